@@ -1,0 +1,1 @@
+"""Evidence-based completion of objects in large point clouds."""

@@ -1,0 +1,154 @@
+"""Point clouds in memory and on disk: binary PLY with float64 positions, LAS and LAZ with a CRS."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyParseError
+from scipy.spatial import cKDTree
+
+from scenefuse.stage import StageError, atomic_file
+from scenefuse.transforms import Sim3
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A point cloud in one frame.
+
+    Attributes:
+        points: (N, 3) float64 positions.
+        normals: (N, 3) float32 unit vectors, or None.
+        colors: (N, 3) uint8 RGB, or None.
+        fields: further values per point, name -> (N,) array (`source`, `confidence`, `views`, ...).
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float32] | None = None
+    colors: NDArray[np.uint8] | None = None
+    fields: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: NDArray[Any]) -> "Cloud":
+        """The points that a mask or an index array selects."""
+        return Cloud(
+            self.points[index],
+            None if self.normals is None else self.normals[index],
+            None if self.colors is None else self.colors[index],
+            {name: values[index] for name, values in self.fields.items()},
+        )
+
+    def transformed(self, b_from_a: Sim3) -> "Cloud":
+        """The same points in frame b; normals turn, fields stay."""
+        normals = None if self.normals is None else b_from_a.rotate(self.normals).astype(np.float32)
+        return replace(self, points=b_from_a.apply(self.points), normals=normals)
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the axis-aligned bounding box's diagonal."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
+
+
+def concatenate(clouds: list[Cloud]) -> Cloud:
+    """One cloud after the other; normals, colours and fields are kept where every cloud has them."""
+    names = set.intersection(*(set(c.fields) for c in clouds))
+    normals = [c.normals for c in clouds if c.normals is not None]
+    colors = [c.colors for c in clouds if c.colors is not None]
+    return Cloud(
+        np.concatenate([c.points for c in clouds]),
+        np.concatenate(normals) if len(normals) == len(clouds) else None,
+        np.concatenate(colors) if len(colors) == len(clouds) else None,
+        {name: np.concatenate([c.fields[name] for c in clouds]) for name in sorted(names)},
+    )
+
+
+def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
+    """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value."""
+    cells = np.floor((cloud.points - cloud.points.min(0)) / voxel).astype(np.int64)
+    size = cells.max(0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, group, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(group, cloud.points[:, k]) / counts for k in range(3)], axis=1)
+    distance = ((cloud.points - means[group]) ** 2).sum(1)
+    order = np.lexsort((distance, group))
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return cloud[np.sort(order[first])]
+
+
+def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> float:
+    """Median distance from a point to its nearest neighbour, over a seeded sample, in the cloud's unit."""
+    tree = cKDTree(points)
+    chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
+    return float(np.median(tree.query(points[chosen], k=2)[0][:, 1]))
+
+
+def read_cloud(path: Path) -> Cloud:
+    """Read a PLY file.
+
+    Raises:
+        StageError: the file is missing, is no PLY, or holds no points.
+    """
+    path = Path(path)
+    try:
+        vertex = PlyData.read(path)["vertex"].data
+    except FileNotFoundError:
+        raise StageError(f"{path} does not exist; give the path of a PLY cloud") from None
+    except (PlyParseError, KeyError, UnicodeDecodeError) as error:
+        raise StageError(f"{path} is not a readable PLY cloud ({error}); export it again as binary PLY") from None
+    if len(vertex) == 0:
+        raise StageError(f"{path} holds no points; look at the log of the stage that wrote it")
+    names = vertex.dtype.names
+    known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"}
+    has_normals, has_colors = {"nx", "ny", "nz"} <= set(names), {"red", "green", "blue"} <= set(names)
+    return Cloud(
+        np.stack([vertex[k] for k in ("x", "y", "z")], axis=1).astype(np.float64),
+        np.stack([vertex[k] for k in ("nx", "ny", "nz")], axis=1).astype(np.float32) if has_normals else None,
+        np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1).astype(np.uint8) if has_colors else None,
+        {name: np.array(vertex[name]) for name in names if name not in known},
+    )
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are."""
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
+    if cloud.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
+    if cloud.colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
+    columns |= cloud.fields
+    vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertex[name] = values
+    with atomic_file(path) as temporary:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+
+
+def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str) -> None:
+    """Write LAZ 1.4 with a CRS: easting, northing and height are `origin` plus the cloud's positions, to a millimetre.
+
+    Args:
+        path: output, .laz or .las.
+        cloud: in metres, axes east, north, up, relative to `origin`.
+        origin: (3,) coordinates of the cloud's local origin in the CRS.
+        crs: anything pyproj understands, "EPSG:32632" for instance.
+    """
+    import laspy
+    import pyproj
+
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(origin)
+    header.add_crs(pyproj.CRS.from_user_input(crs))
+    names = {"uint8": "u1", "int32": "i4", "float32": "f4", "float64": "f8", "uint16": "u2", "int64": "i8"}
+    for name, values in cloud.fields.items():
+        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=names[values.dtype.name]))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (cloud.points + origin).T
+    if cloud.colors is not None:
+        las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * 257
+    for name, values in cloud.fields.items():
+        las[name] = values
+    with atomic_file(path) as temporary:
+        las.write(str(temporary))

@@ -1,0 +1,43 @@
+"""Depth, normal and confidence maps on disk, in COLMAP's binary format, which its own tools read."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from scenefuse.stage import StageError
+
+
+def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
+    """Write an (H, W) float32 map of depths along the camera's z axis; 0 marks pixels without a depth."""
+    valid = depth[depth > 0]
+    low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 0.0)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pycolmap.DepthMap.from_array(np.ascontiguousarray(depth, dtype=np.float32), low, high).write(path)
+
+
+def read_depth(path: Path) -> NDArray[np.float32]:
+    """Read an (H, W) float32 map (depth or confidence); StageError when the file is missing or damaged."""
+    depth_map = pycolmap.DepthMap()
+    try:
+        depth_map.read(path)
+    except Exception as error:
+        raise StageError(f"{path} is not a readable COLMAP map ({error}); rerun the stage that writes it") from None
+    return np.array(depth_map.to_array(), dtype=np.float32)
+
+
+def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
+    """Write an (H, W, 3) float32 map of unit normals in the camera frame; zeros mark pixels without a normal."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    pycolmap.NormalMap.from_array(np.ascontiguousarray(normals, dtype=np.float32)).write(path)
+
+
+def read_normals(path: Path) -> NDArray[np.float32]:
+    """Read an (H, W, 3) float32 normal map; StageError when the file is missing or damaged."""
+    normal_map = pycolmap.NormalMap()
+    try:
+        normal_map.read(path)
+    except Exception as error:
+        raise StageError(f"{path} is not a readable COLMAP map ({error}); rerun the stage that writes it") from None
+    return np.array(normal_map.to_array(), dtype=np.float32)

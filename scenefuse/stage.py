@@ -1,0 +1,132 @@
+"""What every stage shares: its command line, its errors, atomic outputs, JSON with units, hashes.
+
+Nothing here imports more than the standard library, so that a stage that is told its input is bad says so at once.
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+
+class StageError(Exception):
+    """Something a person has to mend. The message says what is wrong, where, and what to do."""
+
+
+def run(function: Callable[..., Any]) -> None:
+    """Run a stage function as a command line built from its signature and docstring.
+
+    A StageError ends in one sentence on stderr and exit status 1. SIGTERM and SIGINT unwind the stack, so that
+    temporary outputs are removed; the process also gets SIGTERM when its parent dies.
+    """
+    import tyro
+
+    _die_with_parent()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _exit_on_signal)
+    try:
+        tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
+    except StageError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+
+
+def threads() -> int:
+    """CPU threads this stage may use: OMP_NUM_THREADS (Snakemake sets it from `threads:`), else all cores."""
+    value = os.environ.get("OMP_NUM_THREADS", "")
+    return int(value) if value.isdigit() and int(value) > 0 else (os.cpu_count() or 1)
+
+
+@contextlib.contextmanager
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary name with the same suffix; on success sync and rename it to `path`, else remove it."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}.tmp-{os.getpid()}{path.suffix}")
+    try:
+        yield temporary
+        with open(temporary, "rb") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_directory(path: Path) -> Iterator[Path]:
+    """Yield an empty temporary directory; on success it replaces `path`, else it is removed."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    try:
+        yield temporary
+        shutil.rmtree(path, ignore_errors=True)
+        os.replace(temporary, path)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
+def quantity(value: Any, unit: str) -> dict[str, Any]:
+    """A number with its unit, as every stage JSON holds it: {"value": ..., "unit": ...}. Arrays become lists."""
+    return {"value": value.tolist() if hasattr(value, "tolist") else value, "unit": unit}
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write JSON atomically, keys in the order given; a NaN is an error, never a file that other tools refuse."""
+    with atomic_file(path) as temporary:
+        temporary.write_text(json.dumps(content, indent=2, allow_nan=False, default=_plain) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a stage JSON; a missing or damaged file is a StageError that names it."""
+    try:
+        return json.loads(Path(path).read_text())
+    except FileNotFoundError:
+        raise StageError(f"{path} does not exist; run the stage that writes it first") from None
+    except ValueError as error:
+        raise StageError(f"{path} is not valid JSON ({error}); delete it and rerun the stage that writes it") from None
+
+
+def value(content: Mapping[str, Any], name: str) -> Any:
+    """The value of one quantity in a stage JSON, without its unit."""
+    return content[name]["value"]
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's bytes, as hex."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def manifest(directory: Path) -> dict[str, str]:
+    """Relative path -> SHA-256 of every file below a directory, sorted: what a `directory()` output holds."""
+    directory = Path(directory)
+    files = sorted(p for p in directory.rglob("*") if p.is_file() and p.name != ".snakemake_timestamp")
+    return {p.relative_to(directory).as_posix(): sha256(p) for p in files}
+
+
+def _plain(item: Any) -> Any:
+    """NumPy scalars and arrays, and paths, as JSON knows them."""
+    if hasattr(item, "tolist"):
+        return item.tolist()
+    if isinstance(item, Path):
+        return item.as_posix()
+    raise TypeError(f"{type(item).__name__} cannot be written as JSON")
+
+
+def _exit_on_signal(number: int, _frame: Any) -> None:
+    sys.exit(128 + number)
+
+
+def _die_with_parent() -> None:
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(1, signal.SIGTERM, 0, 0, 0)

@@ -1,0 +1,153 @@
+"""Similarities between frames: composing, inverting, fitting, writing.
+
+`b_from_a` names a transform, `x_in_b` points. All arithmetic is float64.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Sim3:
+    """x_in_b = scale * rotation @ x_in_a + translation.
+
+    Attributes:
+        scale: positive factor, units of b per unit of a.
+        rotation: (3, 3) rotation matrix.
+        translation: (3,) in units of b.
+    """
+
+    scale: float
+    rotation: Array
+    translation: Array
+
+    @classmethod
+    def identity(cls) -> "Sim3":
+        """The transform that changes nothing."""
+        return cls(1.0, np.eye(3), np.zeros(3))
+
+    @classmethod
+    def from_matrix(cls, matrix: Array) -> "Sim3":
+        """From a 4x4 similarity matrix; ValueError when its linear part is no scaled rotation."""
+        matrix = np.asarray(matrix, dtype=np.float64)
+        determinant = np.linalg.det(matrix[:3, :3])
+        if determinant <= 0:
+            raise ValueError(f"not a similarity: the determinant of the linear part is {determinant:.3g}")
+        scale = float(np.cbrt(determinant))
+        rotation = matrix[:3, :3] / scale
+        if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("not a similarity: the linear part is not a scaled rotation")
+        return cls(scale, rotation, matrix[:3, 3].copy())
+
+    @property
+    def matrix(self) -> Array:
+        """The transform as a (4, 4) matrix."""
+        matrix = np.eye(4)
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
+        return matrix
+
+    def apply(self, points: ArrayLike) -> Array:
+        """Transform (..., 3) points from a to b."""
+        return self.scale * (np.asarray(points, dtype=np.float64) @ self.rotation.T) + self.translation
+
+    def rotate(self, directions: ArrayLike) -> Array:
+        """Rotate (..., 3) directions, normals for instance, from a to b."""
+        return np.asarray(directions, dtype=np.float64) @ self.rotation.T
+
+    def inverse(self) -> "Sim3":
+        """a_from_b."""
+        rotation = self.rotation.T
+        return Sim3(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
+
+    def __matmul__(self, other: "Sim3") -> "Sim3":
+        """c_from_b @ b_from_a = c_from_a."""
+        return Sim3(
+            self.scale * other.scale,
+            self.rotation @ other.rotation,
+            self.scale * (self.rotation @ other.translation) + self.translation,
+        )
+
+
+def fit_sim3(x_in_a: Array, x_in_b: Array, weights: Array | None = None, scale: float | None = None) -> Sim3:
+    """Weighted least-squares b_from_a for (N, 3) pairs (Umeyama 1991); with `scale` given it is not estimated.
+
+    Raises:
+        ValueError: fewer than three pairs, or points on one line.
+    """
+    if len(x_in_a) < 3:
+        raise ValueError(f"a similarity needs three pairs of points, not {len(x_in_a)}")
+    w = np.ones(len(x_in_a)) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    mean_a, mean_b = w @ x_in_a, w @ x_in_b
+    centred_a, centred_b = x_in_a - mean_a, x_in_b - mean_b
+    u, singular, vt = np.linalg.svd((w[:, None] * centred_b).T @ centred_a)
+    if singular[1] < 1e-12 * max(singular[0], 1e-300):
+        raise ValueError("a similarity cannot be fitted to points on one line")
+    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    rotation = (u * sign) @ vt
+    if scale is None:
+        scale = float((singular * sign).sum() / (w @ (centred_a**2).sum(1)))
+    return Sim3(scale, rotation, mean_b - scale * (rotation @ mean_a))
+
+
+def fit_sim3_robust(
+    x_in_a: Array, x_in_b: Array, threshold: float, seed: int = 0, trials: int = 1000
+) -> tuple[Sim3, NDArray[np.bool_]]:
+    """RANSAC over triples, then least squares on the inliers within `threshold` (units of b).
+
+    Returns:
+        b_from_a and the (N,) inlier mask.
+
+    Raises:
+        ValueError: fewer than three pairs, or no triple that spans a plane.
+    """
+    rng = np.random.default_rng(seed)
+    best = np.zeros(len(x_in_a), dtype=bool)
+    for _ in range(trials):
+        triple = rng.choice(len(x_in_a), 3, replace=False) if len(x_in_a) >= 3 else np.arange(len(x_in_a))
+        try:
+            candidate = fit_sim3(x_in_a[triple], x_in_b[triple])
+        except ValueError:
+            continue
+        inliers = np.linalg.norm(candidate.apply(x_in_a) - x_in_b, axis=1) <= threshold
+        if inliers.sum() > best.sum():
+            best = inliers
+    for _ in range(5):
+        fitted = fit_sim3(x_in_a[best], x_in_b[best])
+        best = np.linalg.norm(fitted.apply(x_in_a) - x_in_b, axis=1) <= threshold
+    return fitted, best
+
+
+def rotation_angle_deg(rotation: Array) -> float:
+    """Angle of a rotation matrix in degrees, 0 to 180."""
+    sine = np.linalg.norm(rotation - rotation.T) / np.sqrt(8.0)
+    return float(np.degrees(np.arctan2(sine, (np.trace(rotation) - 1.0) / 2.0)))
+
+
+def rotation_between(a: Array, b: Array) -> Array:
+    """The smallest (3, 3) rotation that turns direction a (3,) into direction b (3,)."""
+    a, b = a / np.linalg.norm(a), b / np.linalg.norm(b)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    if cosine < -1.0 + 1e-12:
+        helper = np.eye(3)[np.argmin(np.abs(a))]
+        axis = np.cross(a, helper)
+        axis /= np.linalg.norm(axis)
+        return 2.0 * np.outer(axis, axis) - np.eye(3)
+    k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + k + k @ k / (1.0 + cosine)
+
+
+def up_from_cameras(world_from_cam_rotations: Array) -> Array:
+    """The direction opposite to gravity, from (N, 3, 3) camera rotations of photos held level.
+
+    A level camera's x axis is horizontal whatever its pitch and heading, so up is the direction most nearly
+    orthogonal to all x axes; its sign is the one that most cameras' up sides (-y) agree with.
+    """
+    x_axes, y_axes = world_from_cam_rotations[:, :, 0], world_from_cam_rotations[:, :, 1]
+    up = np.linalg.eigh(x_axes.T @ x_axes)[1][:, 0]
+    return up if (-(y_axes @ up)).sum() >= 0 else -up

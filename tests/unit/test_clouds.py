@@ -1,0 +1,76 @@
+import numpy as np
+import pytest
+
+from scenefuse.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
+from scenefuse.stage import StageError
+from scenefuse.transforms import Sim3
+
+
+def cloud(count: int = 50) -> Cloud:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(count, 3))
+    return Cloud(
+        rng.uniform(0, 1, (count, 3)) + [500_000.123456, 5_572_094.155, 300.0],
+        (normals / np.linalg.norm(normals, axis=1, keepdims=True)).astype(np.float32),
+        rng.integers(0, 256, (count, 3)).astype(np.uint8),
+        {"source": np.arange(count, dtype=np.uint8), "confidence": rng.random(count).astype(np.float32)},
+    )
+
+
+def test_ply_keeps_every_bit(tmp_path):
+    before = cloud()
+    write_cloud(tmp_path / "a.ply", before)
+    after = read_cloud(tmp_path / "a.ply")
+    assert np.array_equal(before.points, after.points)
+    assert np.array_equal(before.normals, after.normals) and np.array_equal(before.colors, after.colors)
+    assert np.array_equal(before.fields["source"], after.fields["source"])
+    assert after.fields["source"].dtype == np.uint8
+
+
+def test_laz_round_trip_at_utm_coordinates_is_a_millimetre(tmp_path):
+    import laspy
+
+    local = Cloud(cloud().points - [500_000, 5_572_094.155, 300.0], None, cloud().colors, cloud().fields)
+    write_laz(tmp_path / "a.laz", local, np.array([500_000, 5_572_094.155, 300.0]), "EPSG:32632")
+    las = laspy.read(tmp_path / "a.laz")
+    assert np.abs(np.stack([las.x, las.y, las.z], axis=1) - cloud().points).max() <= 1e-3
+    assert las.header.parse_crs().to_epsg() == 32632
+    assert np.array_equal(las["source"], cloud().fields["source"])
+
+
+@pytest.mark.parametrize("content", [b"not a cloud", b"ply\nformat ascii 1.0\nend_header\n"])
+def test_unreadable_cloud_is_named(tmp_path, content):
+    (tmp_path / "bad.ply").write_bytes(content)
+    with pytest.raises(StageError, match=r"bad\.ply"):
+        read_cloud(tmp_path / "bad.ply")
+    with pytest.raises(StageError, match="does not exist"):
+        read_cloud(tmp_path / "none.ply")
+
+
+def test_voxel_downsample_keeps_measured_points_one_per_voxel():
+    grid = np.stack(np.meshgrid(*[np.arange(4.0)] * 3), axis=-1).reshape(-1, 3)
+    points = np.concatenate([grid, grid + 0.01, grid - 0.01])
+    thin = voxel_downsample(Cloud(points + 0.5, fields={"index": np.arange(len(points))}), 1.0)
+    assert len(thin) == 64
+    assert np.array_equal(points[thin.fields["index"]] + 0.5, thin.points)
+
+
+def test_spacing_of_a_grid_is_its_step():
+    grid = np.stack(np.meshgrid(*[np.arange(6) * 0.25] * 3), axis=-1).reshape(-1, 3)
+    assert spacing(grid) == pytest.approx(0.25)
+
+
+def test_transform_turns_normals_and_keeps_fields():
+    quarter = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
+    one = Cloud(np.array([[1.0, 0, 0]]), np.array([[1, 0, 0]], dtype=np.float32), None, {"views": np.array([3])})
+    moved = one.transformed(quarter)
+    assert np.allclose(moved.points, [[0, 2, 0]]) and np.allclose(moved.normals, [[0, 1, 0]])
+    assert moved.fields["views"] == [3]
+
+
+def test_concatenate_keeps_what_all_clouds_have():
+    joined = concatenate(
+        [cloud(), Cloud(cloud(3).points, colors=cloud(3).colors, fields={"source": np.ones(3, np.uint8)})]
+    )
+    assert len(joined) == 53 and joined.normals is None and joined.colors is not None
+    assert list(joined.fields) == ["source"]
