@@ -1,0 +1,243 @@
+"""Errors against a known truth: cameras, depth, surfaces, registrations. Arrays in, numbers out."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import open3d as o3d
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.demo.cameras import Cameras
+from scenefuse.stage import StageError, threads
+from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """A true surface.
+
+    Attributes:
+        vertices: (V, 3) float32, metres, in the truth's frame.
+        triangles: (T, 3) int32.
+    """
+
+    vertices: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+
+    def caster(self) -> o3d.t.geometry.RaycastingScene:
+        """Open3D's ray caster with this mesh alone."""
+        return cast_together([self])
+
+
+@dataclass(frozen=True)
+class PosedModel:
+    """The posed photos of a COLMAP model that the truth knows.
+
+    Attributes:
+        names: N file names.
+        centres: (N, 3) in the model's frame.
+        cam_from_model: (N, 3, 3) rotations.
+        intrinsics: (N, 3, 3) pixels.
+        sizes: (N, 2) width and height in pixels.
+        true: (N,) index of each photo among the true cameras.
+    """
+
+    names: list[str]
+    centres: Array
+    cam_from_model: Array
+    intrinsics: Array
+    sizes: NDArray[np.int64]
+    true: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class CameraFit:
+    """How well a model's cameras agree with the truth.
+
+    Attributes:
+        truth_from_model: similarity fitted to the camera centres.
+        position: (N,) metres left after the fit.
+        rotation_deg: (N,) angles left after the fit.
+    """
+
+    truth_from_model: Sim3
+    position: Array
+    rotation_deg: Array
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read a PLY mesh; StageError when it is missing or empty."""
+    if not Path(path).is_file():
+        raise StageError(f"{path} does not exist; render the demo again")
+    mesh = o3d.t.io.read_triangle_mesh(str(path))
+    if mesh.is_empty():
+        raise StageError(f"{path} holds no mesh; render the demo again")
+    return Mesh(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy().astype(np.int32))
+
+
+def cast_together(meshes: list[Mesh]) -> o3d.t.geometry.RaycastingScene:
+    """One ray caster; a hit's geometry id is the mesh's place in the list."""
+    scene = o3d.t.geometry.RaycastingScene(threads())
+    for mesh in meshes:
+        triangles = o3d.core.Tensor.from_numpy(mesh.triangles.astype(np.uint32))
+        scene.add_triangles(o3d.core.Tensor.from_numpy(mesh.vertices), triangles)
+    return scene
+
+
+def distances(scene: o3d.t.geometry.RaycastingScene, points: Array) -> NDArray[np.float32]:
+    """(N,) distance of (N, 3) points to the nearest surface, metres."""
+    return scene.compute_distance(o3d.core.Tensor.from_numpy(points.astype(np.float32)), threads()).numpy()
+
+
+def sample_surface(mesh: Mesh, count: int, seed: int) -> Array:
+    """(count, 3) points spread evenly over a mesh's area."""
+    rng = np.random.default_rng(seed)
+    a, b, c = (mesh.vertices[mesh.triangles[:, k]].astype(np.float64) for k in range(3))
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    chosen = rng.choice(len(area), count, p=area / area.sum())
+    u, v = np.sqrt(rng.random(count))[:, None], rng.random(count)[:, None]
+    return (1 - u) * a[chosen] + u * (1 - v) * b[chosen] + u * v * c[chosen]
+
+
+def read_posed(model: Path, truth: Cameras) -> PosedModel:
+    """The posed photos of a COLMAP model whose names the truth knows; StageError when fewer than three are."""
+    try:
+        reconstruction = pycolmap.Reconstruction(model)
+    except Exception as error:
+        raise StageError(f"{model} is not a readable COLMAP model ({error}); rerun the stage that writes it") from None
+    place = {Path(name).stem: k for k, name in enumerate(truth.names)}
+    images = [i for i in reconstruction.images.values() if i.has_pose and Path(i.name).stem in place]
+    images.sort(key=lambda i: i.name)
+    if len(images) < 3:
+        raise StageError(
+            f"only {len(images)} posed photos of {model} are known to the truth, three are needed; "
+            "give the truth of the capture that the model was made from"
+        )
+    cameras = [reconstruction.cameras[i.camera_id] for i in images]
+    return PosedModel(
+        [i.name for i in images],
+        np.array([i.projection_center() for i in images]),
+        np.array([i.cam_from_world().rotation.matrix() for i in images]),
+        np.array([c.calibration_matrix() for c in cameras]),
+        np.array([(c.width, c.height) for c in cameras]),
+        np.array([place[Path(i.name).stem] for i in images]),
+    )
+
+
+def fit_cameras(posed: PosedModel, truth: Cameras) -> CameraFit:
+    """Fit the similarity from the model to the truth by camera centres, and measure what is left.
+
+    The fit starts from the triple of cameras with the least median error (Rousseeuw 1984); cameras farther off than
+    four times the median are left out of it, not of the errors.
+    """
+    target = truth.centres[posed.true]
+    rng = np.random.default_rng(0)
+    triples = [rng.choice(len(target), 3, replace=False) for _ in range(300)]
+    error = min((_errors(posed.centres, target, triple) for triple in triples), key=lambda e: float(np.median(e)))
+    for _ in range(4):
+        within = error <= max(4.0 * float(np.median(error)), 1e-9)
+        fitted = fit_sim3(posed.centres[within], target[within])
+        error = np.linalg.norm(fitted.apply(posed.centres) - target, axis=1)
+    turned = posed.cam_from_model @ fitted.rotation.T
+    angles = [rotation_angle_deg(a @ b.T) for a, b in zip(turned, truth.cam_from_world[posed.true])]
+    return CameraFit(fitted, error, np.array(angles))
+
+
+def _errors(centres: Array, target: Array, chosen: NDArray[np.int64]) -> Array:
+    """(N,) errors after fitting to the chosen pairs; infinite where they lie on one line."""
+    try:
+        return np.linalg.norm(fit_sim3(centres[chosen], target[chosen]).apply(centres) - target, axis=1)
+    except ValueError:
+        return np.full(len(target), np.inf)
+
+
+def mask_iou(mask: NDArray[np.bool_], true_mask: NDArray[np.bool_]) -> float:
+    """Intersection over union; two empty masks agree."""
+    union = int((mask | true_mask).sum())
+    return float((mask & true_mask).sum() / union) if union else 1.0
+
+
+def true_depth(
+    scene: o3d.t.geometry.RaycastingScene, posed: PosedModel, photo: int, truth_from_model: Sim3, size: tuple[int, int]
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """What a map of a photo should hold, cast from the model's own camera brought into the truth's frame.
+
+    So a depth error is measured along the ray that the stage used, and does not count the camera's own error.
+
+    Returns:
+        (H, W) depth along z in metres, infinite for the sky, and (H, W) number of the mesh hit, -1 for none.
+    """
+    width, height = size
+    shrink = np.diag([width / posed.sizes[photo, 0], height / posed.sizes[photo, 1], 1.0])
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    # With z = 1 in the camera, the length along the ray is the depth.
+    in_cam = pixels @ np.linalg.inv(shrink @ posed.intrinsics[photo]).T
+    directions = in_cam @ (posed.cam_from_model[photo] @ truth_from_model.rotation.T)
+    centre = np.broadcast_to(truth_from_model.apply(posed.centres[photo]), directions.shape)
+    rays = np.concatenate([centre, directions], axis=-1).astype(np.float32)
+    hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=threads())
+    return hits["t_hit"].numpy(), hits["geometry_ids"].numpy().view(np.int32).astype(np.int64)
+
+
+def f_score(
+    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], tau: float
+) -> tuple[float, float, float]:
+    """Precision, recall and their harmonic mean at a distance `tau` (Knapitsch et al. 2017, section 4)."""
+    precision = float((cloud_to_truth <= tau).mean()) if len(cloud_to_truth) else 0.0
+    recall = float((truth_to_cloud <= tau).mean()) if len(truth_to_cloud) else 0.0
+    total = precision + recall
+    return precision, recall, 2 * precision * recall / total if total > 0 else 0.0
+
+
+def nearest(points: Array, cloud: Array) -> Array:
+    """(N,) distance of each of (N, 3) points to the nearest point of a cloud; infinite when it is empty."""
+    if len(cloud) == 0:
+        return np.full(len(points), np.inf)
+    return cKDTree(cloud).query(points, workers=threads())[0]
+
+
+def belongs_to_object(
+    points: Array,
+    to_object: NDArray[np.floating],
+    to_world: NDArray[np.floating],
+    low: Array,
+    high: Array,
+    margin: float,
+) -> NDArray[np.bool_]:
+    """(N,) points that claim to be the object: inside its box widened by `margin`, nearer to it than to the rest.
+
+    The ground and clutter around the object thus count neither for nor against a cloud.
+    """
+    inside = ((points >= low - margin) & (points <= high + margin)).all(1)
+    return inside & (to_object < to_world)
+
+
+@dataclass(frozen=True)
+class RegistrationError:
+    """An estimated scene_from_object against the true one."""
+
+    scale_pct: float
+    rotation_deg: float
+    translation_over_diagonal: float
+
+
+def registration_error(
+    estimated: Sim3, true: Sim3, middle_in_object: Array, diagonal_in_scene: float
+) -> RegistrationError:
+    """Errors of a registration; the translation's is the shift of the object's middle, over its diagonal.
+
+    Args:
+        estimated: scene_from_object to judge.
+        true: the true one.
+        middle_in_object: (3,) the object's middle in its own frame.
+        diagonal_in_scene: the object's diagonal in the scene's unit.
+    """
+    shift = estimated.apply(middle_in_object) - true.apply(middle_in_object)
+    return RegistrationError(
+        100.0 * abs(estimated.scale / true.scale - 1.0),
+        rotation_angle_deg(estimated.rotation @ true.rotation.T),
+        float(np.linalg.norm(shift)) / diagonal_in_scene,
+    )

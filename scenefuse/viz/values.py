@@ -1,0 +1,69 @@
+"""Reading stage JSONs that may lack anything: nested quantities as one flat table, numbers as short text."""
+
+import json
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+Fields = dict[str, dict[str, Any]]
+
+
+def flatten(content: Mapping[str, Any], prefix: str = "") -> Fields:
+    """Nested {"group": {"name": {"value", "unit"}}} as {"group.name": {"value", "unit"}}; anything else is left out."""
+    fields: Fields = {}
+    for name, item in content.items():
+        if isinstance(item, Mapping):
+            if "value" in item:
+                fields[prefix + name] = {"value": item["value"], "unit": item.get("unit", "")}
+            else:
+                fields |= flatten(item, f"{prefix}{name}.")
+    return fields
+
+
+def load(path: Path) -> Fields:
+    """The quantities of a stage JSON; none when it is missing or damaged: a summary never fails on one file."""
+    try:
+        content = json.loads(Path(path).read_text())
+    except (OSError, ValueError):
+        return {}
+    return flatten(content) if isinstance(content, dict) else {}
+
+
+def find(fields: Fields, *names: str) -> Any:
+    """The value of the first of `names` that is there: by full name, else by the last part of a name; else None."""
+    for name in names:
+        if name in fields:
+            return fields[name]["value"]
+        for key, item in fields.items():
+            if "." not in name and key.rsplit(".", 1)[-1] == name:
+                return item["value"]
+    return None
+
+
+def number(item: Any) -> str:
+    """Four significant digits, no exponent for everyday numbers; '-' for what is absent or no finite number."""
+    if isinstance(item, bool):
+        return "yes" if item else "no"
+    if isinstance(item, int):
+        return str(item)
+    if isinstance(item, float):
+        if not math.isfinite(item):
+            return "-"
+        return f"{item:.4g}" if abs(item) < 1e4 else f"{item:.0f}"
+    return "-" if item is None or item == "" else str(item)
+
+
+def find_like(fields: Fields, *parts: str) -> Any:
+    """The value whose full name holds all of `parts`, the shortest name first; else None."""
+    names = [key for key in fields if all(part in key for part in parts)]
+    return fields[min(names, key=lambda key: (len(key), key))]["value"] if names else None
+
+
+def unit_of(fields: Fields, *names: str) -> str | None:
+    """The unit of what `find` finds; None when there is nothing."""
+    for name in names:
+        for key, item in fields.items():
+            if key == name or ("." not in name and key.rsplit(".", 1)[-1] == name):
+                return str(item["unit"])
+    return None

@@ -1,0 +1,203 @@
+"""Tables, text and page of partial runs."""
+
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+from PIL import Image
+
+from scenefuse.stage import StageError, quantity, write_json
+from scenefuse.viz.report import write_report
+from scenefuse.viz.summary import write_summary
+from scenefuse.viz.tables import last_error, runtime_table
+from scenefuse.viz.values import find, flatten, load, number
+
+HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
+
+
+@pytest.fixture
+def results(tmp_path):
+    """A scene, a registered house, a refused balloon, and a sculpture whose masks failed."""
+    scene = tmp_path / "scenes/demo"
+    write_json(scene / "sparse.json", {"total": quantity(60, "1"), "registered": quantity(59, "1")})
+    write_json(scene / "dense_cloud.json", {"points": quantity(5000, "1"), "fallback": quantity("CPU used", "")})
+    for name, status in (("house", "registered"), ("balloon", "unregistered")):
+        folder = tmp_path / "objects" / name
+        write_json(folder / "stage4.json", {"held_out_psnr": quantity(27.5, "dB")})
+        write_json(folder / "object.json", {"points": quantity(1000, "1")})
+        for k, arm in enumerate(("full", "paper")):
+            fine = {"status": quantity(status, ""), "reason": quantity("" if status == "registered" else "weak", "")}
+            write_json(folder / f"registration/{arm}/fine.json", fine | {"scale": quantity(2.0 + k, "m")})
+            scores = {"fitness_source": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
+            write_json(folder / f"registration/{arm}/metrics.json", {"registration": scores})
+        completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1"), "nue_scene": quantity(None, "1")}
+        write_json(folder / "metrics.json", {"completion": completion})
+        arms = {arm: {"scale_error_pct": quantity(0.5 + k, "%")} for k, arm in enumerate(("full", "paper"))}
+        scene_scores = {f"scene_f_score_{w}": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
+        write_json(folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "arms": arms, **scene_scores})
+        (folder / "fused.ply").write_text("points")
+    (tmp_path / "logs/masks").mkdir(parents=True)
+    (tmp_path / "logs/masks/sculpture.log").write_text("error: old\nloading\nerror: no <mask> matches a frame\n")
+    for rule, job, seconds, memory in (
+        ("nerf", "house", 100.0, 900),
+        ("nerf", "balloon", 50.0, 1200),
+        ("fine", "x", 0.2, "-"),
+    ):
+        path = tmp_path / f"benchmarks/{rule}/{job}.tsv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{HEADER}{seconds}\t0:01:00\t{memory}\t1\t1\t1\t0\t0\t99\t1\n")
+    return tmp_path
+
+
+def summarise(results):
+    write_summary(
+        scenes=[results / "scenes/demo"],
+        objects=[results / "objects" / name for name in ("house", "balloon", "sculpture")],
+        arms=["full", "paper"],
+        benchmarks=results / "benchmarks",
+        logs=results / "logs",
+        summary=results / "summary",
+    )
+    return results / "summary"
+
+
+def read(summary, name, **options):
+    return pd.read_csv(summary / f"{name}.tsv", sep="\t", na_values=["-"], **options)
+
+
+def test_registration_holds_every_object_and_arm(results):
+    table = read(summarise(results), "registration").set_index(["object", "arm"])
+    assert table.loc[("house", "full"), "status"] == "registered"
+    assert table.loc[("house", "paper"), "fitness_source"] == pytest.approx(0.6)
+    assert table.loc[("house", "paper"), "scale_error_pct"] == 1.5
+    assert table.loc[("balloon", "full"), "reason"] == "weak"
+    assert table.loc[("sculpture", "full"), "status"] == "missing"
+    assert "no <mask> matches a frame" in table.loc[("sculpture", "full"), "reason"]
+    assert np.isnan(table.loc[("sculpture", "full"), "scale"])
+
+
+def test_ablation_sets_the_arms_side_by_side(results):
+    table = read(summarise(results), "ablation").set_index(["object", "measure"])
+    assert table.loc[("house", "scale"), "unit"] == "m"
+    assert [float(table.loc[("house", "scale"), arm]) for arm in ("full", "paper")] == [2.0, 3.0]
+    assert table.loc[("sculpture", "status"), "full"] == "missing"
+
+
+def test_completion_sets_value_null_and_scene_side_by_side(results):
+    table = read(summarise(results), "completion").set_index(["object", "measure"])
+    assert table.loc[("house", "nue"), ["value", "null"]].tolist() == [1.25, 2.5]
+    assert np.isnan(table.loc[("house", "nue"), "scene"])
+    assert table.loc[("house", "scene_f_score_after"), "value"] == 0.9
+
+
+def test_objects_and_scenes(results):
+    summary = summarise(results)
+    objects = read(summary, "objects").set_index("object")
+    assert objects.loc["house", "stage4_psnr_db"] == 27.5
+    assert objects.loc["house", "stage1_depth_error_over_diagonal"] == 0.02
+    assert objects.loc["sculpture", "missing"].startswith("object.json")
+    assert read(summary, "scenes").loc[0, "registered"] == 59
+
+
+def test_runtime_sums_over_jobs_and_totals(results):
+    table = read(summarise(results), "runtime").set_index("rule")
+    assert table.loc["nerf", ["jobs", "seconds", "longest_seconds", "max_rss_mb"]].tolist() == [2, 150, 100, 1200]
+    assert table.loc["total", "seconds"] == pytest.approx(150.2)
+    assert np.isnan(table.loc["fine", "max_rss_mb"])
+
+
+def test_runtime_of_no_benchmarks_and_of_damaged_ones(tmp_path):
+    assert len(runtime_table(tmp_path / "none")) == 1
+    (tmp_path / "rule").mkdir()
+    (tmp_path / "rule/job.tsv").write_text("garbage\n1\n")
+    assert runtime_table(tmp_path)["jobs"].tolist() == [0]
+
+
+def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results):
+    text = (summarise(results) / "summary.txt").read_text()
+    assert max(len(line) for line in text.splitlines()) <= 100
+    assert "object house: registered" in text and "object balloon: unregistered" in text
+    assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
+    assert "dense_cloud.fallback: CPU used" in text
+    assert "F-score 0.4 -> 0.9" in text
+    assert "1 of 3 objects registered" in text
+
+
+def test_an_empty_run_is_a_summary_too(tmp_path):
+    write_summary(
+        scenes=[tmp_path / "scenes/demo"],
+        objects=[tmp_path / "objects/house"],
+        arms=["full"],
+        benchmarks=tmp_path / "benchmarks",
+        logs=tmp_path / "logs",
+        summary=tmp_path / "summary",
+    )
+    text = (tmp_path / "summary/summary.txt").read_text()
+    assert "it has not run yet" in text and "no benchmark files yet" in text
+    assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
+    with pytest.raises(StageError, match="no registration arm"):
+        write_summary(scenes=[], objects=[], arms=[], benchmarks=tmp_path, logs=tmp_path, summary=tmp_path)
+
+
+def test_the_last_error_is_that_of_the_named_object(tmp_path):
+    (tmp_path / "fine").mkdir()
+    (tmp_path / "fine/house-full.log").write_text("error: one\nerror: two\ndone\n")
+    (tmp_path / "fine/greenhouse-full.log").write_text("ValueError: other\n")
+    assert last_error(tmp_path, "house") == "two [fine/house-full.log]"
+    assert last_error(tmp_path, "greenhouse") == "ValueError: other [fine/greenhouse-full.log]"
+    assert last_error(tmp_path, "hous") == ""
+
+
+def test_values():
+    fields = flatten({"a": {"b": quantity(1.5, "m"), "c": {"d": quantity("x", "")}}, "note": "left out"})
+    assert fields == {"a.b": {"value": 1.5, "unit": "m"}, "a.c.d": {"value": "x", "unit": ""}}
+    assert find(fields, "nothing", "b") == 1.5 and find(fields, "x.b") is None
+    assert [number(v) for v in (None, float("nan"), 0.123456, 123456.7, 3, True)] == [
+        "-",
+        "-",
+        "0.1235",
+        "123457",
+        "3",
+        "yes",
+    ]
+
+
+def test_a_damaged_json_counts_as_absent(tmp_path):
+    (tmp_path / "x.json").write_text("{")
+    assert load(tmp_path / "x.json") == {} and load(tmp_path / "none.json") == {}
+
+
+def report(results):
+    figures = results / "objects/house/figures"
+    figures.mkdir(parents=True)
+    for name in ("before", "after", "provenance"):
+        Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures / f"{name}.png")
+    page = results / "report.html"
+    write_report(
+        summary=summarise(results),
+        scenes=[results / "scenes/demo"],
+        objects=[results / "objects" / name for name in ("house", "sculpture")],
+        title="Run <1>",
+        report=page,
+    )
+    return page.read_text()
+
+
+def test_the_page_is_offline_and_escapes_text(results):
+    page = report(results)
+    assert "Run &lt;1&gt;" in page and "<1>" not in page
+    assert "no &lt;mask&gt; matches a frame" in page and "<mask>" not in page
+    assert not re.search(r"https?://|<link|src=\"(?!data:)|url\(", page)
+    assert page.count("data:image/webp;base64,") == 3
+    assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<h2")[0]
+
+
+def test_the_page_names_objects_without_figures(results):
+    assert "No figures: the object's stages did not finish." in report(results)
+
+
+def test_a_page_without_a_summary_is_refused(tmp_path):
+    with pytest.raises(StageError, match="write the summary first"):
+        write_report(summary=tmp_path, scenes=[], objects=[], title="x", report=tmp_path / "report.html")
+    assert not (tmp_path / "report.html").exists()

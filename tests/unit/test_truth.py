@@ -1,0 +1,236 @@
+"""Errors against truth: planted values come back."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import open3d as o3d
+import pycolmap
+import pytest
+
+from scenefuse.clouds import Cloud, write_cloud
+from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
+from scenefuse.maps import write_depth
+from scenefuse.metrics import truth as tr
+from scenefuse.metrics.evaluation import evaluate_object, evaluate_scene
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3, rotation_between
+
+TRUTH_FROM_OBJECT = Sim3(
+    2.5, rotation_between(np.array([0, 0, 1.0]), np.array([0.3, -0.5, 0.8])), np.array([3.0, 1, 2])
+)
+TRUTH_FROM_SCENE = Sim3(
+    1.01, rotation_between(np.array([0, 0, 1.0]), np.array([0.01, 0.02, 1.0])), np.array([0.4, 0, -1])
+)
+
+
+def box_mesh(low, high) -> tr.Mesh:
+    mesh = o3d.geometry.TriangleMesh.create_box(*(np.array(high) - low).tolist()).translate(low)
+    return tr.Mesh(np.asarray(mesh.vertices, dtype=np.float32), np.asarray(mesh.triangles, dtype=np.int32))
+
+
+def ring(count: int, distance: float, height: float) -> Cameras:
+    angle = 2 * np.pi * np.arange(count) / count
+    centres = np.stack([distance * np.cos(angle), distance * np.sin(angle), height + 0.3 * np.cos(3 * angle)], axis=1)
+    rotations = np.array([look_at(c, np.array([0, 0, 0.5]), np.array([0, 0, 1.0])) for c in centres])
+    return Cameras([f"p_{k}.jpg" for k in range(count)], pinhole(90.0, 96, 72), 96, 72, rotations, centres)
+
+
+def model_of(cameras: Cameras, model_from_truth: Sim3, folder: Path) -> None:
+    reconstruction = pycolmap.Reconstruction()
+    k = cameras.intrinsics
+    camera = pycolmap.Camera(
+        model="PINHOLE",
+        width=cameras.width,
+        height=cameras.height,
+        params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
+        camera_id=1,
+    )
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for index, name in enumerate(cameras.names):
+        rotation = cameras.cam_from_world[index] @ model_from_truth.rotation.T
+        centre = model_from_truth.apply(cameras.centres[index])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), -rotation @ centre)
+        image = pycolmap.Image(name=name, camera_id=1, image_id=index + 1)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    folder.mkdir(parents=True)
+    reconstruction.write(folder)
+
+
+def write_mesh(path: Path, mesh: tr.Mesh) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    legacy = o3d.geometry.TriangleMesh(
+        o3d.utility.Vector3dVector(mesh.vertices.astype(float)), o3d.utility.Vector3iVector(mesh.triangles)
+    )
+    o3d.io.write_triangle_mesh(str(path), legacy)
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Truth, and a perfect reconstruction of it, in two other frames: a box of 2 x 1 x 1 m on a plate."""
+    root = tmp_path_factory.mktemp("planted")
+    thing, plate = box_mesh([-1, -0.5, 0], [1, 0.5, 1]), box_mesh([-6, -6, -0.5], [6, 6, 0])
+    orbit, flight = ring(8, 5.0, 2.5), ring(7, 9.0, 9.0)
+    extent = {"middle": quantity([0, 0, 0.5], "m"), "diagonal": quantity(6**0.5, "m")}
+    write_json(root / "truth/thing/cameras.json", cameras_json(orbit) | {"object": extent})
+    write_mesh(root / "truth/thing/mesh.ply", thing)
+    write_mesh(root / "truth/scene/meshes/world.ply", plate)
+    write_mesh(root / "truth/scene/meshes/thing.ply", thing)
+    write_json(
+        root / "truth/scene/cameras.json",
+        cameras_json(flight)
+        | {
+            "origin": quantity([47.5, 8.5, 430.0], ""),
+            "ground_sampling_distance": quantity(0.1, "m"),
+            "mapped_area": quantity([[-5, -5], [5, 5]], "m"),
+            "objects": {"thing": extent},
+        },
+    )
+    object_from_truth, scene_from_truth = TRUTH_FROM_OBJECT.inverse(), TRUTH_FROM_SCENE.inverse()
+    model_of(orbit, object_from_truth, root / "cameras/sparse")
+    model_of(flight, scene_from_truth, root / "scene")
+    write_json(root / "georeference.json", {"status": quantity("none", "")})
+    caster = tr.cast_together([thing, plate])
+    posed = tr.read_posed(root / "cameras/sparse", orbit)
+    (root / "masks").mkdir()
+    (root / "truth/thing/masks").mkdir()
+    for k, name in enumerate(posed.names):
+        depth, hit = tr.true_depth(caster, posed, k, TRUTH_FROM_OBJECT, (96, 72))
+        mask = (hit == 0).astype(np.uint8) * 255
+        cv2.imwrite(str(root / f"masks/{Path(name).stem}.png"), mask)
+        cv2.imwrite(str(root / f"truth/thing/masks/{Path(name).stem}.png"), mask)
+        finite = np.where(np.isfinite(depth), depth, 0)
+        write_depth(root / f"stage1/depth_maps/{name}.bin", (finite / TRUTH_FROM_OBJECT.scale).astype(np.float32))
+        write_depth(root / f"stage2/depth_maps/{name}.bin", (1.1 * finite / TRUTH_FROM_OBJECT.scale).astype(np.float32))
+    surface = tr.sample_surface(thing, 30000, 1)
+    ground = tr.sample_surface(plate, 60000, 2)
+    write_cloud(root / "object.ply", Cloud(object_from_truth.apply(surface)))
+    half = surface[surface[:, 0] < 0]
+    write_cloud(root / "before.ply", Cloud(scene_from_truth.apply(np.concatenate([half, ground]))))
+    write_cloud(root / "after.ply", Cloud(scene_from_truth.apply(np.concatenate([surface, ground]))))
+    exact = scene_from_truth @ TRUTH_FROM_OBJECT
+    wrong = Sim3(exact.scale * 1.02, exact.rotation, exact.translation)
+    for arm, transform in (("full", exact), ("no_scale", wrong)):
+        content = {"status": quantity("registered", ""), "scene_from_object": quantity(transform.matrix, "")}
+        write_json(root / arm / "fine.json", content)
+    write_json(
+        root / "no_crop/fine.json", {"status": quantity("unregistered", ""), "scene_from_object": quantity(None, "")}
+    )
+    return root
+
+
+def scene_of(root: Path, out: Path) -> None:
+    evaluate_scene(
+        model=root / "scene", georeference=root / "georeference.json", cloud=root / "before.ply",
+        truth=root / "truth/scene", evaluation=out, samples=20000, seed=0,
+    )  # fmt: skip
+
+
+def test_a_perfect_scene_has_no_errors(planted: Path, tmp_path: Path) -> None:
+    scene_of(planted, tmp_path / "s.json")
+    result = read_json(tmp_path / "s.json")
+    assert value(result, "registered_share") == 1.0
+    assert value(result, "camera_position_max") < 1e-6
+    assert value(result, "camera_rotation_max_deg") < 1e-4
+    assert value(result, "cloud_distance_median") < 1e-4
+    assert value(result, "terrain_covered") > 0.99
+    assert value(result, "georeference_error_median") is None
+    assert np.allclose(value(result, "truth_from_scene"), TRUTH_FROM_SCENE.matrix, atol=1e-6)
+
+
+def test_georeferencing_is_judged_with_nothing_fitted(planted: Path, tmp_path: Path) -> None:
+    origin = {"origin_latitude_deg": 47.5, "origin_longitude_deg": 8.5, "origin_altitude_m": 428.0}
+    write_json(tmp_path / "g.json", {k: quantity(v, "") for k, v in origin.items()})
+    model_of(ring(7, 9.0, 9.0), Sim3.identity(), tmp_path / "model")
+    evaluate_scene(
+        model=tmp_path / "model", georeference=tmp_path / "g.json", cloud=planted / "before.ply",
+        truth=planted / "truth/scene", evaluation=tmp_path / "s.json", samples=2000, seed=0,
+    )  # fmt: skip
+    assert value(read_json(tmp_path / "s.json"), "georeference_error_median") == pytest.approx(2.0, abs=1e-3)
+
+
+def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Path) -> None:
+    scene_of(planted, tmp_path / "s.json")
+    evaluate_object(
+        cameras=planted / "cameras", masks=planted / "masks", stages=[planted / "stage1", planted / "stage2"],
+        cloud=planted / "object.ply", arms=[planted / arm / "fine.json" for arm in ("full", "no_scale", "no_crop")],
+        before=planted / "before.ply", after=planted / "after.ply", scene_evaluation=tmp_path / "s.json",
+        truth_scene=planted / "truth/scene", truth_object=planted / "truth/thing", evaluation=tmp_path / "o.json",
+        max_photos=5, samples=20000, seed=0,
+    )  # fmt: skip
+    result = read_json(tmp_path / "o.json")
+    assert value(result, "mask_iou_min") == 1.0
+    assert value(result, "stage1_depth_error") < 1e-5
+    # 10 % of a depth of about 5 m, over a diagonal of 2.45 m.
+    assert 0.12 < value(result, "stage2_depth_error") < 0.3
+    assert value(result, "stage1_depth_within_1pct") > 0.999
+    assert value(result, "stage2_depth_within_1pct") == 0.0
+    assert value(result, "cloud_accuracy_90") < 0.01
+    assert value(result, "cloud_completeness_1pct") > 0.97
+    assert value(result, "object_f_score") > 0.98
+    assert value(result, "rotation_error_deg") < 1e-4
+    assert value(result["arms"]["no_scale"], "scale_error_pct") == pytest.approx(2.0, abs=1e-4)
+    assert value(result["arms"]["no_crop"], "object_f_score") is None
+    assert value(result, "scene_f_score_before") < 0.75 < 0.97 < value(result, "scene_f_score_after")
+    assert value(result, "scene_precision_before") > 0.99
+
+
+def test_f_score_by_hand() -> None:
+    precision, recall, score = tr.f_score(np.array([0.1, 0.1, 0.3, 0.3]), np.array([0.1, 0.9, 0.9, 0.9]), 0.2)
+    assert (precision, recall) == (0.5, 0.25)
+    assert score == pytest.approx(2 * 0.5 * 0.25 / 0.75)
+    assert tr.f_score(np.empty(0), np.array([np.inf]), 0.2) == (0.0, 0.0, 0.0)
+
+
+def test_registration_error_by_hand() -> None:
+    turn = rotation_between(np.array([1.0, 0, 0]), np.array([np.cos(0.1), np.sin(0.1), 0]))
+    true, estimated = Sim3(2.0, np.eye(3), np.zeros(3)), Sim3(2.1, turn, np.array([0.0, 0, 0.5]))
+    error = tr.registration_error(estimated, true, np.zeros(3), 10.0)
+    assert error.scale_pct == pytest.approx(5.0)
+    assert error.rotation_deg == pytest.approx(np.degrees(0.1))
+    assert error.translation_over_diagonal == pytest.approx(0.05)
+
+
+def test_one_lost_camera_does_not_spoil_the_fit(tmp_path: Path) -> None:
+    cameras = ring(9, 5.0, 2.0)
+    model_of(cameras, TRUTH_FROM_OBJECT.inverse(), tmp_path / "model")
+    posed = tr.read_posed(tmp_path / "model", cameras)
+    posed.centres[4] += 3.0
+    fit = tr.fit_cameras(posed, cameras)
+    assert fit.truth_from_model.scale == pytest.approx(2.5, abs=1e-6)
+    assert np.median(fit.position) < 1e-6 and fit.position.max() > 5.0
+
+
+def test_samples_lie_on_the_mesh_and_spread_by_area() -> None:
+    mesh = box_mesh([0, 0, 0], [10, 1, 1])
+    points = tr.sample_surface(mesh, 20000, 0)
+    assert tr.distances(mesh.caster(), points).max() < 1e-4
+    ends = (points[:, 0] < 1e-6) | (points[:, 0] > 10 - 1e-6)
+    assert ends.mean() == pytest.approx(2 / 42, abs=0.01)
+    assert np.array_equal(points, tr.sample_surface(mesh, 20000, 0))
+
+
+def test_ground_belongs_to_nobody() -> None:
+    points = np.array([[0, 0, 0.01], [0, 0, 0.9], [9.0, 0, 0]])
+    own = tr.belongs_to_object(
+        points, np.array([0.5, 0.1, 0.1]), np.array([0.01, 0.9, 0.9]), np.zeros(3) - 1, np.ones(3), 0.1
+    )
+    assert own.tolist() == [False, True, False]
+
+
+def test_bad_input_is_named(planted: Path, tmp_path: Path) -> None:
+    with pytest.raises(StageError, match="does not exist; render the demo again"):
+        tr.read_mesh(tmp_path / "none.ply")
+    with pytest.raises(StageError, match="only 0 posed photos"):
+        other = ring(4, 5.0, 2.0)
+        tr.read_posed(
+            planted / "scene", Cameras(["x.jpg"] * 4, other.intrinsics, 96, 72, other.cam_from_world, other.centres)
+        )
+    (tmp_path / "cameras.json").write_text(json.dumps({"photos": {}}))
+    with pytest.raises(StageError, match="is not a truth file"):
+        scene_of_bad = tmp_path
+        evaluate_scene(
+            model=planted / "scene", georeference=planted / "georeference.json", cloud=planted / "before.ply",
+            truth=scene_of_bad, evaluation=tmp_path / "s.json", samples=10, seed=0,
+        )  # fmt: skip

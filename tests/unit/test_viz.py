@@ -1,0 +1,215 @@
+"""The renderer, the sheets and the figures of planted clouds."""
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.clouds import Cloud, write_cloud
+from scenefuse.maps import write_depth
+from scenefuse.stage import StageError, quantity, write_json
+from scenefuse.transforms import Sim3
+from scenefuse.viz.figures import object_figures, scene_figure
+from scenefuse.viz.render import Camera, look_at, orbit_camera, point_radii, render
+from scenefuse.viz.sheets import save_png
+
+GREEN, RED, BLUE = (0, 200, 0), (220, 0, 0), (0, 0, 220)
+
+
+def plane(z, color, size=1.0, count=60):
+    x, y = np.meshgrid(*[np.linspace(-size, size, count)] * 2)
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)
+    return Cloud(points, None, np.tile(np.uint8(color), (len(points), 1)))
+
+
+def join(*clouds):
+    return Cloud(np.concatenate([c.points for c in clouds]), None, np.concatenate([c.colors for c in clouds]))
+
+
+def test_projection_of_a_pinhole_camera_by_hand():
+    camera = Camera(np.eye(3), np.array([0.0, 0.0, -2.0]), 100.0, 64, 48)
+    pixels, depth = camera.project([[0.0, 0.0, 0.0], [0.4, -0.2, 2.0]])
+    np.testing.assert_allclose(pixels, [[32, 24], [32 + 100 * 0.4 / 4, 24 - 100 * 0.2 / 4]])
+    np.testing.assert_allclose(depth, [2, 4])
+
+
+def test_projection_of_an_orthographic_camera_ignores_depth():
+    camera = Camera(np.eye(3), np.zeros(3), 10.0, 64, 48, orthographic=True)
+    pixels, _ = camera.project([[1.0, 2.0, 1.0], [1.0, 2.0, 9.0]])
+    np.testing.assert_allclose(pixels, [[42, 44], [42, 44]])
+
+
+def test_look_at_is_a_rotation_with_up_upwards():
+    rotation = look_at([3.0, 1.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert (rotation @ [0, 0, 1])[1] < 0
+
+
+@pytest.mark.parametrize("orthographic", [False, True])
+@pytest.mark.parametrize("elevation", [90.0, 20.0, -30.0])
+def test_orbit_camera_frames_the_points_up_to_the_margin(orthographic, elevation):
+    points = np.random.default_rng(0).uniform([-3, 4, 0], [1, 9, 2], (500, 3))
+    camera = orbit_camera(points, 70.0, elevation, (200, 150), orthographic=orthographic, margin=0.1)
+    pixels, depth = camera.project(points)
+    assert (depth > 0).all()
+    # The outermost point touches the margin of a tenth on each side: 0.8 of the half image.
+    assert (np.abs(pixels - [100, 75]) / [100, 75]).max() == pytest.approx(0.8)
+
+
+def test_the_nearer_surface_hides_the_farther_one_and_holes_stay_background():
+    camera = orbit_camera(plane(0, RED).points, 0.0, 90.0, (80, 80), orthographic=True, margin=0.0)
+    near = plane(0.5, RED)
+    hole = near[np.abs(near.points[:, :2]).max(1) > 0.4]
+    image = render(join(hole, plane(0.0, GREEN)), camera, 0.03, eye_dome=0.0)
+    np.testing.assert_array_equal(image[40, 40], GREEN)
+    np.testing.assert_array_equal(image[40, 10], RED)
+    alone = render(hole, camera, 0.03, background=BLUE)
+    np.testing.assert_array_equal(alone[40, 40], BLUE)
+
+
+def test_eye_dome_darkens_the_farther_side_of_a_step_only():
+    left = plane(1.0, GREEN)
+    scene = join(left[left.points[:, 0] < 0], plane(0.0, GREEN))
+    camera = orbit_camera(plane(0, RED).points, 0.0, 90.0, (80, 80), orthographic=True)
+    image = render(scene, camera, 0.03)[40, :, 1]
+    assert image[20] == 200 and image[65] == 200
+    assert image.min() < 150
+
+
+def test_a_surface_seen_from_behind_is_darker():
+    camera = orbit_camera(plane(0, RED).points, 0.0, 90.0, (40, 40), orthographic=True)
+    base = plane(0, GREEN)
+    up, down = (Cloud(base.points, np.tile(np.float32([0, 0, s]), (len(base), 1)), base.colors) for s in (1, -1))
+    front, back = (render(c, camera, 0.05)[20, 20, 1] for c in (up, down))
+    assert 100 < back < front <= 200
+
+
+def test_points_behind_the_camera_and_an_empty_cloud_draw_nothing():
+    camera = Camera(np.eye(3), np.array([0.0, 0.0, 5.0]), 50.0, 20, 10)
+    assert (render(plane(0, RED), camera, 0.1) == 255).all()
+    assert (render(plane(0, RED)[np.zeros(3600, dtype=bool)], camera, 0.1) == 255).all()
+
+
+def test_radii_follow_spacing_and_keep_a_lone_point_small():
+    points = np.concatenate([plane(0, RED).points, [[50.0, 0.0, 0.0]]])
+    radii = point_radii(points, factor=1.0, limit=2.0)
+    step = 2.0 / 59
+    assert np.median(radii) == pytest.approx(step, rel=1e-5)
+    assert radii[-1] == pytest.approx(2 * step, rel=1e-5)
+
+
+def test_noise_is_saved_below_a_megabyte(tmp_path):
+    image = np.random.default_rng(0).integers(0, 255, (800, 900, 3), dtype=np.uint8)
+    save_png(tmp_path / "noise.png", image)
+    assert (tmp_path / "noise.png").stat().st_size < 1_000_000
+
+
+def box_surface(count, seed):
+    """Points on the surface of a box 2 x 1 x 1 that stands on z = 0, coloured by side."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (count, 3))
+    side = rng.integers(0, 3, count)
+    points[np.arange(count), side] = rng.choice([-1.0, 1.0], count)
+    colors = np.array([RED, GREEN, BLUE], dtype=np.uint8)[side]
+    return Cloud((points * [1.0, 0.5, 0.5]) + [0, 0, 0.5], None, colors)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """Everything the figures read, for a box whose lower half the scene misses."""
+    folder = tmp_path_factory.mktemp("capture")
+    whole = box_surface(6000, 0)
+    half = whole[whole.points[:, 2] > 0.5]
+    ground = plane(0.0, (120, 120, 120), size=4.0, count=80)
+    scene = join(ground, half)
+    added = whole[whole.points[:, 2] <= 0.5]
+    fused = join(scene, added)
+    source = np.repeat(np.uint8([0, 1]), [len(scene), len(added)])
+    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    write_cloud(folder / "dense.ply", scene)
+    write_cloud(folder / "fused_scene.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
+    write_cloud(folder / "crop.ply", half)
+    write_cloud(folder / "object.ply", whole.transformed(pose.inverse()))
+    write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], "")})
+    write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
+    model = pycolmap.Reconstruction()
+    pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
+    model.add_camera_with_trivial_rig(pinhole)
+    (folder / "cameras/images").mkdir(parents=True)
+    (folder / "cameras/sparse").mkdir()
+    (folder / "masks").mkdir()
+    for k in range(4):
+        camera = orbit_camera(whole.points, 90.0 * k, 20.0, (64, 48))
+        pose_of_camera = pycolmap.Rigid3d(
+            pycolmap.Rotation3d(camera.cam_from_world), -camera.cam_from_world @ camera.centre
+        )
+        image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k + 1)
+        model.add_image_with_trivial_frame(image, pose_of_camera)
+        picture = render(whole, camera, 0.05)
+        cv2.imwrite(str(folder / f"cameras/images/{k}.png"), picture)
+        cv2.imwrite(str(folder / f"masks/{k}.png"), (picture.min(2) < 255).astype(np.uint8) * 255)
+        write_depth(folder / f"stage1/depth_maps/{k}.png.bin", np.full((24, 32), 3.0, dtype=np.float32))
+    model.write(folder / "cameras/sparse")
+    for stage in (2, 3, 4):
+        (folder / f"stage{stage}").mkdir()
+    return folder
+
+
+def draw(capture, fine, figures):
+    write_json(capture / "fine.json", fine)
+    object_figures(
+        name="box",
+        scene=capture / "dense.ply",
+        fused_scene=capture / "fused_scene.ply",
+        crop=capture / "crop.ply",
+        crop_report=capture / "crop.json",
+        object_cloud=capture / "object.ply",
+        fine=capture / "fine.json",
+        metrics=capture / "metrics.json",
+        cameras=capture / "cameras",
+        masks=capture / "masks",
+        stage1=capture / "stage1",
+        stage2=capture / "stage2",
+        stage3=capture / "stage3",
+        stage4=capture / "stage4",
+        figures=figures,
+    )
+
+
+def test_figures_show_what_was_added(capture, tmp_path):
+    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
+    draw(capture, fine, tmp_path / "figures")
+    names = {"before_after.png", "provenance.png", "registration.png", "object.png", "before.png", "after.png"}
+    assert {p.name for p in (tmp_path / "figures").iterdir()} == names
+    assert all(p.stat().st_size < 1_000_000 for p in (tmp_path / "figures").iterdir())
+    before, after = (cv2.imread(str(tmp_path / f"figures/{n}.png")).astype(float) for n in ("before", "after"))
+    assert (np.abs(before - after).max(2) > 40).mean() > 0.02
+    colors = cv2.cvtColor(cv2.imread(str(tmp_path / "figures/provenance.png")), cv2.COLOR_BGR2RGB).astype(int)
+    assert (colors[..., 0] - colors[..., 2] > 60).mean() > 0.01
+
+
+def test_a_refused_object_without_a_pose_still_gets_its_figures(capture, tmp_path):
+    fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit equally well", "")}
+    draw(capture, fine, tmp_path / "figures")
+    assert (tmp_path / "figures/registration.png").is_file()
+
+
+def test_an_object_far_from_the_scene_is_named(capture, tmp_path):
+    pose = Sim3(2.0, np.eye(3), np.array([500.0, 0, 0]))
+    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
+    with pytest.raises(StageError, match="no points around box"):
+        draw(capture, fine, tmp_path / "figures")
+    assert not (tmp_path / "figures").exists()
+
+
+def test_scene_figure(capture, tmp_path):
+    figure = tmp_path / "scene.png"
+    arguments = {"name": "demo", "dense": capture / "dense.ply", "georeferenced": capture / "cameras/sparse"}
+    scene_figure(**arguments, crops=[capture / "crop.ply"], objects=["box"], figure=figure)
+    picture = cv2.imread(str(figure)).astype(int)
+    # Camera markers are red on a grey scene.
+    assert ((picture[..., 2] > 180) & (picture[..., 1] < 70)).sum() > 50
+    with pytest.raises(StageError, match="1 crops but 2 object names"):
+        scene_figure(**arguments, crops=[capture / "crop.ply"], objects=["a", "b"], figure=figure)
