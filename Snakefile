@@ -1,0 +1,32 @@
+# Completes objects in a drone reconstruction with evidence from close-up photos: scene -> objects -> join -> summary.
+#   snakemake --cores 2                                        everything
+#   snakemake --cores 2 results/objects/house/fused.ply        one object
+#   snakemake -n                                               what would run
+from snakemake.utils import min_version
+
+min_version("9.20")
+
+
+configfile: workflow.source_path("config/config.yaml")
+
+
+report: "workflow/report/workflow.rst"
+
+
+resource_scopes:
+    gpu="local",
+
+
+include: "workflow/rules/common.smk"
+include: "workflow/rules/demo.smk"
+include: "workflow/rules/scene.smk"
+include: "workflow/rules/object.smk"
+include: "workflow/rules/join.smk"
+include: "workflow/rules/summary.smk"
+
+
+rule all:
+    default_target: True
+    input:
+        "results/summary/summary.txt",
+        "results/summary/report.html",

@@ -1,0 +1,119 @@
+# The demo: a synthetic drone capture with known truth.
+#
+# INPUTS    none; config: demo, seed
+# OUTPUTS   results/demo/{scene}/scene/photos/              the flight, GPS with noise in its EXIF
+#           results/demo/{scene}/{object}/photos/           an orbit of each object
+#           results/demo/{scene}/{object}/fiducials.tsv     what a person would click in the flight's photos
+#           results/demo/{scene}/{object}/prompts.tsv       what a person would click in the object's photos
+#           results/demo/{scene}/truth/                     cameras, surfaces, masks; read by evaluation only
+DEMO_OBJECTS = "house|balloon|sculpture"
+
+
+rule demo_scene:
+    """Render the mapping flight."""
+    output:
+        photos=directory("results/demo/{scene}/scene/photos"),
+        truth=directory("results/demo/{scene}/truth/scene"),
+    log:
+        "results/logs/demo_scene/{scene}.log",
+    benchmark:
+        "results/benchmarks/demo_scene/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        options=flags(config["demo"]["flight"]),
+        seed=config["seed"],
+        code=code("demo_scene.py"),
+    message:
+        "Demo {wildcards.scene}: rendering the flight"
+    shell:
+        "exec python {SCRIPTS}/demo_scene.py --photos {output.photos} --truth {output.truth} --seed {params.seed}"
+        " {params.options} &> {log}"
+
+
+rule demo_object:
+    """Render the photos around one object."""
+    output:
+        photos=directory("results/demo/{scene}/{object}/photos"),
+        truth=directory("results/demo/{scene}/truth/{object}"),
+    log:
+        "results/logs/demo_object/{scene}-{object}.log",
+    benchmark:
+        "results/benchmarks/demo_object/{scene}-{object}.tsv"
+    wildcard_constraints:
+        object=DEMO_OBJECTS,
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=4000,
+        runtime=30,
+    params:
+        options=flags(config["demo"]["orbit"]),
+        seed=config["seed"],
+        code=code("demo_object.py"),
+    message:
+        "Demo {wildcards.scene}: rendering the photos around the {wildcards.object}"
+    shell:
+        "exec python {SCRIPTS}/demo_object.py --name {wildcards.object} --photos {output.photos} --truth {output.truth}"
+        " --seed {params.seed} {params.options} &> {log}"
+
+
+rule demo_fiducials:
+    """Click the object in the flight's photos, as a person would: a pixel or so off, where it can be seen."""
+    input:
+        "results/demo/{scene}/truth/scene",
+    output:
+        "results/demo/{scene}/{object}/fiducials.tsv",
+    log:
+        "results/logs/demo_fiducials/{scene}-{object}.log",
+    benchmark:
+        "results/benchmarks/demo_fiducials/{scene}-{object}.tsv"
+    wildcard_constraints:
+        object=DEMO_OBJECTS,
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    params:
+        options=flags(config["demo"]["fiducials"]),
+        seed=config["seed"],
+        code=code("demo_clicks.py"),
+    message:
+        "Demo {wildcards.scene}: clicking the {wildcards.object} in the flight's photos"
+    shell:
+        "exec python {SCRIPTS}/demo_clicks.py --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
+        " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"
+
+
+rule demo_prompts:
+    """Click the object in a few of its own photos; these points prompt the masks."""
+    input:
+        "results/demo/{scene}/truth/{object}",
+    output:
+        "results/demo/{scene}/{object}/prompts.tsv",
+    log:
+        "results/logs/demo_prompts/{scene}-{object}.log",
+    benchmark:
+        "results/benchmarks/demo_prompts/{scene}-{object}.tsv"
+    wildcard_constraints:
+        object=DEMO_OBJECTS,
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    params:
+        options=flags(config["demo"]["prompts"]),
+        seed=config["seed"],
+        code=code("demo_clicks.py"),
+    message:
+        "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
+    shell:
+        "exec python {SCRIPTS}/demo_clicks.py --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
+        " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"
