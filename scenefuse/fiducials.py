@@ -1,0 +1,220 @@
+"""Points that a person marked: clicks in photos, triangulated through the cameras, or points in the scene frame."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from scenefuse.stage import StageError
+
+Array = NDArray[np.float64]
+CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
+POINT_COLUMNS = ["point", "x", "y", "z"]
+
+
+@dataclass(frozen=True)
+class Clicks:
+    """Pixels clicked in photos.
+
+    Attributes:
+        path: the file they come from, for messages.
+        points: N point names; a point appears once for each photo it was clicked in.
+        photos: N photo names.
+        pixels: (N, 2) x and y in pixels of the original photo, pixel centres at +0.5.
+    """
+
+    path: Path
+    points: list[str]
+    photos: list[str]
+    pixels: Array
+
+
+@dataclass(frozen=True)
+class ScenePoints:
+    """Points given by their coordinates in the scene frame.
+
+    Attributes:
+        path: the file they come from, for messages.
+        points: N point names.
+        positions: (N, 3) coordinates.
+    """
+
+    path: Path
+    points: list[str]
+    positions: Array
+
+
+def read_points(path: Path) -> Clicks | ScenePoints:
+    """Read a tab-separated file of clicks (point, photo, x_px, y_px) or of scene points (point, x, y, z).
+
+    Raises:
+        StageError: the file is missing or empty, its header is neither of the two, or a line is not well formed.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (FileNotFoundError, IsADirectoryError):
+        raise StageError(f"the file of marked points {path} does not exist; write it, or correct its path") from None
+    except UnicodeDecodeError:
+        raise StageError(f"{path} is no text; save the marked points as tab-separated text (UTF-8)") from None
+    rows = [(n, line.split("\t")) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
+    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    if header not in (CLICK_COLUMNS, POINT_COLUMNS):
+        raise StageError(
+            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z', "
+            f"not with '{' '.join(header)}'"
+        )
+    if len(rows) == 1:
+        raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
+    texts = 2 if header == CLICK_COLUMNS else 1
+    names: list[list[str]] = []
+    numbers: list[list[float]] = []
+    for number, cells in rows[1:]:
+        try:
+            if len(cells) != 4:
+                raise ValueError
+            values = [float(cell) for cell in cells[texts:]]
+            if not np.isfinite(values).all():
+                raise ValueError
+        except ValueError:
+            raise StageError(
+                f"{path}, line {number}: expected {' '.join(header)} separated by tabs, got '{' '.join(cells)}'"
+            ) from None
+        names.append([cell.strip() for cell in cells[:texts]])
+        numbers.append(values)
+    keys = [tuple(entry) for entry in names]
+    for key in keys:
+        if keys.count(key) > 1:
+            raise StageError(f"{path}: {' in '.join(key)} is given more than once; keep one line of it")
+    if header == POINT_COLUMNS:
+        return ScenePoints(path, [n[0] for n in names], np.array(numbers))
+    return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
+
+
+def triangulate(
+    clicks: Clicks,
+    model: pycolmap.Reconstruction,
+    max_residual_px: float,
+    sizes: Mapping[str, tuple[int, int]] | None = None,
+) -> tuple[list[str], Array, Array]:
+    """Positions of clicked points in the frame of a COLMAP model, through its cameras and their distortion.
+
+    Linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on the reprojection error.
+
+    Args:
+        clicks: two or more photos per point.
+        model: of the photos that were clicked in (not of undistorted ones).
+        max_residual_px: a point with a larger RMS reprojection error is an error, in pixels of the model's photos.
+        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies.
+
+    Returns:
+        Point names in order of appearance, (P, 3) positions, (P,) RMS reprojection errors in pixels.
+
+    Raises:
+        StageError: a photo that the model does not hold, a click outside its photo, a point with fewer than two clicks
+            in registered photos, rays that are parallel or miss each other. Each message names the point.
+    """
+    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    seen: dict[str, list[tuple[str, Array]]] = {}
+    lost: dict[str, list[str]] = {}
+    for point, photo, pixel in zip(clicks.points, clicks.photos, clicks.pixels):
+        seen.setdefault(point, [])
+        if photo in images:
+            seen[point].append((photo, _model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))
+        elif sizes is not None and photo in sizes:
+            lost.setdefault(point, []).append(photo)
+        else:
+            raise StageError(
+                f"{clicks.path}: point {point} is clicked in {photo}, which is not among the {len(images)} "
+                f"registered photos; click in one of them ({', '.join(sorted(images)[:3])}, ...)"
+            )
+    for point, observed in seen.items():
+        if len(observed) < 2:
+            why = f" ({', '.join(lost[point])} could not be registered)" if point in lost else ""
+            raise StageError(
+                f"{clicks.path}: the number of registered photos in which point {point} is clicked is "
+                f"{len(observed)}{why}; two or more are needed, click it in another one"
+            )
+    positions, residuals = [], []
+    for point, observed in seen.items():
+        where = ", ".join(name for name, _ in observed)
+        position, residual = _intersect([images[name] for name, _ in observed], np.array([p for _, p in observed]))
+        if position is None:
+            raise StageError(
+                f"{clicks.path}: the rays to point {point} from {where} are parallel or meet behind a camera; "
+                f"correct the clicks, or click it in photos taken from more different places"
+            )
+        if residual > max_residual_px:
+            raise StageError(
+                f"{clicks.path}: the clicks on point {point} miss each other by {residual:.1f} px (limit "
+                f"{max_residual_px:g} px); check that it is the same spot in {where}"
+            )
+        positions.append(position)
+        residuals.append(residual)
+    return list(seen), np.array(positions), np.array(residuals)
+
+
+def locate(
+    path: Path, model: Path, max_residual_px: float, sizes: Mapping[str, tuple[int, int]] | None = None
+) -> tuple[list[str], Array, Array]:
+    """Marked points of either kind in the frame of a COLMAP model (scene points are taken to be in it already).
+
+    Returns:
+        Names, (P, 3) positions, (P,) residuals in pixels, which are 0 for points given by coordinates.
+    """
+    marked = read_points(path)
+    if isinstance(marked, ScenePoints):
+        return marked.points, marked.positions, np.zeros(len(marked.points))
+    return triangulate(marked, pycolmap.Reconstruction(model), max_residual_px, sizes)
+
+
+def _model_pixel(
+    path: Path,
+    point: str,
+    photo: str,
+    pixel: Array,
+    image: pycolmap.Image,
+    sizes: Mapping[str, tuple[int, int]] | None,
+) -> Array:
+    """A click (2,) in pixels of the model's photo; StageError when it lies outside."""
+    assert image.camera is not None
+    own = (image.camera.width, image.camera.height)
+    clicked = own if sizes is None else sizes.get(photo, own)
+    if not (0 <= pixel[0] <= clicked[0] and 0 <= pixel[1] <= clicked[1]):
+        raise StageError(
+            f"{path}: the click on point {point} at ({pixel[0]:g}, {pixel[1]:g}) lies outside {photo}, which has "
+            f"{clicked[0]} x {clicked[1]} pixels; correct the click"
+        )
+    return pixel * np.array(own) / np.array(clicked)
+
+
+def _intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
+    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet."""
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    cameras = [image.camera for image in images if image.camera is not None]
+    normalised = np.array([camera.cam_from_img(pixel) for camera, pixel in zip(cameras, pixels)])
+    rows = normalised[:, :, None] * poses[:, 2:3, :] - poses[:, :2, :]
+    system = rows.reshape(-1, 4)
+    homogeneous = np.linalg.svd(system)[2][3]
+    if abs(homogeneous[3]) < 1e-9 * np.linalg.norm(homogeneous[:3]):
+        return None, np.inf
+    position = homogeneous[:3] / homogeneous[3]
+    for _ in range(10):
+        in_cam = poses[:, :, :3] @ position + poses[:, :, 3]
+        if (in_cam[:, 2] <= 0).any():
+            return None, np.inf
+        error = in_cam[:, :2] / in_cam[:, 2:] - normalised
+        # d(x/z, y/z) = (row_xy - (xy / z) row_z) / z
+        slope = (poses[:, :2, :3] - (in_cam[:, :2] / in_cam[:, 2:])[:, :, None] * poses[:, 2:3, :3]) / in_cam[
+            :, 2:, None
+        ]
+        step, _, rank, _ = np.linalg.lstsq(slope.reshape(-1, 3), -error.reshape(-1), rcond=1e-6)
+        if rank < 3:
+            return None, np.inf
+        position = position + step
+    reprojected = [image.project_point(position) for image in images]
+    if any(p is None for p in reprojected):
+        return None, np.inf
+    return position, float(np.sqrt(((np.array(reprojected) - pixels) ** 2).sum(1).mean()))

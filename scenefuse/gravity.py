@@ -1,0 +1,68 @@
+"""Which way is up in a reconstruction that no GPS has turned upright."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+# RMS sine (about 8 degrees) by which the cameras' x axes have to leave one line to fix the vertical on their own.
+MIN_AXIS_SPREAD = 0.15
+
+
+def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
+    """The direction opposite to gravity, and the cue it comes from.
+
+    Photos are mostly held level: a camera's x axis is horizontal whatever its heading and pitch. Where headings
+    differ, up is the direction most nearly orthogonal to all x axes (robustly: a few rolled photos do no harm).
+    Where all x axes lie on one line (a nadir flight in strips, or a walk along a wall), up may be any direction
+    around that line; it is then the mean image-up side, or opposite to the mean viewing direction, whichever of the two
+
+    - keeps more cameras from standing on their head (a flight back along the next strip turns photos by 180 degrees),
+    - else lets the camera centres move less along it (flights and walks keep their height).
+
+    Nothing tells one nadir strip from a walk along a wall, both straight; the walk is assumed.
+
+    Args:
+        world_from_cam: (N, 3, 3) camera rotations, OpenCV axes.
+        centres: (N, 3) camera centres, in any unit.
+
+    Returns:
+        (3,) unit vector in the world frame, and "headings", "image up" or "viewing direction".
+    """
+    x, y, z = (world_from_cam[:, :, k] for k in range(3))
+    up, spread = _orthogonal_to_all(x)
+    if spread >= MIN_AXIS_SPREAD:
+        # Image-up sides and looking down both speak for a sign; for nadir photos only the latter does.
+        return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings"
+    line = np.linalg.eigh(x.T @ x)[1][:, 2]
+    candidates = {"image up": -y.mean(0), "viewing direction": -z.mean(0)}
+    levelled = {cue: _unit(d - (d @ line) * line) for cue, d in candidates.items() if np.linalg.norm(d) > 0.1}
+    if not levelled:
+        return up, "headings"
+    upright = {cue: float(np.mean(-(y @ d) > -0.2)) for cue, d in levelled.items()}
+    best = max(upright.values())
+    fair = [cue for cue in levelled if upright[cue] > best - 0.2]
+    travel = {cue: float(np.std(centres @ levelled[cue])) for cue in fair}
+    # Image up comes first in the dictionary, so it wins unless the other is clearly better.
+    chosen = min(fair, key=lambda cue: travel[cue] * (1.0 if cue == "image up" else 2.0))
+    return levelled[chosen], chosen
+
+
+def roll_spread_deg(world_from_cam: Array, up: Array) -> float:
+    """Median angle in degrees between the cameras' x axes and the horizontal plane: small when `up` explains them."""
+    return float(np.degrees(np.median(np.arcsin(np.clip(np.abs(world_from_cam[:, :, 0] @ up), 0.0, 1.0)))))
+
+
+def _orthogonal_to_all(x: Array) -> tuple[Array, float]:
+    """The direction most nearly orthogonal to (N, 3) axes by robust least squares, and their RMS spread across it."""
+    weights = np.ones(len(x))
+    for _ in range(20):
+        moment = (weights[:, None] * x).T @ x / weights.sum()
+        values, vectors = np.linalg.eigh(moment)
+        sine = x @ vectors[:, 0]
+        weights = 1.0 / (1.0 + (sine / 0.1) ** 2)
+    return vectors[:, 0], float(np.sqrt(max(values[1], 0.0)))
+
+
+def _unit(direction: Array) -> Array:
+    return direction / np.linalg.norm(direction)

@@ -1,0 +1,92 @@
+"""The whole workflow on a tiny capture: what it writes, what a second run does, what an edit reruns."""
+
+import json
+import re
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from conftest import ROOT
+
+from scenefuse.clouds import read_cloud
+
+
+@pytest.fixture(scope="session")
+def finished(tmp_path_factory, snakemake):
+    """A working directory in which the whole tiny workflow has run."""
+    directory = tmp_path_factory.mktemp("tiny")
+    result = snakemake(directory)
+    assert result.returncode == 0, result.stdout[-6000:]
+    return directory
+
+
+def planned(output: str) -> set[str]:
+    """Rules that a dry run lists."""
+    return set(re.findall(r"^([a-z0-9_]+) +\d+$", output, re.MULTILINE)) - {"total"}
+
+
+def test_everything_a_user_reads_is_there(finished):
+    results = finished / "results"
+    for name in ("registration", "completion", "ablation", "runtime", "scenes", "objects"):
+        assert len(pd.read_csv(results / f"summary/{name}.tsv", sep="\t")) > 0
+    assert "house" in (results / "summary/summary.txt").read_text()
+    assert "<img" in (results / "summary/report.html").read_text()
+    assert {"before_after.png", "object.png"} <= {p.name for p in (results / "objects/house/figures").iterdir()}
+
+
+def test_the_object_is_registered_where_it_really_is(finished):
+    fine = json.loads((finished / "results/objects/house/registration/full/fine.json").read_text())
+    truth = json.loads((finished / "results/objects/house/truth.json").read_text())
+    assert fine["status"]["value"] == "registered", fine["reason"]
+    assert abs(truth["scale_error_pct"]["value"]) <= 2.0
+    assert truth["rotation_error_deg"]["value"] <= 2.0
+    assert truth["translation_error_over_diagonal"]["value"] <= 0.01
+
+
+def test_fusion_completes_and_keeps_the_provenance_of_every_point(finished):
+    house = finished / "results/objects/house"
+    truth = json.loads((house / "truth.json").read_text())
+    assert truth["scene_f_score_after"]["value"] > truth["scene_f_score_before"]["value"]
+    fused = read_cloud(house / "fused_scene.ply")
+    scene = read_cloud(finished / "results/scenes/demo/dense.ply")
+    added = fused.fields["source"] == 1
+    assert (~added).sum() == len(scene) and added.sum() > 0
+    assert (fused.fields["views"][added] >= 2).all()
+    assert (house / "fused_scene.laz").stat().st_size > 0
+
+
+def test_transforms_in_the_ledger_agree_with_the_registration(finished):
+    house = finished / "results/objects/house"
+    ledger = json.loads((house / "frames.json").read_text())
+    fine = json.loads((house / "registration/full/fine.json").read_text())
+    assert np.allclose(ledger["scene_from_object"]["value"], fine["scene_from_object"]["value"], atol=1e-12)
+
+
+def test_a_second_run_does_nothing(finished, snakemake):
+    assert "Nothing to be done" in snakemake(finished).stdout
+
+
+@pytest.mark.parametrize(
+    "edit, rules",
+    [
+        (
+            {"metrics": {"tau_fraction": 0.02}},
+            {"metrics", "arm_metrics", "object_figures", "summary", "report_page", "all"},
+        ),
+        (
+            {"fusion": {"fill_spacings": 2.0}},
+            {"fuse", "metrics", "evaluate_object", "object_figures", "summary", "report_page", "all"},
+        ),
+    ],
+    ids=["metrics", "fusion"],
+)
+def test_an_edited_setting_reruns_only_what_depends_on_it(finished, snakemake, tmp_path, edit, rules):
+    tiny = yaml.safe_load((ROOT / "tests/data/tiny.yaml").read_text())
+    (tmp_path / "edited.yaml").write_text(yaml.safe_dump(tiny | edit))
+    assert planned(snakemake(finished, "--dry-run", config=tmp_path / "edited.yaml").stdout) == rules
+
+
+def test_one_object_is_a_target(finished, snakemake):
+    result = snakemake(finished, "--dry-run", "--forcerun", "fuse", "results/objects/house/fused.ply")
+    assert planned(result.stdout) == {"fuse"}

@@ -1,0 +1,134 @@
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.fiducials import Clicks, ScenePoints, locate, read_points, triangulate
+from scenefuse.stage import StageError
+
+POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
+
+
+@pytest.fixture(scope="module")
+def model():
+    """Three cameras with strong distortion, 5 units away, looking at the origin from 0, 30 and 60 degrees."""
+    reconstruction = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 500.0, 640, 480)
+    camera.params = [500.0, 320.0, 240.0, 0.1]
+    reconstruction.add_camera_with_trivial_rig(camera)
+    for index, angle in enumerate(np.radians([0.0, 30.0, 60.0]), 1):
+        rotation = np.array([[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), np.array([0.0, 0.0, 5.0]))
+        image = pycolmap.Image(name=f"{index}.jpg", camera_id=1, image_id=index)
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    return reconstruction
+
+
+def clicked(model, tmp_path, points=POINTS, photos=("1.jpg", "2.jpg", "3.jpg"), shift=(0.0, 0.0), scale=1.0):
+    """Clicks where the model sees the points; `shift` moves the first click."""
+    images = {image.name: image for image in model.images.values()}
+    names, files, pixels = [], [], []
+    for name, position in points.items():
+        for photo in photos:
+            names.append(name)
+            files.append(photo)
+            pixels.append(images[photo].project_point(np.array(position)) * scale)
+    pixels[0] = pixels[0] + shift
+    return Clicks(tmp_path / "fiducials.tsv", names, files, np.array(pixels))
+
+
+def test_clicks_are_triangulated_through_the_distortion(model, tmp_path):
+    names, positions, residuals = triangulate(clicked(model, tmp_path), model, 5.0)
+    assert names == ["roof", "door"]
+    np.testing.assert_allclose(positions, list(POINTS.values()), atol=1e-7)
+    assert residuals.max() < 1e-5
+
+
+def test_two_noisy_photos_give_a_small_residual(model, tmp_path):
+    clicks = clicked(model, tmp_path, photos=("1.jpg", "3.jpg"), shift=(0.0, 2.0))
+    _, positions, residuals = triangulate(clicks, model, 5.0)
+    # A vertical error of 2 px between two level cameras is split into one pixel each.
+    assert residuals[0] == pytest.approx(1.0, abs=0.1)
+    assert np.linalg.norm(positions[0] - POINTS["roof"]) < 0.03
+
+
+def test_clicks_in_larger_originals_are_scaled(model, tmp_path):
+    clicks = clicked(model, tmp_path, scale=2.0)
+    sizes = {f"{i}.jpg": (1280, 960) for i in (1, 2, 3)}
+    _, positions, _ = triangulate(clicks, model, 5.0, sizes)
+    np.testing.assert_allclose(positions, list(POINTS.values()), atol=1e-7)
+
+
+def with_click(clicks, index, photo=None, pixel=None):
+    photos, pixels = list(clicks.photos), clicks.pixels.copy()
+    if photo is not None:
+        photos[index] = photo
+    if pixel is not None:
+        pixels[index] = pixel
+    return Clicks(clicks.path, clicks.points, photos, pixels)
+
+
+def test_error_sentences_name_the_point(model, tmp_path):
+    clicks = clicked(model, tmp_path)
+    with pytest.raises(StageError, match=r"point door is clicked in 9\.jpg, which is not among the 3 registered"):
+        triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0)
+    with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
+        triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
+    with pytest.raises(StageError, match=r"point door miss each other by .* px \(limit 5 px\).*1\.jpg, 2\.jpg, 3\.jpg"):
+        triangulate(with_click(clicks, 3, pixel=clicks.pixels[3] + [0, 60]), model, 5.0)
+    single = clicked(model, tmp_path, photos=("2.jpg",))
+    with pytest.raises(StageError, match="in which point roof is clicked is 1; two or more are needed"):
+        triangulate(single, model, 5.0)
+
+
+def test_a_click_in_a_photo_that_was_not_registered_is_left_out(model, tmp_path):
+    sizes = {f"{i}.jpg": (640, 480) for i in range(1, 5)}
+    clicks = with_click(clicked(model, tmp_path), 0, photo="4.jpg")
+    _, positions, _ = triangulate(clicks, model, 5.0, sizes)
+    np.testing.assert_allclose(positions[0], POINTS["roof"], atol=1e-7)
+    two = with_click(clicked(model, tmp_path, photos=("1.jpg", "2.jpg")), 0, photo="4.jpg")
+    with pytest.raises(StageError, match=r"is 1 \(4\.jpg could not be registered\)"):
+        triangulate(two, model, 5.0, sizes)
+
+
+def test_parallel_rays(model, tmp_path):
+    clicks = Clicks(tmp_path / "f.tsv", ["p", "p"], ["1.jpg", "1.jpg"], np.array([[300.0, 200.0]] * 2))
+    with pytest.raises(StageError, match="the rays to point p .* are parallel"):
+        triangulate(clicks, model, 5.0)
+
+
+def test_both_kinds_of_file(tmp_path):
+    path = tmp_path / "f.tsv"
+    path.write_text("point\tphoto\tx_px\ty_px\nroof\ta.jpg\t10\t20.5\n\nroof\tb.jpg\t1\t2\n")
+    clicks = read_points(path)
+    assert isinstance(clicks, Clicks) and clicks.photos == ["a.jpg", "b.jpg"]
+    np.testing.assert_array_equal(clicks.pixels, [[10, 20.5], [1, 2]])
+    path.write_text("point\tx\ty\tz\na\t1\t2\t3\nb\t4\t5\t6e1\n")
+    points = read_points(path)
+    assert isinstance(points, ScenePoints) and points.points == ["a", "b"]
+    names, positions, residuals = locate(path, tmp_path / "no model needed", 5.0)
+    np.testing.assert_array_equal(positions, [[1, 2, 3], [4, 5, 60]])
+    assert names == ["a", "b"] and not residuals.any()
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("", "has to begin with the tab-separated header"),
+        ("point x y z\na 1 2 3\n", "has to begin with the tab-separated header"),
+        ("point\tx\ty\tz\n", "holds no points below its header"),
+        ("point\tx\ty\tz\na\t1\t2\n", "line 2: expected point x y z separated by tabs, got 'a 1 2'"),
+        ("point\tx\ty\tz\na\t1\t2\tnan\n", "line 2"),
+        ("point\tphoto\tx_px\ty_px\na\tp.jpg\t1\ttwo\n", "line 2"),
+        ("point\tphoto\tx_px\ty_px\na\tp.jpg\t1\t2\na\tp.jpg\t3\t4\n", "a in p.jpg is given more than once"),
+    ],
+)
+def test_bad_files(tmp_path, text, sentence):
+    path = tmp_path / "f.tsv"
+    path.write_text(text)
+    with pytest.raises(StageError, match=sentence):
+        read_points(path)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(StageError, match=r"f\.tsv does not exist"):
+        read_points(tmp_path / "f.tsv")

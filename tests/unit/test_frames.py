@@ -1,0 +1,109 @@
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from scenefuse.objects.frames import FrameSettings, extract_frames, original_sizes, sharpness, thin_out
+from scenefuse.photos import read_photos
+from scenefuse.stage import StageError, read_json, value
+
+SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64, jpeg_quality=95)
+
+
+def picture(width=64, height=48, seed=0):
+    return np.random.default_rng(seed).integers(0, 255, (height, width, 3), dtype=np.uint8)
+
+
+def folder_of(tmp_path, sizes, suffix=".png"):
+    folder = tmp_path / "photos"
+    folder.mkdir()
+    for index, (width, height) in enumerate(sizes):
+        Image.fromarray(picture(width, height, index)).save(folder / f"{index:02d}{suffix}")
+    return folder
+
+
+def extract(tmp_path, source, settings=SETTINGS):
+    extract_frames(source=source, frames=tmp_path / "frames", photos=tmp_path / "photos.json", settings=settings)
+    return read_photos(tmp_path / "photos.json"), read_json(tmp_path / "photos.json")
+
+
+def test_narrow_photos_are_copied_and_wide_ones_scaled(tmp_path):
+    folder = folder_of(tmp_path, [(64, 48), (128, 96), (32, 24)])
+    photos, content = extract(tmp_path, folder)
+    assert [(p.name, p.width, p.height) for p in photos] == [
+        ("00.png", 64, 48),
+        ("01.png", 64, 48),
+        ("02.png", 32, 24),
+    ]
+    assert (tmp_path / "frames" / "00.png").read_bytes() == (folder / "00.png").read_bytes()
+    assert original_sizes(content) == {"00.png": (64, 48), "01.png": (128, 96), "02.png": (32, 24)}
+    assert value(content, "kind") == "photos"
+
+
+def test_rotated_photos_are_stood_upright_and_keep_their_focal_length(tmp_path):
+    folder = folder_of(tmp_path, [(60, 40)] * 3, ".jpg")
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    exif[0x8769] = {0xA405: 36}
+    Image.fromarray(picture(60, 40)).save(folder / "00.jpg", exif=exif)
+    photos, content = extract(tmp_path, folder)
+    assert (photos[0].width, photos[0].height, photos[0].orientation) == (40, 60, 1)
+    assert photos[0].focal_px == pytest.approx(60.0)
+    assert original_sizes(content)["00.jpg"] == (40, 60)
+
+
+def test_step_and_limit(tmp_path):
+    assert thin_out(10, 3, 0) == [0, 3, 6, 9]
+    assert thin_out(101, 1, 3) == [0, 50, 100]
+    assert thin_out(4, 1, 9) == [0, 1, 2, 3]
+    folder = folder_of(tmp_path, [(64, 48)] * 9)
+    photos, _ = extract(tmp_path, folder, FrameSettings(2, 3, 64, 95))
+    assert [p.name for p in photos] == ["00.png", "04.png", "08.png"]
+
+
+def test_the_sharpest_frame_of_each_window_of_a_video_is_kept(tmp_path):
+    path = tmp_path / "walk.avi"
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (128, 96))
+    sharp = {2, 5, 11, 12}
+    for index in range(16):
+        frame = cv2.resize(picture(32, 24, index), (128, 96), interpolation=cv2.INTER_NEAREST)
+        video.write(frame if index in sharp else cv2.GaussianBlur(frame, (0, 0), 6.0))
+    video.release()
+    photos, content = extract(tmp_path, path, FrameSettings(4, 0, 64, 95))
+    assert value(content, "kind") == "video"
+    origin = value(content, "origin")
+    chosen = [origin[p.name]["frame"] for p in photos]
+    # Windows 0 to 3, 4 to 7, 8 to 11, 12 to 15.
+    assert chosen == [2, 5, 11, 12]
+    assert (photos[0].width, photos[0].height) == (64, 48)
+    assert original_sizes(content)[photos[0].name] == (128, 96)
+
+
+def test_blur_lowers_sharpness():
+    frame = picture()
+    assert sharpness(cv2.GaussianBlur(frame, (0, 0), 2.0)) < 0.2 * sharpness(frame)
+
+
+def test_bad_sources(tmp_path):
+    with pytest.raises(StageError, match="nowhere do not exist"):
+        extract(tmp_path, tmp_path / "nowhere")
+    (tmp_path / "list.txt").write_text("x")
+    with pytest.raises(StageError, match="neither a folder of photos nor a video"):
+        extract(tmp_path, tmp_path / "list.txt")
+    (tmp_path / "broken.mp4").write_bytes(b"x" * 100)
+    with pytest.raises(StageError, match=r"broken\.mp4 cannot be decoded"):
+        extract(tmp_path, tmp_path / "broken.mp4")
+    assert not (tmp_path / "frames").exists()
+
+
+def test_too_few_frames_leave_nothing_behind(tmp_path):
+    with pytest.raises(StageError, match="yields 2 frames, at least 3"):
+        extract(tmp_path, folder_of(tmp_path, [(64, 48)] * 2))
+    assert not (tmp_path / "frames").exists() and not (tmp_path / "photos.json").exists()
+
+
+def test_frames_that_would_share_a_mask(tmp_path):
+    folder = folder_of(tmp_path, [(64, 48)] * 3)
+    Image.fromarray(picture()).save(folder / "00.jpg")
+    with pytest.raises(StageError, match=r"00\.jpg and 00\.png in .* would share the mask 00\.png"):
+        extract(tmp_path, folder)

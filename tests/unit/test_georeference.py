@@ -1,0 +1,162 @@
+import numpy as np
+import pycolmap
+import pyproj
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenefuse.photos import Photo, write_photos
+from scenefuse.scenes.geodesy import LocalFrame, local_frame
+from scenefuse.scenes.georeference import (
+    GeoreferenceSettings,
+    camera_poses,
+    fit_level,
+    georegister,
+    place_by_gps,
+)
+from scenefuse.stage import read_json, value
+from scenefuse.transforms import Sim3, rotation_angle_deg
+
+SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0, min_gps_photos=5)
+FRAME = LocalFrame(47.37, 8.55, 430.0)
+PLANTED = Sim3(7.5, Rotation.from_euler("xyz", [150, 20, -80], degrees=True).as_matrix(), np.array([30.0, -12.0, 55.0]))
+
+
+def flight(rows=5, columns=6, seed=3):
+    """Camera centres of a flight, east, north, up in metres."""
+    x, y = np.meshgrid(np.arange(columns) * 12.0, np.arange(rows) * 12.0)
+    z = np.random.default_rng(seed).normal(60, 2, x.size)
+    return np.stack([x.ravel(), y.ravel(), z], axis=1)
+
+
+def test_local_frame_is_east_north_up_in_metres():
+    # One arc second of latitude is 30.9 m; the meridian and the parallel through the origin are the axes.
+    enu = FRAME.apply(np.array([[47.37, 8.55, 440.0], [47.37 + 1 / 3600, 8.55, 430.0], [47.37, 8.55 + 1 / 3600, 430]]))
+    np.testing.assert_allclose(enu[0], [0, 0, 10], atol=1e-6)
+    np.testing.assert_allclose(enu[1], [0, 30.88, 0], atol=0.02)
+    np.testing.assert_allclose(enu[2], [20.97, 0, 0], atol=0.02)
+    there_and_back = FRAME.inverse(enu)
+    np.testing.assert_allclose(FRAME.apply(there_and_back), enu, atol=1e-6)
+
+
+@pytest.mark.parametrize("longitude, latitude, crs", [(8.55, 47.37, "EPSG:32632"), (-70.2, -33.5, "EPSG:32719")])
+def test_similarity_to_utm_agrees_with_pyproj(longitude, latitude, crs):
+    frame = LocalFrame(latitude, longitude, 430.0)
+    assert frame.crs == crs
+    local = np.array([[120.0, -80.0, 15.0], [-60.0, 150.0, -5.0]])
+    geographic = frame.inverse(local)
+    easting, northing = pyproj.Transformer.from_crs(4326, crs, always_xy=True).transform(
+        geographic[:, 1], geographic[:, 0]
+    )
+    in_crs = frame.crs_from_local().apply(local)
+    np.testing.assert_allclose(in_crs[:, :2], np.stack([easting, northing], axis=1), atol=0.02)
+    np.testing.assert_allclose(in_crs[:, 2], 430.0 + local[:, 2], atol=0.02)
+
+
+def test_origin_is_rounded_mean():
+    frame = local_frame(np.array([[10.123456, 20.0, 99.6], [10.123466, 20.2, 100.0]]))
+    assert (frame.latitude_deg, frame.longitude_deg, frame.altitude_m) == (10.12346, 20.1, 100.0)
+
+
+def test_planted_similarity_with_noise_and_two_wild_positions():
+    target = flight()
+    centres = PLANTED.inverse().apply(target)
+    noisy = target + np.random.default_rng(1).normal(0, 0.5, target.shape)
+    noisy[[4, 17]] += [[80, 0, 0], [0, -60, 40]]
+    placement = place_by_gps(centres, noisy, PLANTED.rotation.T @ [0, 0, 1], SETTINGS, seed=0)
+    assert placement.status == "georeferenced"
+    assert list(np.flatnonzero(~placement.inliers)) == [4, 17]
+    fitted = placement.local_from_model
+    assert fitted.scale == pytest.approx(PLANTED.scale, rel=0.01)
+    assert rotation_angle_deg(fitted.rotation.T @ PLANTED.rotation) < 1.5
+    assert np.linalg.norm(fitted.apply(centres) - target, axis=1).max() < 1.0
+
+
+def test_one_strip_is_levelled_by_the_cameras():
+    target = flight(rows=1, columns=12)
+    target[:, 2] = 60.0
+    centres = PLANTED.inverse().apply(target)
+    up = PLANTED.rotation.T @ np.array([0.0, 0.0, 1.0])
+    noisy = target + np.random.default_rng(1).normal(0, 0.3, target.shape)
+    placement = place_by_gps(centres, noisy, up, SETTINGS, seed=0)
+    assert "levelled by the cameras" in placement.reason
+    assert rotation_angle_deg(placement.local_from_model.rotation.T @ PLANTED.rotation) < 1.0
+    assert placement.local_from_model.scale == pytest.approx(PLANTED.scale, rel=0.02)
+
+
+def test_fit_level_is_exact_without_noise():
+    target = flight()
+    fitted, inliers = fit_level(PLANTED.inverse().apply(target), target, PLANTED.rotation.T @ [0, 0, 1.0], 8.0)
+    assert inliers.all()
+    np.testing.assert_allclose(fitted.matrix, PLANTED.matrix, atol=1e-9)
+
+
+def test_positions_that_hardly_move_give_no_scale():
+    target = flight() * 0.02
+    placement = place_by_gps(PLANTED.inverse().apply(target), target, np.array([0, 0, 1.0]), SETTINGS, seed=0)
+    assert placement.status == "upright" and "spread over" in placement.reason
+    assert placement.local_from_model.scale == 1.0
+
+
+def test_positions_that_contradict_the_cameras_give_no_scale():
+    target = flight()
+    wild = np.random.default_rng(0).uniform(0, 500, target.shape)
+    placement = place_by_gps(PLANTED.inverse().apply(target), wild, np.array([0, 0, 1.0]), SETTINGS, seed=0)
+    assert placement.status == "upright" and "agree with the cameras" in placement.reason
+
+
+@pytest.fixture
+def model(tmp_path):
+    """A synthetic model in an arbitrary frame, and the metric one it comes from."""
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=8, num_cameras_per_rig=1, num_frames_per_rig=1)
+    options.num_points3D = 50
+    options.sensor_from_rig_translation_stddev = 0.0
+    options.sensor_from_rig_rotation_stddev = 0.0
+    synthetic = pycolmap.synthesize_dataset(options)
+    synthetic.transform(pycolmap.Sim3d(20.0, pycolmap.Rotation3d(), np.zeros(3)))
+    names, _, truth = camera_poses(synthetic)
+    undo = PLANTED.inverse()
+    synthetic.transform(pycolmap.Sim3d(undo.scale, pycolmap.Rotation3d(undo.rotation), undo.translation))
+    (tmp_path / "sparse").mkdir()
+    synthetic.write(tmp_path / "sparse")
+    return tmp_path, names, truth
+
+
+def listed(names, centres):
+    positions = FRAME.inverse(centres)
+    return [Photo(n, 100, 100, "", *(float(v) for v in p)) for n, p in zip(names, positions)]
+
+
+def georegister_in(folder, photos):
+    write_photos(folder / "photos.json", photos, folder, "photos", [])
+    georegister(
+        sparse=folder / "sparse",
+        photos=folder / "photos.json",
+        georeferenced=folder / "georeferenced",
+        report=folder / "georeference.json",
+        settings=SETTINGS,
+        seed=0,
+    )
+    return read_json(folder / "georeference.json"), pycolmap.Reconstruction(folder / "georeferenced")
+
+
+def test_stage_brings_a_model_into_metres(model):
+    folder, names, truth = model
+    report, moved = georegister_in(folder, listed(names, truth))
+    assert value(report, "status") == "georeferenced" and value(report, "length_unit") == "m"
+    assert value(report, "gps_residual_rms_m") < 1e-3
+    _, _, centres = camera_poses(moved)
+    origin = LocalFrame(*(value(report, f"origin_{k}") for k in ("latitude_deg", "longitude_deg", "altitude_m")))
+    np.testing.assert_allclose(centres, origin.apply(FRAME.inverse(truth)), atol=1e-3)
+    crs_from_scene = Sim3.from_matrix(np.array(value(report, "crs_from_scene")))
+    np.testing.assert_allclose(crs_from_scene.translation, value(report, "origin_in_crs"))
+
+
+def test_stage_without_gps_names_no_metre(model):
+    folder, names, _ = model
+    report, moved = georegister_in(folder, [Photo(n, 100, 100, "") for n in names])
+    assert value(report, "status") == "upright"
+    assert {entry["unit"] for entry in report.values()}.isdisjoint({"m"})
+    assert value(report, "length_unit") == "scene units"
+    assert value(report, "scale") == 1.0
+    assert moved.num_reg_images() == 8

@@ -1,0 +1,92 @@
+import hashlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from scenefuse.photos import gps_positions, list_photos, read_photos
+from scenefuse.stage import StageError, read_json, value
+
+
+def save(path, size=(40, 30), gps=None, shade=100, focal_35mm=None, orientation=None):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    exif = Image.Exif()
+    if gps is not None:
+        exif[0x8825] = gps
+    if focal_35mm is not None:
+        exif[0x8769] = {0xA405: focal_35mm}
+    if orientation is not None:
+        exif[0x0112] = orientation
+    Image.new("RGB", size, (shade, shade, shade)).save(path, exif=exif)
+
+
+def test_sizes_hashes_positions_and_subfolders(tmp_path):
+    folder = tmp_path / "photos"
+    south_west = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\x00", 6: 520.25}
+    save(folder / "a.jpg", gps=south_west, focal_35mm=18)
+    save(folder / "sub" / "b.png", size=(20, 50), shade=7)
+    (folder / "notes.txt").write_text("no photo")
+    list_photos(folder=folder, photos=tmp_path / "photos.json")
+    first, second = read_photos(tmp_path / "photos.json")
+    assert (first.name, first.width, first.height) == ("a.jpg", 40, 30)
+    assert first.sha256 == hashlib.sha256((folder / "a.jpg").read_bytes()).hexdigest()
+    assert first.latitude_deg == pytest.approx(-33.51) and first.longitude_deg == pytest.approx(-70.25)
+    assert first.altitude_m == pytest.approx(520.25)
+    assert first.focal_px == pytest.approx(20.0)  # 18 mm of a 36 mm wide frame is half of 40 columns
+    assert (second.name, second.width, second.height, second.has_gps) == ("sub/b.png", 20, 50, False)
+    assert value(read_json(tmp_path / "photos.json"), "with_gps") == 1
+
+
+@pytest.mark.parametrize(
+    "gps",
+    [
+        {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)},
+        {1: "N", 3: "E"},
+        {1: "N", 2: (99.0, 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)},
+    ],
+)
+def test_a_useless_position_is_no_position(tmp_path, gps):
+    save(tmp_path / "p" / "a.jpg", gps=gps)
+    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    assert not read_photos(tmp_path / "photos.json")[0].has_gps
+
+
+def test_depth_below_sea_level_and_missing_altitude(tmp_path):
+    north_east = {1: "N", 2: (31.0, 0.0, 0.0), 3: "E", 4: (35.0, 0.0, 0.0)}
+    save(tmp_path / "p" / "a.jpg", gps=north_east | {5: b"\x01", 6: 400.0}, shade=1)
+    save(tmp_path / "p" / "b.jpg", gps=north_east, shade=2)
+    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    names, positions = gps_positions(read_photos(tmp_path / "photos.json"))
+    assert names == ["a.jpg", "b.jpg"]
+    np.testing.assert_allclose(positions, [[31, 35, -400], [31, 35, -400]])
+
+
+def test_copies_and_rotations_are_noted(tmp_path):
+    save(tmp_path / "p" / "a.jpg")
+    save(tmp_path / "p" / "b.jpg")
+    save(tmp_path / "p" / "c.jpg", orientation=6)
+    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    notes = value(read_json(tmp_path / "photos.json"), "notes")
+    assert notes[0] == "b.jpg is a copy of a.jpg"
+    assert "1 photos (c.jpg, ...) carry an EXIF rotation" in notes[1]
+
+
+@pytest.mark.parametrize("content", [b"", b"not a photo", None])
+def test_an_unreadable_photo_is_named_and_nothing_is_written(tmp_path, content):
+    folder = tmp_path / "p"
+    save(folder / "good.jpg")
+    save(folder / "bad.jpg", size=(400, 300))
+    whole = (folder / "bad.jpg").read_bytes()
+    (folder / "bad.jpg").write_bytes(whole[: len(whole) // 2] if content is None else content)
+    with pytest.raises(StageError, match=r"bad\.jpg cannot be decoded .* remove it"):
+        list_photos(folder=folder, photos=tmp_path / "photos.json")
+    assert not (tmp_path / "photos.json").exists()
+
+
+def test_missing_and_empty_folders(tmp_path):
+    with pytest.raises(StageError, match="nowhere does not exist"):
+        list_photos(folder=tmp_path / "nowhere", photos=tmp_path / "photos.json")
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "empty" / "readme.txt").write_text("x")
+    with pytest.raises(StageError, match=r"holds no photos.*1 other files"):
+        list_photos(folder=tmp_path / "empty", photos=tmp_path / "photos.json")

@@ -1,0 +1,221 @@
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from scipy.ndimage import gaussian_filter
+
+from scenefuse.photos import Photo, list_photos, write_photos
+from scenefuse.scenes.geodesy import LocalFrame
+from scenefuse.scenes.georeference import camera_poses
+from scenefuse.scenes.interrupt import cancellable
+from scenefuse.scenes.mapping import MapSettings, map_incremental
+from scenefuse.scenes.pairs import PairSettings, choose_pairs, sequential_pairs, spatial_pairs
+from scenefuse.scenes.sfm import FeatureSettings, MatchSettings, camera_groups, extract_features, match_features
+from scenefuse.scenes.undistort import UndistortSettings, undistort
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import fit_sim3
+
+PAIRS = PairSettings("auto", 10, 20, 3, 2, 4, 2.0)
+FEATURES = FeatureSettings(1000, 800, 0, "SIMPLE_RADIAL", "auto")
+MATCHES = MatchSettings(0.7, 0.7, True, True, 15)
+MAPPING = MapSettings(50, 200, 0.0, 4.0, 50, 0.8)
+FRAME = LocalFrame(47.0, 8.0, 400.0)
+
+
+def photo(name, position=None, size=(640, 480), camera="", focal=None):
+    where = (None, None, None) if position is None else tuple(float(v) for v in FRAME.inverse(np.array([position]))[0])
+    return Photo(name, *size, "", *where, focal, camera)
+
+
+def strip(count, step=10.0):
+    return [photo(f"{i:03d}.jpg", (i * step, 0.0, 50.0)) for i in range(count)]
+
+
+def test_pairs_are_chosen_by_what_is_known():
+    assert choose_pairs(strip(8), False, PAIRS)[0] == "exhaustive"
+    assert choose_pairs(strip(12), False, PAIRS)[0] == "spatial"
+    assert choose_pairs(strip(12, step=0.1), False, PAIRS)[0] == "exhaustive"  # all at one place: GPS says nothing
+    without = [photo(f"{i:03d}.jpg") for i in range(30)]
+    assert choose_pairs(without[:20], False, PAIRS)[0] == "exhaustive"
+    assert choose_pairs(without[:20], True, PAIRS)[0] == "sequential"
+    assert choose_pairs(without, False, PAIRS)[0] == "sequential"
+    kind, reason, pairs = choose_pairs(without[:5], False, PairSettings("spatial", 10, 20, 3, 2, 4, 2.0))
+    assert (kind, len(pairs)) == ("exhaustive", 10) and "too few photos" in reason
+
+
+def test_spatial_pairs_are_neighbours_and_connected():
+    photos = strip(6) + [photo(f"far{i}.jpg", (5000 + 10 * i, 0.0, 50.0)) for i in range(3)] + [photo("no_gps.jpg")]
+    pairs = spatial_pairs(photos, 2)
+    assert ("000.jpg", "001.jpg") in pairs and ("000.jpg", "002.jpg") in pairs
+    assert ("000.jpg", "004.jpg") not in pairs
+    assert ("005.jpg", "far0.jpg") in pairs  # the spanning tree
+    assert sum("no_gps.jpg" in pair for pair in pairs) == 9
+    assert len(set(pairs)) == len(pairs)
+
+
+def test_sequential_pairs_close_loops():
+    pairs = sequential_pairs([str(i) for i in range(9)], 2, 4)
+    assert ("0", "2") in pairs and ("0", "3") not in pairs
+    assert ("0", "8") in pairs and ("4", "8") in pairs
+    assert len(pairs) == 8 + 7 + 3
+
+
+def test_cameras_are_shared_by_size_model_and_focal_length():
+    photos = [photo("a/1"), photo("a/2", camera="X", focal=500.0), photo("b/3"), photo("b/4", camera="X", focal=700.0)]
+    assert camera_groups(photos, "auto") == [["a/1", "b/3"], ["a/2"], ["b/4"]]
+    assert camera_groups(photos, "single") == [["a/1", "a/2", "b/3", "b/4"]]
+    assert camera_groups(photos, "per_folder") == [["a/1", "a/2"], ["b/3", "b/4"]]
+    assert len(camera_groups(photos, "per_photo")) == 4
+    with pytest.raises(StageError, match=r"differ in size: 640x480 \(a/1\), 320x240 \(c\)"):
+        camera_groups([*photos, photo("c", size=(320, 240))], "single")
+
+
+def test_an_error_in_a_worker_reaches_the_caller():
+    def fail(cancellation_token):
+        raise ValueError("inside")
+
+    with pytest.raises(ValueError, match="inside"):
+        cancellable(fail)
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """Six photos of two textured walls that meet in a corner, seen from an arc, and the true camera centres."""
+    folder = tmp_path_factory.mktemp("capture")
+    (folder / "photos").mkdir()
+    rng = np.random.default_rng(0)
+    texture = np.stack(
+        [sum(gaussian_filter(rng.standard_normal((256, 512)), s) * s for s in (1, 2, 4)) for _ in range(3)], axis=2
+    )
+    texture = (np.clip(texture / np.abs(texture).std() * 45 + 128, 0, 255)).astype(np.uint8)
+    columns, rows = np.meshgrid(np.arange(240) + 0.5, np.arange(180) + 0.5)
+    rays = np.stack([(columns - 120) / 200, (rows - 90) / 200, np.ones_like(rows)], axis=2)
+    centres = []
+    for index, angle in enumerate(np.radians(np.linspace(-35, 35, 6))):
+        centre = np.array([4 * np.sin(angle), -0.3 * (index % 2), -4 * np.cos(angle)])
+        z = -centre / np.linalg.norm(centre)
+        x = np.cross([0, 1, 0], z) / np.linalg.norm(np.cross([0, 1, 0], z))
+        directions = rays @ np.stack([x, np.cross(z, x), z])
+        # Walls z = |x| / 2 + ..., one for each sign of x; the nearer hit in front of the camera counts.
+        best = np.full(rows.shape, np.inf)
+        for sign in (-1.0, 1.0):
+            normal = np.array([sign * 0.6, 0.0, 1.0])
+            distance = (1.5 - centre @ normal) / (directions @ normal)
+            hit = centre + distance[..., None] * directions
+            valid = (distance > 0) & (sign * hit[..., 0] >= 0)
+            best = np.where(valid & (distance < best), distance, best)
+        hit = centre + np.where(np.isfinite(best), best, 0)[..., None] * directions
+        u, v = (hit[..., 0] * 75 + 256) % 512, (hit[..., 1] * 75 + 128) % 256
+        Image.fromarray(texture[v.astype(int), u.astype(int)]).save(folder / "photos" / f"{index}.png")
+        centres.append(centre)
+    list_photos(folder=folder / "photos", photos=folder / "photos.json")
+    return folder, np.array(centres)
+
+
+def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path):
+    folder, truth = capture
+    extract_features(
+        folder=folder / "photos",
+        photos=folder / "photos.json",
+        features=tmp_path / "features.db",
+        settings=FEATURES,
+    )
+    for name in ("first", "second"):
+        match_features(
+            photos=folder / "photos.json",
+            features=tmp_path / "features.db",
+            database=tmp_path / f"{name}.db",
+            matches=tmp_path / "matches.json",
+            pair_settings=PAIRS,
+            settings=MATCHES,
+            seed=0,
+        )
+        map_incremental(
+            folder=folder / "photos",
+            photos=folder / "photos.json",
+            database=tmp_path / f"{name}.db",
+            sparse=tmp_path / name,
+            report=tmp_path / f"{name}.json",
+            settings=MAPPING,
+            seed=0,
+        )
+    matches = read_json(tmp_path / "matches.json")
+    assert value(matches, "pairs_choice") == "exhaustive" and value(matches, "pairs") == 15
+    report = read_json(tmp_path / "first.json")
+    assert value(report, "registered") == 6 and value(report, "not_registered") == []
+    assert value(report, "mean_reprojection_error_px") < 1.0
+    model = pycolmap.Reconstruction(tmp_path / "first")
+    names, _, centres = camera_poses(model)
+    assert names == [f"{i}.png" for i in range(6)]
+    assert np.linalg.norm(fit_sim3(centres, truth).apply(centres) - truth, axis=1).max() < 0.15
+    again = camera_poses(pycolmap.Reconstruction(tmp_path / "second"))[2]
+    np.testing.assert_array_equal(centres, again)
+    assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
+
+    undistort(
+        folder=folder / "photos",
+        sparse=tmp_path / "first",
+        dense=tmp_path / "dense",
+        report=tmp_path / "dense.json",
+        settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+    )
+    dense = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
+    assert {c.model_name for c in dense.cameras.values()} == {"PINHOLE"}
+    assert max(value(read_json(tmp_path / "dense.json"), "sizes_px")[0]) <= 120
+    with pytest.raises(StageError, match=r"6 photos of the model .* are missing"):
+        undistort(
+            folder=tmp_path,
+            sparse=tmp_path / "first",
+            dense=tmp_path / "none",
+            report=tmp_path / "none.json",
+            settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+        )
+    assert not (tmp_path / "none").exists()
+
+
+def test_photos_that_show_different_things(tmp_path):
+    rng = np.random.default_rng(1)
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
+        noise = (noise - noise.min()) / np.ptp(noise) * 255
+        Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
+    list_photos(folder=tmp_path / "photos", photos=tmp_path / "photos.json")
+    extract_features(
+        folder=tmp_path / "photos",
+        photos=tmp_path / "photos.json",
+        features=tmp_path / "features.db",
+        settings=FEATURES,
+    )
+    with pytest.raises(StageError, match="none of the 3 pairs of photos"):
+        match_features(
+            photos=tmp_path / "photos.json",
+            features=tmp_path / "features.db",
+            database=tmp_path / "database.db",
+            matches=tmp_path / "matches.json",
+            pair_settings=PAIRS,
+            settings=MATCHES,
+            seed=0,
+        )
+    assert not (tmp_path / "database.db").exists() and not (tmp_path / "matches.json").exists()
+
+
+def test_too_few_registered_photos(tmp_path):
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=5, num_cameras_per_rig=1, num_frames_per_rig=1)
+    options.num_points3D = 200
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        synthetic = pycolmap.synthesize_dataset(options, database)
+    names = [i.name for i in synthetic.images.values()] + [f"extra{i}.jpg" for i in range(5)]
+    write_photos(tmp_path / "photos.json", [photo(n) for n in names], tmp_path, "photos", [])
+    with pytest.raises(StageError, match=r"only 5 of 10 photos were registered.*extra0\.jpg.*min_registered_share"):
+        map_incremental(
+            folder=tmp_path,
+            photos=tmp_path / "photos.json",
+            database=tmp_path / "database.db",
+            sparse=tmp_path / "sparse",
+            report=tmp_path / "sparse.json",
+            settings=MAPPING,
+            seed=0,
+        )
+    assert not (tmp_path / "sparse").exists() and not (tmp_path / "sparse.json").exists()
