@@ -140,14 +140,3 @@ def rotation_between(a: Array, b: Array) -> Array:
         return 2.0 * np.outer(axis, axis) - np.eye(3)
     k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + k + k @ k / (1.0 + cosine)
-
-
-def up_from_cameras(world_from_cam_rotations: Array) -> Array:
-    """The direction opposite to gravity, from (N, 3, 3) camera rotations of photos held level.
-
-    A level camera's x axis is horizontal whatever its pitch and heading, so up is the direction most nearly
-    orthogonal to all x axes; its sign is the one that most cameras' up sides (-y) agree with.
-    """
-    x_axes, y_axes = world_from_cam_rotations[:, :, 0], world_from_cam_rotations[:, :, 1]
-    up = np.linalg.eigh(x_axes.T @ x_axes)[1][:, 0]
-    return up if (-(y_axes @ up)).sum() >= 0 else -up

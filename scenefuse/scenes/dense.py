@@ -258,9 +258,11 @@ def _tasks(model: pycolmap.Reconstruction, settings: DepthSettings) -> dict[str,
         points = np.array([xyz[p] for p in seen[i]])
         pose = model.images[i].cam_from_world().matrix()
         z = points @ pose[2, :3] + pose[2, 3]
-        low, high = np.percentile(z[z > 0], [1, 99])
-        # Sparse points miss tops of things and distant ground: a margin of a quarter in front and half behind.
-        tasks[model.images[i].name] = _Task(model.images[i].name, chosen, float(0.75 * low), float(1.5 * high))
+        z = np.sort(z[z > 0])
+        # Sparse points miss tops and distant ground, and a tall thing may hold few of them: the third nearest counts.
+        near, far = min(0.75 * np.percentile(z, 1), 0.85 * z[min(2, len(z) - 1)]), 1.25 * np.percentile(z, 99)
+        name = model.images[i].name
+        tasks[name] = _Task(name, chosen, float(near), float(far))
     return tasks
 
 

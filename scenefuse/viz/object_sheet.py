@@ -9,9 +9,10 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from scenefuse.clouds import Cloud
+from scenefuse.gravity import estimate_up
 from scenefuse.maps import read_depth
 from scenefuse.stage import StageError
-from scenefuse.transforms import Array, Sim3, rotation_between, up_from_cameras
+from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.viz.render import orbit_camera, point_radii, render
 from scenefuse.viz.sheets import Image, Sheet, draw_sheet
 
@@ -78,8 +79,8 @@ def _held_out_row(cameras: Path, stage: Path) -> tuple[list[Image | None], list[
 
 def upright(cloud: Cloud, cameras: Path) -> Cloud:
     """The object's cloud turned so that z points up, from the photos' horizontal axes."""
-    rotations = [i.cam_from_world().rotation.matrix().T for i in read_model(cameras / "sparse").images.values()]
-    up = up_from_cameras(np.array(rotations))
+    poses = [i.cam_from_world().inverse() for i in read_model(cameras / "sparse").images.values()]
+    up, _ = estimate_up(np.array([p.rotation.matrix() for p in poses]), np.array([p.translation for p in poses]))
     return cloud.transformed(Sim3(1.0, rotation_between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3)))
 
 

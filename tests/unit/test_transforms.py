@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.transforms import Sim3, fit_sim3, fit_sim3_robust, rotation_angle_deg, rotation_between, up_from_cameras
+from scenefuse.transforms import Sim3, fit_sim3, fit_sim3_robust, rotation_angle_deg, rotation_between
 
 
 def random_sim3(seed: int) -> Sim3:
@@ -64,15 +64,3 @@ def test_rotation_angle_and_shortest_rotation():
     a, b = np.array([0.0, 0, 2]), np.array([1.0, 1, 0])
     assert np.allclose(rotation_between(a, b) @ [0, 0, 1], b / np.linalg.norm(b))
     assert np.allclose(rotation_between(a, -a) @ [0, 0, 1], [0, 0, -1])
-
-
-def test_up_from_level_cameras_at_any_pitch():
-    planted = Rotation.random(random_state=1).as_matrix()
-    rotations = []
-    for heading in np.linspace(0, 2 * np.pi, 12, endpoint=False):
-        forward = np.array([np.cos(heading), np.sin(heading), -0.4])
-        forward /= np.linalg.norm(forward)
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        rotations.append(planted @ np.stack([right, np.cross(forward, right), forward], axis=1))
-    assert np.allclose(up_from_cameras(np.array(rotations)), planted @ [0, 0, 1], atol=1e-9)

@@ -1,0 +1,158 @@
+"""The visual hull of an object: a voxel grid carved by the masks of all photos, with a share of them allowed to err.
+
+Source: Laurentini 1994 (visual hull), with voting instead of a strict intersection.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in the object's frame.
+
+    Attributes:
+        object_from_box: (3, 4) pose; the box's third axis is up.
+        low, high: (3,) extents along the box's axes, in object units.
+    """
+
+    object_from_box: Array
+    low: Array
+    high: Array
+
+    def corners(self) -> Array:
+        """(8, 3) corners in the object's frame."""
+        picks = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], dtype=bool)
+        return self.to_object(np.where(picks, self.high, self.low))
+
+    def to_object(self, x_in_box: Array) -> Array:
+        """(N, 3) points from the box's axes to the object's frame."""
+        return x_in_box @ self.object_from_box[:, :3].T + self.object_from_box[:, 3]
+
+    def to_box(self, x_in_object: Array) -> Array:
+        """(N, 3) points from the object's frame to the box's axes."""
+        return (x_in_object - self.object_from_box[:, 3]) @ self.object_from_box[:, :3]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the diagonal, in object units."""
+        return float(np.linalg.norm(self.high - self.low))
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One undistorted photo of the object and its camera.
+
+    Attributes:
+        name: file name.
+        image: (H, W, 3) uint8 BGR.
+        intrinsics: (3, 3), pixel centres at +0.5.
+        cam_from_object: (3, 4).
+        observed: (K, 2) pixel positions of the SfM points that it sees.
+        point_rows: (K,) their rows in the array of all SfM points.
+    """
+
+    name: str
+    image: NDArray[np.uint8]
+    intrinsics: Array
+    cam_from_object: Array
+    observed: Array
+    point_rows: NDArray[np.int64]
+
+    def project(self, points: Array) -> tuple[Array, Array]:
+        """Pixel positions (N, 2) and depths (N,) of (N, 3) points."""
+        x = points @ self.cam_from_object[:, :3].T + self.cam_from_object[:, 3]
+        depth = x[:, 2]
+        pixels = (x @ self.intrinsics.T)[:, :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[:, None]
+        return pixels, depth
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The occupied voxels of a box.
+
+    Attributes:
+        shell: (N, 3) centres of the occupied voxels that have a free neighbour, in the object's frame.
+        voxel: side of a voxel, in object units.
+        volume: occupied share of the box, 0..1.
+    """
+
+    shell: Array
+    voxel: float
+    volume: float
+
+
+def carve(
+    box: Box, height_of: Callable[[Array], Array], frames: list[Frame], masks: list[Mask], voxels: int, tolerance: float
+) -> Hull:
+    """The voxels of a box, above the ground, that all masks but a share of `tolerance` contain.
+
+    Args:
+        box: the space to look at.
+        height_of: heights (N,) over the ground of (N, 3) points along the box's axes; nothing below 0
+            belongs to the object.
+        frames: photos; a photo has no say on a voxel it does not show.
+        masks: (H, W) per photo.
+        voxels: number along the longest side.
+        tolerance: share of the photos that show a voxel which may have it outside their mask.
+    """
+    size = (box.high - box.low).max() / voxels
+    shape = np.maximum(np.ceil((box.high - box.low) / size).astype(int), 1)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    x_in_box = box.low + (index + 0.5) * size
+    centres = box.to_object(x_in_box).astype(np.float32)
+    alive = np.flatnonzero(height_of(x_in_box) > 0)
+    misses = np.zeros(len(centres), dtype=np.int16)
+    shown = np.zeros(len(centres), dtype=np.int16)
+    for k, (frame, mask) in enumerate(zip(frames, masks)):
+        rotation, shift = frame.cam_from_object[:, :3], frame.cam_from_object[:, 3]
+        projection = (frame.intrinsics @ np.column_stack([rotation, shift])).astype(np.float32)
+        p = centres[alive] @ projection[:, :3].T + projection[:, 3]
+        height, width = mask.shape
+        depth = np.maximum(p[:, 2], 1e-6)
+        u, v = (p[:, 0] / depth).astype(np.int32), (p[:, 1] / depth).astype(np.int32)
+        inside = (p[:, 2] > 0) & (p[:, 0] >= 0) & (u < width) & (p[:, 1] >= 0) & (v < height)
+        hit = np.zeros(len(alive), dtype=bool)
+        hit[inside] = mask[v[inside], u[inside]]
+        shown[alive] += inside
+        misses[alive] += inside & ~hit
+        # Whatever already has more misses than all photos together could excuse needs no further look.
+        if k % 4 == 3:
+            alive = alive[misses[alive] <= tolerance * len(frames)]
+    occupied = np.zeros(len(centres), dtype=bool)
+    occupied[alive] = (shown[alive] >= max(2, len(frames) // 4)) & (misses[alive] <= tolerance * shown[alive])
+    grid = occupied.reshape(shape)
+    shell = grid & ~ndimage.binary_erosion(grid)
+    return Hull(centres[shell.ravel()].astype(np.float64), float(size), float(grid.mean()))
+
+
+def silhouette(hull: Hull, frame: Frame) -> Mask:
+    """The hull as the photo sees it, (H, W)."""
+    height, width = frame.image.shape[:2]
+    drawn = np.zeros((height, width), dtype=np.uint8)
+    if len(hull.shell) == 0:
+        return drawn.astype(bool)
+    pixels, depth = frame.project(hull.shell)
+    front = depth > 1e-6
+    u, v = np.floor(pixels[front]).astype(int).T
+    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    drawn[v[inside], u[inside]] = 255
+    side = hull.voxel * frame.intrinsics[0, 0] / float(np.median(depth[front]))
+    # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
+    reach = 2 * int(np.ceil(0.75 * side)) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel, borderValue=0) > 0
+
+
+def agreement(a: Mask, b: Mask) -> float:
+    """Intersection over union of two masks; 0 when both are empty."""
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 0.0

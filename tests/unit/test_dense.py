@@ -1,0 +1,154 @@
+"""Stereo and fusion on a planted scene: a bumpy, textured surface of known depth seen by five cameras."""
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.clouds import read_cloud
+from scenefuse.maps import read_depth, read_normals
+from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
+from scenefuse.scenes.plane_sweep import DepthSettings
+from scenefuse.stage import StageError, read_json, value
+
+WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
+DEPTH = DepthSettings(160, 4, 2, 48, 2, 7, 0.1, 0.5, 1.0, True)
+FUSION = FusionSettings(3, 2.0, 0.01, 20.0, 100, 8, 0.0)
+
+
+def surface(x, y):
+    """Height over the plane z = 10 in front of the first camera; a plane z = 10 + 0.3 x - 0.2 y."""
+    return 10 + 0.3 * x - 0.2 * y
+
+
+def depth_of(centre):
+    """(H, W) exact depths of the plane from a camera that looks along +z from (x, y, 0), pixel centres at +0.5."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    a, b = (u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL
+    return (10 + 0.3 * centre[0] - 0.2 * centre[1]) / (1 - 0.3 * a + 0.2 * b), a, b
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("workspace")
+    (folder / "images").mkdir()
+    (folder / "sparse").mkdir()
+    noise = np.random.default_rng(0).random((400, 400)).astype(np.float32)
+    texture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3.0))
+    texture = (texture - texture.min()) / np.ptp(texture)
+    centres = [(0, 0), (1.2, 0), (-1.2, 0.1), (0, 1.2), (0.1, -1.2)]
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(
+        model="PINHOLE", width=WIDTH, height=HEIGHT, params=[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2], camera_id=1
+    )
+    model.add_camera_with_trivial_rig(camera)
+    points = np.random.default_rng(1).uniform(-3, 3, (200, 2))
+    points = np.column_stack([points, surface(*points.T)])
+    tracks = [[] for _ in points]
+    for k, centre in enumerate(centres, 1):
+        depth, a, b = depth_of(centre)
+        x, y = centre[0] + a * depth, centre[1] + b * depth
+        to_texture = [((c + 10) * 20 - 0.5).astype(np.float32) for c in (x, y)]
+        photo = cv2.remap(texture, *to_texture, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.clip(photo * 255, 0, 255).astype(np.uint8))
+        x_in_cam = points - [*centre, 0]
+        pixels = FOCAL * x_in_cam[:, :2] / x_in_cam[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        rows = np.flatnonzero(((pixels > 0) & (pixels < [WIDTH, HEIGHT])).all(1))
+        image = pycolmap.Image(
+            name=f"{k}.png", camera_id=1, image_id=k, points2D=[pycolmap.Point2D(p) for p in pixels[rows]]
+        )
+        model.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(np.column_stack([np.eye(3), [-centre[0], -centre[1], 0]]))
+        )
+        for j, row in enumerate(rows):
+            tracks[row].append(pycolmap.TrackElement(k, j))
+    for point, track in zip(points, tracks):
+        if len(track) > 1:
+            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    model.write_binary(folder / "sparse")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def maps(workspace, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("maps")
+    for chunk in range(2):
+        estimate_depth_maps(
+            workspace=workspace,
+            chunk=chunk,
+            chunks=2,
+            backend="torch",
+            settings=DEPTH,
+            seed=0,
+            depth=folder / f"{chunk}",
+            report=folder / f"{chunk}.json",
+        )
+    return folder
+
+
+def test_depth_and_normals_of_a_slanted_plane(maps):
+    depth = read_depth(maps / "0" / "depth_maps" / "1.png.bin")
+    normals = read_normals(maps / "0" / "normal_maps" / "1.png.bin")
+    truth, _, _ = depth_of((0, 0))
+    inner = np.s_[15:-15, 15:-15]
+    assert (depth[inner] > 0).mean() > 0.98
+    error = np.abs(depth - truth)[inner][depth[inner] > 0]
+    # One source pixel of disparity at the largest baseline is 10 * 10 / (150 * 1.2) = 0.55 in depth.
+    assert np.median(error) < 0.03
+    towards_camera = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
+    angle = np.degrees(np.arccos(np.clip((normals[inner] @ towards_camera)[depth[inner] > 0], -1, 1)))
+    assert np.median(angle) < 4
+
+
+def test_chunks_share_out_the_photos(maps):
+    names = [sorted(p.name for p in (maps / f"{k}" / "depth_maps").iterdir()) for k in range(2)]
+    assert names == [["1.png.bin", "3.png.bin", "5.png.bin"], ["2.png.bin", "4.png.bin"]]
+    report = read_json(maps / "1.json")
+    assert value(report, "backend") == "torch"
+    assert set(report["photos"]) == {"2.png", "4.png"}
+    assert report["photos"]["2.png"]["near"] < 9 < 11 < report["photos"]["2.png"]["far"]
+
+
+def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, maps, tmp_path):
+    cloud_path, report_path = tmp_path / "dense.ply", tmp_path / "dense.json"
+    fuse_depth_maps(
+        workspace=workspace,
+        depth=[maps / "0", maps / "1"],
+        depth_reports=[maps / "0.json", maps / "1.json"],
+        settings=FUSION,
+        cloud=cloud_path,
+        report=report_path,
+    )
+    cloud = read_cloud(cloud_path)
+    report = read_json(report_path)
+    assert len(cloud) == value(report, "points") > 3000
+    assert cloud.fields["views"].min() >= 3
+    x, y, z = cloud.points.T
+    signed = (z - surface(x, y)) / np.sqrt(1 + 0.3**2 + 0.2**2)
+    # A pixel is 0.067 wide here; half of it on this slope would show as a bias of 0.003 (0.3 * 0.033 - 0.2 * 0.033).
+    assert np.abs(np.median(signed)) < 0.0025
+    assert np.median(np.abs(signed)) < 0.02
+    assert cloud.normals is not None and (cloud.normals[:, 2] < 0).mean() > 0.99
+
+
+def test_errors_are_sentences(workspace, maps, tmp_path):
+    outputs = {"depth": tmp_path / "d", "report": tmp_path / "d.json"}
+    common = {"workspace": workspace, "settings": DEPTH, "seed": 0}
+    with pytest.raises(StageError, match="chunk 2 of 2 does not exist"):
+        estimate_depth_maps(chunk=2, chunks=2, backend="torch", **common, **outputs)
+    if not pycolmap.has_cuda:
+        with pytest.raises(StageError, match="needs CUDA"):
+            estimate_depth_maps(chunk=0, chunks=1, backend="colmap", **common, **outputs)
+    with pytest.raises(StageError, match="not a readable COLMAP model"):
+        estimate_depth_maps(chunk=0, chunks=1, backend="torch", **(common | {"workspace": tmp_path}), **outputs)
+    fusion = {"workspace": workspace, "settings": FUSION, "cloud": tmp_path / "c.ply", "report": tmp_path / "c.json"}
+    with pytest.raises(StageError, match="no depth maps in"):
+        fuse_depth_maps(depth=[tmp_path], depth_reports=[], **fusion)
+    strict = FusionSettings(6, 2.0, 0.01, 20.0, 100, 8, 0.0)
+    with pytest.raises(StageError, match="no point is seen alike by 6 photos"):
+        fuse_depth_maps(
+            depth=[maps / "0", maps / "1"],
+            depth_reports=[maps / "0.json", maps / "1.json"],
+            **(fusion | {"settings": strict}),
+        )
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,249 @@
+"""Masks of a planted object: a mottled red ball on green ground, eight photos around it."""
+
+import dataclasses
+import shutil
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.objects.box import find_ground, upright_box
+from scenefuse.objects.grabcut import cleaned, second_trimap, stamp_seeds
+from scenefuse.objects.hull import Frame, agreement, carve, silhouette
+from scenefuse.objects.masks import MaskSettings, make_masks
+from scenefuse.objects.sam2 import check_weights
+from scenefuse.stage import StageError, read_json, sha256, value, write_json
+
+WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
+SETTINGS = MaskSettings(0.15, 0.02, 120, 3, 40, 0.1, 5.0, 0.6, 4, 2.0, "0" * 64, "0" * 64)
+CENTRE, RADIUS = np.array([0, 0, 1.0]), 1.0
+
+
+def camera_pose(k):
+    """(3, 4) cam_from_object of a camera on a circle, five away and 2.5 high, looking at the ball."""
+    angle = 2 * np.pi * k / PHOTOS
+    position = np.array([5 * np.cos(angle), 5 * np.sin(angle), 2.5])
+    forward = CENTRE - position
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return np.column_stack([rotation, -rotation @ position])
+
+
+def look(pose):
+    """True mask (H, W) and points seen (H, W, 3) by a camera: the ball, else the ground."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:, :3]
+    position = -pose[:, :3].T @ pose[:, 3]
+    a, b = (rays**2).sum(-1), rays @ (position - CENTRE)
+    root = b**2 - a * (((position - CENTRE) ** 2).sum() - RADIUS**2)
+    ball = root > 0
+    distance = np.where(ball, (-b - np.sqrt(np.maximum(root, 0))) / a, -position[2] / np.minimum(rays[..., 2], -1e-3))
+    return ball, position + rays * distance[..., None]
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("capture")
+    (folder / "cameras" / "images").mkdir(parents=True)
+    (folder / "cameras" / "sparse").mkdir()
+    (folder / "truth").mkdir()
+    generator = np.random.default_rng(0)
+    sphere = generator.normal(size=(150, 3))
+    sphere = CENTRE + RADIUS * sphere / np.linalg.norm(sphere, axis=1, keepdims=True)
+    ground = np.column_stack([generator.uniform(-3.5, 3.5, (250, 2)), np.zeros(250)])
+    points = np.concatenate([sphere, ground])
+    model = pycolmap.Reconstruction()
+    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+    )
+    tracks = [[] for _ in points]
+    for k in range(PHOTOS):
+        pose = camera_pose(k)
+        ball, seen = look(pose)
+        noise = generator.normal(0, 18, (HEIGHT, WIDTH, 1))
+        photo = np.where(ball[..., None], [50, 60, 170], [60, 130, 70]) + noise
+        cv2.imwrite(str(folder / "cameras" / "images" / f"f{k}.png"), np.clip(photo, 0, 255).astype(np.uint8))
+        cv2.imwrite(str(folder / "truth" / f"f{k}_mask.png"), ball.astype(np.uint8) * 255)
+        x = points @ pose[:, :3].T + pose[:, 3]
+        pixels = FOCAL * x[:, :2] / x[:, 2:] + [WIDTH / 2, HEIGHT / 2]
+        inside = np.flatnonzero(((pixels > 1) & (pixels < [WIDTH - 1, HEIGHT - 1])).all(1))
+        u, v = pixels[inside].astype(int).T
+        rows = inside[np.linalg.norm(seen[v, u] - points[inside], axis=1) < 0.15]
+        image = pycolmap.Image(
+            name=f"f{k}.png", camera_id=1, image_id=k + 1, points2D=[pycolmap.Point2D(p) for p in pixels[rows]]
+        )
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+        for j, row in enumerate(rows):
+            tracks[row].append(pycolmap.TrackElement(k + 1, j))
+    for point, track in zip(points, tracks):
+        if len(track) > 1:
+            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    model.write_binary(folder / "cameras" / "sparse")
+    write_json(folder / "cameras.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
+    marks = [(0, 0, 2), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1), (0, 0, 0.05)]
+    lines = [f"p{i}\t{x}\t{y}\t{z}" for i, (x, y, z) in enumerate(marks)]
+    (folder / "prompts.tsv").write_text("\n".join(["point\tx\ty\tz", *lines]) + "\n")
+    return folder
+
+
+def run_stage(capture, output, **changes):
+    arguments = {
+        "cameras": capture / "cameras",
+        "cameras_json": capture / "cameras.json",
+        "sfm": capture / "cameras" / "sparse",
+        "method": "grabcut",
+        "prompts": capture / "prompts.tsv",
+        "supplied": None,
+        "sam2_encoder": None,
+        "sam2_decoder": None,
+        "settings": SETTINGS,
+        "seed": 0,
+        "masks": output / "masks",
+        "contact_sheet": output / "sheet.png",
+        "report": output / "masks.json",
+    }
+    make_masks(**(arguments | changes))
+
+
+def iou_with_truth(capture, output):
+    scores = []
+    for k in range(PHOTOS):
+        truth = cv2.imread(str(capture / "truth" / f"f{k}_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+        found = cv2.imread(str(output / "masks" / f"f{k}.png"), cv2.IMREAD_GRAYSCALE)
+        assert set(np.unique(found)) <= {0, 255}
+        scores.append(agreement(truth, found > 0))
+    return scores
+
+
+def test_grabcut_finds_the_ball(capture, tmp_path):
+    run_stage(capture, tmp_path)
+    assert min(iou_with_truth(capture, tmp_path)) > 0.93
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "masks") == PHOTOS
+    assert value(report, "ground") == "measured"
+    assert cv2.imread(str(tmp_path / "sheet.png")).shape[1] == 8 * 240
+
+
+def test_a_photo_whose_colours_mislead_is_repaired_or_dropped(capture, tmp_path):
+    broken = tmp_path / "capture"
+    shutil.copytree(capture, broken)
+    photo = broken / "cameras" / "images" / "f3.png"
+    cv2.imwrite(str(photo), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    output = tmp_path / "out"
+    run_stage(broken, output)
+    report = read_json(output / "masks.json")
+    mask = cv2.imread(str(output / "masks" / "f3.png"), cv2.IMREAD_GRAYSCALE)
+    truth = cv2.imread(str(capture / "truth" / "f3_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
+    if mask is None:
+        assert "IoU with the visual hull" in report["dropped"]["f3.png"]
+    else:
+        assert agreement(mask > 0, truth) > 0.75
+
+
+def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture, tmp_path):
+    run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=capture / "truth")
+    assert min(iou_with_truth(capture, tmp_path)) > 0.999
+    strangers = tmp_path / "strangers"
+    strangers.mkdir()
+    cv2.imwrite(str(strangers / "other.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(StageError, match="masks that match no photo"):
+        run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=strangers)
+    with pytest.raises(StageError, match="folder of supplied masks"):
+        run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=tmp_path / "nothing")
+    assert not (tmp_path / "x").exists()
+
+
+def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
+    prompts = tmp_path / "prompts.tsv"
+    prompts.write_text("point\tx\ty\tz\na\t0\t0\t20\nb\t1\t0\t20\nc\t0\t1\t21\n")
+    with pytest.raises(StageError):
+        run_stage(capture, tmp_path / "x", prompts=prompts)
+    with pytest.raises(StageError, match="need a prompts file"):
+        run_stage(capture, tmp_path / "x", prompts=None)
+    with pytest.raises(StageError, match="9 needed"):
+        run_stage(capture, tmp_path / "x", settings=dataclasses.replace(SETTINGS, min_photos=9))
+    assert not (tmp_path / "x").exists()
+
+
+def test_wrong_or_missing_weights_are_named(tmp_path):
+    weights = tmp_path / "encoder.ort"
+    with pytest.raises(StageError, match="do not exist"):
+        check_weights(weights, "0" * 64, "encoder")
+    weights.write_bytes(b"not a network")
+    with pytest.raises(StageError, match="have SHA-256"):
+        check_weights(weights, "0" * 64, "encoder")
+    assert check_weights(weights, sha256(weights), "encoder") == weights
+    with pytest.raises(StageError, match="need its encoder weights"):
+        check_weights(None, "0" * 64, "encoder")
+
+
+def test_hull_of_true_masks_is_the_ball():
+    frames, masks = [], []
+    for k in range(PHOTOS):
+        intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+        blank = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+        frames.append(Frame(f"{k}", blank, intrinsics, camera_pose(k), np.empty((0, 2)), np.empty(0, np.int64)))
+        masks.append(look(camera_pose(k))[0])
+    box = upright_box(np.array([[-1, -1, 0], [1, 1, 2], [1, -1, 0], [-1, 1, 0]]), np.array([0, 0, 1.0]), 0.1)
+    hull = carve(box, lambda x: x[:, 2], frames, masks, 60, 0.0)
+    distance = np.linalg.norm(hull.shell - CENTRE, axis=1)
+    # Eight silhouettes from one height leave edges and a cap, but nothing is inside the ball's skin.
+    assert distance.min() > RADIUS - 1.5 * hull.voxel
+    assert np.median(distance) < 1.15 * RADIUS
+    assert min(agreement(silhouette(hull, f), m) for f, m in zip(frames, masks)) > 0.9
+    # One photo that sees nothing empties a strict hull and leaves a tolerant one alone.
+    masks[0] = np.zeros_like(masks[0])
+    assert len(carve(box, lambda x: x[:, 2], frames, masks, 60, 0.0).shell) == 0
+    assert len(carve(box, lambda x: x[:, 2], frames, masks, 60, 0.2).shell) > 0.5 * len(hull.shell)
+
+
+def test_ground_of_a_tilted_bowl_is_measured_beside_the_object():
+    generator = np.random.default_rng(0)
+    flat = generator.uniform(-4, 4, (600, 2))
+    height = 0.1 * flat[:, 0] - 0.02 * (flat**2).sum(1)
+    clutter = np.column_stack([generator.uniform(-4, 4, (150, 2)), generator.uniform(0.5, 2, 150)])
+    prompts = np.array([[-1, -1, 0], [1, 1, 0.2], [1, -1, 2], [-1, 1, 2.0]])
+    box = upright_box(prompts, np.array([0, 0, 1.0]), 0.1)
+    points = np.concatenate([np.column_stack([flat, height]), clutter])
+    ground, found = find_ground(box.to_box(points), box, box.to_box(prompts), 0)
+    assert found
+    beside = np.array([[2, 0, 0.2 - 0.08], [0, -2, -0.08]])
+    assert np.abs(ground.height_of(box.to_box(beside))).max() < 0.08
+    nowhere, found = find_ground(np.empty((0, 3)), box, box.to_box(prompts), 0)
+    assert not found
+    assert nowhere.height_of(np.array([[0, 0, box.low[2] + 1]])) == pytest.approx(1)
+
+
+def test_cleaned_turns_specks_and_pinholes():
+    mask = np.zeros((50, 50), dtype=bool)
+    mask[10:40, 10:40] = True
+    expected = mask.copy()
+    mask[20, 20] = False
+    mask[2, 2] = True
+    assert (cleaned(mask) == expected).all()
+
+
+def test_labels_where_hull_mask_and_seeds_meet():
+    outline = np.zeros((60, 60), dtype=bool)
+    outline[10:50, 10:50] = True
+    mask = outline.copy()
+    mask[10:50, 30:50] = False
+    evidence = np.where(np.arange(60)[:, None] < 30, 1.0, -1.0) * np.ones((60, 60))
+    trimap = second_trimap(outline, mask, evidence.astype(np.float32), 3)
+    assert trimap[30, 20] == cv2.GC_FGD
+    assert trimap[20, 40] == cv2.GC_PR_FGD
+    assert trimap[40, 40] == cv2.GC_PR_BGD
+    assert trimap[2, 2] == cv2.GC_BGD
+    pixels = np.array([[20, 20], [40, 20], [30, 40], [5, 55.0]])
+    positions = np.column_stack([pixels / 20, np.zeros(4)])
+    labels = np.full((60, 60), cv2.GC_PR_BGD, np.uint8)
+    stamp_seeds(labels, pixels, positions, np.array([1, 1, 1, -1], np.int8), 1.0, 2.0)
+    assert labels[26, 30] == cv2.GC_FGD
+    assert labels[55, 5] == cv2.GC_BGD
+    labels[:] = cv2.GC_PR_BGD
+    stamp_seeds(labels, pixels, positions, np.array([1, 1, 1, -1], np.int8), 1.0, 0.5)
+    assert labels[26, 30] == cv2.GC_PR_BGD
