@@ -12,6 +12,7 @@ from scipy import ndimage
 
 from scenefuse.fiducials import locate
 from scenefuse.objects.box import Ground, find_ground, in_hull, span, upright_box
+from scenefuse.objects.frames import original_sizes
 from scenefuse.objects.grabcut import (
     cleaned,
     first_trimap,
@@ -94,6 +95,7 @@ def make_masks(
     cameras: Path,
     cameras_json: Path,
     sfm: Path,
+    photos: Path,
     method: Literal["grabcut", "sam2", "supplied"],
     prompts: Path | None,
     supplied: Path | None,
@@ -116,7 +118,8 @@ def make_masks(
     Args:
         cameras: undistorted COLMAP workspace of the object (PINHOLE cameras).
         cameras_json: its report, with `up_in_camera_frame`.
-        sfm: the COLMAP model before undistortion: clicks and supplied masks are in its photos' pixels.
+        sfm: the COLMAP model before undistortion.
+        photos: JSON list of the frames, with the sizes of the photos they were made from: clicks are in their pixels.
         method: where masks come from.
         prompts: for grabcut and sam2: TSV of pixels clicked in two or more photos, or of points in the
             object's frame, on the object and
@@ -144,7 +147,7 @@ def make_masks(
         hull = _carve(target, frames, first, settings, settings.hull_tolerance)
         final = first
     else:
-        points = _prompt_points(prompts, sfm, settings)
+        points = _prompt_points(prompts, sfm, photos, settings)
         target = _object_from_points(points, sparse, up, settings, seed)
         print(f"{np.sum(target.kind > 0)} sparse points on the object, {np.sum(target.kind < 0)} not", flush=True)
         if method == "sam2":
@@ -264,11 +267,11 @@ def _with_neighbours_points(frames: list[Frame], sparse: Array, max_angle_deg: f
     return completed
 
 
-def _prompt_points(prompts: Path | None, sfm: Path, settings: MaskSettings) -> Array:
+def _prompt_points(prompts: Path | None, sfm: Path, photos: Path, settings: MaskSettings) -> Array:
     """(N, 3) prompts in the object's frame."""
     if prompts is None:
         raise StageError("masks from prompts need a prompts file; set its path in config/objects.tsv, or supply masks")
-    names, points, _ = locate(prompts, sfm, settings.max_click_residual_px)
+    names, points, _ = locate(prompts, sfm, settings.max_click_residual_px, original_sizes(read_json(photos)))
     if len(points) < 3:
         raise StageError(
             f"{prompts} holds {len(names)} points on the object, three or more are needed; mark some at its ends"

@@ -83,6 +83,7 @@ def capture(tmp_path_factory):
         if len(track) > 1:
             model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
     model.write_binary(folder / "cameras" / "sparse")
+    write_json(folder / "photos.json", {"photos": []})
     write_json(folder / "cameras.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
     marks = [(0, 0, 2), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1), (0, 0, 0.05)]
     lines = [f"p{i}\t{x}\t{y}\t{z}" for i, (x, y, z) in enumerate(marks)]
@@ -95,6 +96,7 @@ def run_stage(capture, output, **changes):
         "cameras": capture / "cameras",
         "cameras_json": capture / "cameras.json",
         "sfm": capture / "cameras" / "sparse",
+        "photos": capture / "photos.json",
         "method": "grabcut",
         "prompts": capture / "prompts.tsv",
         "supplied": None,

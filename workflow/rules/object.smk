@@ -195,6 +195,7 @@ rule masks:
     """Where the object is in each frame: SAM 2, GrabCut, or your own masks (paper 3.2)."""
     input:
         mask_inputs,
+        photos="results/objects/{object}/photos.json",
         sfm="results/objects/{object}/sfm",
         cameras="results/objects/{object}/cameras",
         cameras_json="results/objects/{object}/cameras.json",
@@ -223,7 +224,7 @@ rule masks:
     message:
         "{wildcards.object}: masks"
     shell:
-        "exec python {SCRIPTS}/masks.py --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm}"
+        "exec python {SCRIPTS}/masks.py --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm} --photos {input.photos}"
         " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"
 
 

@@ -207,7 +207,7 @@ rule depth_maps:
         "results/benchmarks/depth_maps/{scene}-{chunk}.tsv"
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 240 * attempt,

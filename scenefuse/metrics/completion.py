@@ -1,0 +1,141 @@
+"""Unsupervised quality of what was added: surface variation, uniformity of density, primitives; each with its null."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenefuse.clouds import Cloud, spacing
+from scenefuse.metrics.primitives import primitive_fitting_score
+from scenefuse.stage import quantity, threads
+from scenefuse.transforms import Array
+
+
+@dataclass(frozen=True)
+class CompletionSettings:
+    """What the completion metrics need; see `MetricSettings` for the meaning of each."""
+
+    variation_spacings: float
+    density_neighbours: int
+    primitive_fraction: float
+    primitive_support: float
+    primitive_most: int
+    primitive_angle_deg: float
+    normal_neighbours: int
+    sample: int
+
+
+def completion_metrics(
+    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, settings: CompletionSettings, seed: int
+) -> dict[str, dict[str, Any]]:
+    """The completion.* numbers of the added points P_new, and the same of a random cloud in their place.
+
+    The null cloud has as many points, uniform in P_new's bounding box: a metric gives that much for nothing.
+
+    Args:
+        around: the scene's points that were kept around the object.
+        scene: the scene's points on the object before completion: the incomplete cloud of NUE.
+        added: P_new.
+        diagonal: of the full arm's crop.
+        settings: see CompletionSettings.
+        seed: of samples and of the null cloud.
+    """
+    names = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
+    if len(added) < 4 * settings.density_neighbours:
+        empty = {n: quantity(None, "1") for m in names for n in (m, f"{m}_null")}
+        return {**empty, "added_points": quantity(len(added), "points")}
+    rng = np.random.default_rng(seed)
+    low, high = added.points.min(0), added.points.max(0)
+    random = rng.uniform(low, high, (len(added), 3))
+    real = _measure(around.points, scene.points, added.points, diagonal, settings, seed)
+    null = _measure(around.points, scene.points, random, diagonal, settings, seed)
+    found: dict[str, dict[str, Any]] = {}
+    for name in real:
+        found[name] = quantity(real[name], "1")
+        found[f"{name}_null"] = quantity(null[name], "1")
+    radius = settings.variation_spacings * spacing(scene.points)
+    found["surface_variation_scene"] = quantity(
+        surface_variation(scene.points, _sampled(scene.points, settings.sample, seed), radius), "1"
+    )
+    found["surface_variation_radius"] = quantity(radius, "scene units")
+    found["added_points"] = quantity(len(added), "points")
+    return found
+
+
+def _measure(
+    around: Array, scene: Array, added: Array, diagonal: float, settings: CompletionSettings, seed: int
+) -> dict[str, float | None]:
+    """Every number for one set of added points."""
+    complete = np.concatenate([around, added])
+    few = _sampled(added, settings.sample, seed)
+    few_scene = _sampled(scene, settings.sample, seed)
+    radius = settings.variation_spacings * spacing(scene)
+    found: dict[str, float | None] = {"surface_variation": surface_variation(complete, few, radius)}
+    for percent in (1, 2, 4):
+        found[f"surface_variation_{percent}pct"] = surface_variation(complete, few[:1500], percent / 100 * diagonal)
+    for k in (settings.density_neighbours, 8, 32):
+        suffix = "" if k == settings.density_neighbours else f"_k{k}"
+        new, old = local_density(complete, few, k), local_density(scene, few_scene, k)
+        found[f"nue{suffix}"] = float(new.std() / old.std())
+        found[f"nue_density_invariant{suffix}"] = float((new.std() / new.mean()) / (old.std() / old.mean()))
+    found["primitive_fitting_score"] = primitive_fitting_score(
+        few,
+        plane_normals(complete, few, settings.normal_neighbours),
+        settings.primitive_fraction * diagonal,
+        settings.primitive_support,
+        settings.primitive_most,
+        settings.primitive_angle_deg,
+        seed,
+    )
+    return found
+
+
+def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
+    """Mean over `at` of lambda_0 / (lambda_0 + lambda_1 + lambda_2) of the cloud's points within `radius`, 0..1/3.
+
+    Neighbourhoods of fewer than four points say nothing and are left out; None when there is no other.
+
+    Args:
+        cloud: (N, 3) points that are neighbours.
+        at: (M, 3) points whose neighbourhoods are measured.
+        radius: of a neighbourhood, in the clouds' unit.
+    """
+    found = cKDTree(cloud).query_ball_point(at, radius, workers=threads())
+    counts = np.array([len(f) for f in found])
+    if (counts < 4).all():
+        return None
+    index = np.concatenate([np.asarray(f, dtype=np.int64) for f in found])
+    owner = np.repeat(np.arange(len(at)), counts)
+    local = cloud[index] - at[owner]
+    first = np.stack([np.bincount(owner, local[:, i], len(at)) for i in range(3)], axis=1)
+    second = np.stack(
+        [np.bincount(owner, local[:, i] * local[:, j], len(at)) for i in range(3) for j in range(3)], axis=1
+    )
+    enough = counts >= 4
+    n = counts[enough][:, None]
+    mean = first[enough] / n
+    covariance = second[enough].reshape(-1, 3, 3) / n[..., None] - mean[:, :, None] * mean[:, None, :]
+    values = np.clip(np.linalg.eigvalsh(covariance), 0, None)
+    return float((values[:, 0] / np.maximum(values.sum(1), 1e-300)).mean())
+
+
+def local_density(cloud: Array, at: Array, k: int) -> Array:
+    """rho = k / (pi r_k^2) at points `at` of the cloud; r_k is the distance to the k-th other point."""
+    distance = cKDTree(cloud).query(at, k=min(k + 1, len(cloud)), workers=threads())[0][:, -1]
+    floor = max(float(np.median(distance)) * 1e-3, 1e-300)
+    return k / (np.pi * np.maximum(distance, floor) ** 2)
+
+
+def plane_normals(cloud: Array, at: Array, neighbours: int) -> Array:
+    """Unit normals (M, 3) at points `at` from the planes through their nearest neighbours in the cloud."""
+    index = cKDTree(cloud).query(at, k=min(neighbours, len(cloud)), workers=threads())[1]
+    local = cloud[index]
+    local = local - local.mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+
+
+def _sampled(points: Array, most: int, seed: int) -> Array:
+    if len(points) <= most:
+        return points
+    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]

@@ -1,0 +1,203 @@
+"""The scene around an object: a box from fiducials, upright to gravity, with the ground and loose parts removed."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.fiducials import locate
+from scenefuse.registration.ground import Ground, fit_ground
+from scenefuse.stage import StageError, quantity, threads, write_json
+from scenefuse.transforms import Array, rotation_between
+
+
+@dataclass(frozen=True)
+class CropSettings:
+    """Settings of the crop. Shares are of the diagonal of the fiducials' box."""
+
+    margin: float
+    """Widening of the box on every side, as a share of its own extent."""
+    margin_fraction: float
+    """Further widening on every side, as a share of the diagonal (two voxels of the registration)."""
+    remove_ground: bool
+    """Whether the ground is fitted around the box and removed inside."""
+    ring_fraction: float
+    """Width of the ring around the box in which the ground is looked for, as a share of the diagonal."""
+    ground_fraction: float
+    """Points lower than this above the ground are ground, as a share of the diagonal."""
+    link_fraction: float
+    """Points closer than this belong to one part, as a share of the diagonal."""
+    reach_fraction: float
+    """A part this near to a fiducial belongs to the object, as a share of the diagonal."""
+    min_part: float
+    """Parts with a smaller share of the points are left out."""
+    min_points: int
+    """Fewest points a crop may have."""
+    max_residual_px: float
+    """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """What was cut out and how.
+
+    Attributes:
+        keep: (N,) bool over the scene's points, True on the object.
+        in_box: (N,) bool, True for all points in the box, ground included.
+        level_from_scene: (3, 3) rotation that turns the scene's up into z.
+        low: (3,) least corner of the box in the level frame.
+        high: (3,) greatest corner.
+        ground: the fitted ground, or None.
+        notes: what was not done and why.
+    """
+
+    keep: NDArray[np.bool_]
+    in_box: NDArray[np.bool_]
+    level_from_scene: Array
+    low: Array
+    high: Array
+    ground: Ground | None
+    notes: list[str]
+
+
+def crop_scene(
+    *,
+    scene: Path,
+    model: Path,
+    fiducials: Path,
+    crop: Path,
+    report: Path,
+    mode: Literal["fiducials", "none"],
+    settings: CropSettings,
+) -> None:
+    """Cut an object's surroundings out of the scene by its fiducials (PAPER C1, C2).
+
+    Args:
+        scene: dense scene cloud (PLY), z up as the georegister stage leaves it.
+        model: COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it.
+        fiducials: tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z), at least four
+            different points on the object.
+        crop: output PLY, the scene's points on the object.
+        report: output JSON: box, gravity, ground, counts.
+        mode: fiducials; or none, which keeps the whole scene (the ablation without cropping).
+        settings: see CropSettings.
+
+    Raises:
+        StageError: fewer than four fiducials, one far from every scene point, or too few points in the box.
+    """
+    cloud = read_cloud(scene)
+    up = np.array([0.0, 0.0, 1.0])
+    if mode == "none":
+        write_cloud(crop, cloud)
+        write_json(report, _report(cloud, cloud, None, None, up, mode))
+        return
+    names, points, _ = locate(fiducials, model, settings.max_residual_px)
+    if len(points) < 4:
+        raise StageError(
+            f"{fiducials} gives {len(points)} fiducials; an object needs at least 4 different points on it"
+        )
+    _check_near(names, points, cloud, fiducials)
+    cut = crop_cloud(cloud, points, up, settings)
+    part = cloud[cut.keep]
+    if len(part) < settings.min_points:
+        raise StageError(
+            f"only {len(part)} scene points are left in the box of {fiducials}, {settings.min_points} are needed:"
+            " a fiducial may lie outside the object, or the scene may not show it"
+        )
+    for note in cut.notes:
+        print(note, flush=True)
+    write_cloud(crop, part)
+    write_json(report, _report(cloud, part, points, cut, up, mode))
+
+
+def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings) -> Crop:
+    """The points of a scene that belong to the object marked by fiducials (F, 3); see `crop_scene`."""
+    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    points, marks = scene.points @ level.T, fiducials @ level.T
+    extent = np.ptp(marks, axis=0)
+    diagonal = float(np.linalg.norm(extent))
+    margin = settings.margin * extent + settings.margin_fraction * diagonal
+    low, high = marks.min(0) - margin, marks.max(0) + margin
+    notes: list[str] = []
+    ground = None
+    if settings.remove_ground:
+        ground = fit_ground(points, low, high, settings.ring_fraction * diagonal, settings.ground_fraction * diagonal)
+        if ground is None:
+            notes.append("no ground was found around the box: nothing was removed as ground")
+        else:
+            # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
+            corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+            low[2] = min(low[2], ground.height(corners).min() - settings.ground_fraction * diagonal)
+    in_box = ((points >= low) & (points <= high)).all(1)
+    above = in_box.copy()
+    if ground is not None:
+        above &= points[:, 2] > ground.height(points[:, :2]) + ground.tolerance
+    keep = above.copy()
+    inside = np.flatnonzero(above)
+    if len(inside):
+        link = max(settings.link_fraction * diagonal, 3 * spacing(points[inside]))
+        keep[inside] = _parts_near(points[inside], marks, link, settings.reach_fraction * diagonal, settings.min_part)
+    return Crop(keep, in_box, level, low, high, ground, notes)
+
+
+def _parts_near(points: Array, marks: Array, link: float, reach: float, min_part: float) -> NDArray[np.bool_]:
+    """Which points belong to a large enough part that a fiducial touches or that mostly lies between fiducials.
+
+    The second counts for parts no one clicked, a wall under a roof for instance: half their points in the fiducials'
+    own box, seen from above.
+    """
+    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
+    cell_of = cell_of.ravel()
+    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
+    part_of = connected_components(graph, directed=False)[1][cell_of]
+    counts = np.bincount(part_of)
+    touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
+    low, high = marks.min(0)[:2], marks.max(0)[:2]
+    between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
+    wanted = (counts >= min_part * len(points)) & (touched | (between >= 0.5 * counts))
+    return wanted[part_of] if wanted.any() else np.ones(len(points), dtype=bool)
+
+
+def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> None:
+    """A fiducial far from everything the scene shows is a wrong click."""
+    diagonal = float(np.linalg.norm(np.ptp(points, axis=0)))
+    distance = cKDTree(cloud.points).query(points, workers=threads())[0]
+    worst = int(distance.argmax())
+    if distance[worst] > max(0.5 * diagonal, 10 * spacing(cloud.points)):
+        raise StageError(
+            f"fiducial {names[worst]} of {path} lies {distance[worst]:.3g} scene units from the nearest scene point;"
+            " check its clicks or coordinates"
+        )
+
+
+def _report(
+    scene: Cloud, part: Cloud, fiducials: Array | None, cut: Crop | None, up: Array, mode: str
+) -> dict[str, object]:
+    """The stage JSON of a crop."""
+    unit = "scene units"
+    ground = None if cut is None else cut.ground
+    return {
+        "mode": quantity(mode, ""),
+        "up_in_scene": quantity(up, ""),
+        "level_from_scene": quantity(np.eye(3) if cut is None else cut.level_from_scene, ""),
+        "box_low": quantity(scene.points.min(0) if cut is None else cut.low, unit),
+        "box_high": quantity(scene.points.max(0) if cut is None else cut.high, unit),
+        "fiducials": quantity([] if fiducials is None else fiducials, unit),
+        "scene_points": quantity(len(scene), "points"),
+        "box_points": quantity(len(scene) if cut is None else int(cut.in_box.sum()), "points"),
+        "crop_points": quantity(len(part), "points"),
+        "diagonal": quantity(part.diagonal, unit),
+        "spacing": quantity(spacing(part.points), unit),
+        "ground_removed": quantity(ground is not None, ""),
+        "ground_coefficients": quantity(None if ground is None else ground.coefficients, unit),
+        "ground_centre": quantity(None if ground is None else ground.centre, unit),
+        "ground_tolerance": quantity(None if ground is None else ground.tolerance, unit),
+        "notes": quantity([] if cut is None else cut.notes, ""),
+    }

@@ -1,0 +1,116 @@
+"""The ground under an object, fitted to what surrounds it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenefuse.transforms import Array
+
+CELLS = 40
+
+
+@dataclass(frozen=True)
+class Ground:
+    """A height field z = a + b x + c y + d x^2 + e x y + f y^2 about a centre.
+
+    Attributes:
+        coefficients: (6,) in the order above.
+        centre: (2,) subtracted from x and y.
+        tolerance: points lower than this above it are ground.
+    """
+
+    coefficients: Array
+    centre: Array
+    tolerance: float
+
+    def height(self, xy: Array) -> Array:
+        """Heights (N,) at (N, 2)."""
+        return _terms(xy - self.centre) @ self.coefficients
+
+
+def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: float, seed: int = 0) -> Ground | None:
+    """Fit the ground on a ring around a box, never inside it, so that the object itself cannot pass for ground.
+
+    The lowest points of cells of the ring are fitted by a plane (RANSAC over triples), then by a parabolic height
+    field with Tukey weights. The parabola is kept only where it stays near the plane in the middle, of which a ring
+    says little.
+
+    Args:
+        points: (N, 3), z up.
+        low: (3,) corner of the box.
+        high: (3,) opposite corner.
+        ring: width of the ring.
+        tolerance: height within which points are ground.
+        seed: of the triples.
+
+    Returns:
+        The ground, or None when the ring is empty or no plane below 45 degrees fits at least 30 % of it.
+    """
+    xy = points[:, :2]
+    near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
+    inside = ((xy >= low[:2]) & (xy <= high[:2])).all(1)
+    around = points[near & ~inside]
+    if len(around) < 50:
+        return None
+    edge = float((high[:2] - low[:2] + 2 * ring).max()) / CELLS
+    cell = np.floor((around[:, :2] - (low[:2] - ring)) / edge).astype(np.int64)
+    key = cell[:, 0] * (2 * CELLS) + cell[:, 1]
+    order = np.lexsort((around[:, 2], key))
+    first = np.concatenate([[True], key[order][1:] != key[order][:-1]])
+    starts = np.flatnonzero(first)
+    # The tenth percentile of a cell, not its lowest point: dense clouds have strays below the ground.
+    counts = np.diff(np.concatenate([starts, [len(order)]]))
+    lowest = around[order[starts + (0.1 * counts).astype(int)]]
+    if len(lowest) < 20:
+        return None
+    centre = (low[:2] + high[:2]) / 2
+    x = lowest[:, :2] - centre
+    plane = _plane_by_triples(x, lowest[:, 2], 2 * tolerance, seed)
+    if plane is None:
+        return None
+    terms = _terms(x)
+    coefficients = np.concatenate([plane, np.zeros(3)])
+    for columns in (3, 6, 6):
+        for _ in range(10):
+            residual = lowest[:, 2] - terms @ coefficients
+            weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
+            root = np.sqrt(weight)[:, None]
+            if (weight > 0).sum() < 20:
+                break
+            solved = np.linalg.lstsq(root * terms[:, :columns], root[:, 0] * lowest[:, 2], rcond=None)[0]
+            coefficients = np.concatenate([solved, np.zeros(6 - columns)])
+        if columns == 3:
+            flat = coefficients
+    bulge = abs(float(coefficients[0] - flat[0]))
+    if bulge > 3 * tolerance:
+        coefficients = flat
+    # A noisy cloud's ground is thick: its own spread about the surface widens the tolerance.
+    off = around[:, 2] - _terms(around[:, :2] - centre) @ coefficients
+    off = off[np.abs(off) < 4 * tolerance]
+    if len(off):
+        coefficients[0] += float(np.median(off))
+        tolerance = float(np.clip(2.5 * 1.4826 * np.median(np.abs(off - np.median(off))), tolerance, 3 * tolerance))
+    return Ground(coefficients, centre, tolerance)
+
+
+def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array | None:
+    """The (3,) plane a + b x + c y with most points within `tolerance`, or None."""
+    rng = np.random.default_rng(seed)
+    triples = rng.integers(0, len(xy), (400, 3))
+    terms = _terms(xy)[:, :3]
+    matrices = terms[triples]
+    good = np.abs(np.linalg.det(matrices)) > 1e-6 * np.ptp(xy, axis=0).max() ** 2
+    if not good.any():
+        return None
+    planes = np.linalg.solve(matrices[good], z[triples[good]][..., None])[..., 0]
+    planes = planes[np.hypot(planes[:, 1], planes[:, 2]) < 1]
+    if len(planes) == 0:
+        return None
+    counts = (np.abs(planes @ terms.T - z) <= tolerance).sum(1)
+    best = int(counts.argmax())
+    return planes[best] if counts[best] >= 0.3 * len(z) else None
+
+
+def _terms(xy: Array) -> Array:
+    x, y = xy[:, 0], xy[:, 1]
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)

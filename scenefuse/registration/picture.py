@@ -1,0 +1,53 @@
+"""A picture of an alignment: the object on the scene crop from three sides."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.clouds import Cloud
+from scenefuse.stage import atomic_file
+from scenefuse.transforms import Array, Sim3
+
+SIDE_PX = 460
+SCENE_RGB, OBJECT_RGB = (60, 60, 60), (214, 92, 30)
+
+
+def draw_alignment(
+    path: Path, cloud: Cloud, scene: Cloud, scene_from_object: Sim3, seed: int, most: int = 15000
+) -> None:
+    """Write a PNG: top, front and side views; above in two colours (scene grey, object orange), below as measured."""
+    rng = np.random.default_rng(seed)
+    thin = [c[np.sort(rng.permutation(len(c))[:most])] for c in (cloud, scene)]
+    obj, ground = thin[0].transformed(scene_from_object), thin[1]
+    low, high = ground.points.min(0), ground.points.max(0)
+    middle, half = (low + high) / 2, 0.62 * max(float((high - low).max()), 1e-9)
+    points = np.concatenate([ground.points, obj.points]) - middle
+    flat = np.concatenate([np.tile(SCENE_RGB, (len(ground), 1)), np.tile(OBJECT_RGB, (len(obj), 1))])
+    real = np.concatenate([_colors(ground, SCENE_RGB), _colors(obj, OBJECT_RGB)])
+    views = [(0, 1, 2), (0, 2, -2), (1, 2, 1)]
+    rows = [np.concatenate([_splat(points, colors, view, half) for view in views], axis=1) for colors in (flat, real)]
+    with atomic_file(path) as temporary:
+        cv2.imwrite(str(temporary), np.concatenate(rows)[:, :, ::-1])
+
+
+def _splat(points: Array, colors: NDArray[np.int64], view: tuple[int, int, int], half: float) -> NDArray[np.uint8]:
+    """Nearest points last, on white; view = (right axis, up axis, depth axis, negative when looked along it)."""
+    right, up, depth = view
+    nearness = points[:, 1] * -1 if depth == -2 else points[:, abs(depth)]
+    image = np.full((SIDE_PX, SIDE_PX, 3), 255, np.uint8)
+    columns = ((points[:, right] / half + 1) / 2 * SIDE_PX).astype(int)
+    rows = ((1 - points[:, up] / half) / 2 * SIDE_PX).astype(int)
+    inside = (columns > 0) & (columns < SIDE_PX - 1) & (rows > 0) & (rows < SIDE_PX - 1)
+    order = np.argsort(nearness[inside], kind="stable")
+    columns, rows, colors = columns[inside][order], rows[inside][order], colors[inside][order]
+    for du, dv in ((0, 0), (1, 0), (0, 1), (1, 1)):
+        image[rows + dv, columns + du] = colors
+    return image
+
+
+def _colors(cloud: Cloud, otherwise: tuple[int, int, int]) -> NDArray[np.int64]:
+    if cloud.colors is None:
+        return np.tile(otherwise, (len(cloud), 1))
+    return cloud.colors.astype(np.int64)

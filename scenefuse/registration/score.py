@@ -1,0 +1,113 @@
+"""How well a pose explains two surfaces: two-way F-score, agreement of colours, and both as one number."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.registration.surface import Surface
+from scenefuse.stage import threads
+from scenefuse.transforms import Array, Sim3
+
+LEAST_CONTRAST = 0.02
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """Nearest neighbours both ways at one pose.
+
+    Attributes:
+        object_index: (M,) indices into the object's points.
+        scene_index: (M,) indices into the scene's points.
+        distance: (M,) distances in scene units, all within the threshold.
+        forward: the first `forward` pairs go from object points to the scene, the rest from scene points to the object.
+    """
+
+    object_index: NDArray[np.int64]
+    scene_index: NDArray[np.int64]
+    distance: Array
+    forward: int
+
+
+@dataclass(frozen=True)
+class Score:
+    """The quality of one pose, every number in 0..1.
+
+    Attributes:
+        f_score: two-way F of `precision` and `recall`, both soft (an inlier counts less the farther and the more
+            tilted its partner is). Recall weighs more, since the scene shows only a part of the object.
+        precision: share of the object that the scene confirms.
+        recall: share of the scene crop that the object explains.
+        color: correlation of the colours over the pairs after one gain and bias per channel; None without colours.
+        total: the number hypotheses are ranked by.
+    """
+
+    f_score: float
+    precision: float
+    recall: float
+    color: float | None
+    total: float
+
+
+def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> Pairs:
+    """Nearest neighbours within `tau` (scene units), from the object to the scene and back.
+
+    The object's own tree serves at every pose: a similarity keeps the order of distances.
+    """
+    s = scene_from_object.scale
+    asking, questioning = obj.points[obj.probe], scene.points[scene.probe]
+    ahead, there = scene.tree.query(scene_from_object.apply(asking), distance_upper_bound=tau, workers=threads())
+    back, here = obj.tree.query(
+        scene_from_object.inverse().apply(questioning), distance_upper_bound=tau / s, workers=threads()
+    )
+    found, met = np.isfinite(ahead), np.isfinite(back)
+    return Pairs(
+        np.concatenate([obj.probe[found], here[met]]),
+        np.concatenate([there[found], scene.probe[met]]),
+        np.concatenate([ahead[found], back[met] * s]),
+        int(found.sum()),
+    )
+
+
+def score(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float, recall_weight: float) -> Score:
+    """Score a pose at the distance `tau`; `recall_weight` is the beta of the F-beta measure."""
+    pairs = pair(obj, scene, scene_from_object, tau)
+    turned = scene_from_object.rotate(obj.normals)
+    facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
+    worth = (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
+    precision = float(worth[: pairs.forward].sum() / len(obj.probe))
+    recall = float(worth[pairs.forward :].sum() / len(scene.probe))
+    b = recall_weight**2
+    f_score = (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
+    color = color_agreement(obj, scene, pairs)
+    total = f_score if color is None else f_score * (0.5 + 0.5 * color)
+    return Score(f_score, precision, recall, color, total)
+
+
+def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
+    """Correlation 0..1 of paired colours, pooled over channels, after a gain and a bias per channel.
+
+    None without colours, or where either side is all but one colour: then colours say nothing about the pose.
+    """
+    if obj.colors is None or scene.colors is None:
+        return None
+    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < LEAST_CONTRAST:
+        return None
+    if len(pairs.distance) < 30:
+        return 0.0
+    a, b = obj.colors[pairs.object_index], scene.colors[pairs.scene_index]
+    a, b = a - a.mean(0), b - b.mean(0)
+    spread = (b**2).sum(0)
+    together = (a * b).sum(0)
+    explained = np.where(together > 0, together**2 / np.maximum((a**2).sum(0), 1e-9), 0.0)
+    return float(np.sqrt(explained.sum() / max(spread.sum(), 1e-9)))
+
+
+def color_gain(obj: Surface, scene: Surface, pairs: Pairs) -> tuple[Array, Array]:
+    """Gain and bias (3,) per channel that bring the object's colours to the scene's over the pairs."""
+    assert obj.colors is not None and scene.colors is not None
+    a, b = obj.colors[pairs.object_index], scene.colors[pairs.scene_index]
+    mean_a, mean_b = a.mean(0), b.mean(0)
+    gain = ((a - mean_a) * (b - mean_b)).sum(0) / np.maximum(((a - mean_a) ** 2).sum(0), 1e-9)
+    gain = np.clip(gain, 0.25, 4.0)
+    return gain, mean_b - gain * mean_a

@@ -1,0 +1,306 @@
+"""Stage 1: every equation against values worked out by hand, and one small training against a planted plane."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from scenefuse.maps import read_depth
+from scenefuse.objects import depth as stage
+from scenefuse.objects.depth_consistency import (
+    agreement_between_views,
+    align_to_points,
+    fuse_by_inverse_variance,
+)
+from scenefuse.objects.depth_inputs import make_frames, network_inputs
+from scenefuse.objects.depth_networks import (
+    DepthNetwork,
+    PoseNetwork,
+    depth_from_disparity,
+    disparity_from_depth,
+    parameters,
+    rigid,
+)
+from scenefuse.objects.depth_training import Recipe, Supervision, train_networks, warmup_then_cosine
+from scenefuse.objects.self_supervision import (
+    minimum_reprojection,
+    photometric_error,
+    smoothness,
+    ssim,
+    warp,
+)
+from scenefuse.objects.views import Views
+from scenefuse.stage import StageError
+
+INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])
+
+
+def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    red = np.sin(5.1 * x + 1.3 * y) + np.sin(11.0 * x - 7.0 * y)
+    green = np.sin(4.3 * y - 2.0 * x) + np.sin(9.0 * y + 8.0 * x)
+    blue = np.sin(6.0 * x * 1.1 + 3.7 * y + 1.0) + np.sin(13.0 * y)
+    return (127.5 + 55.0 * np.stack([red, green, blue], -1)).astype(np.uint8)
+
+
+def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int = 1) -> tuple[Views, np.ndarray]:
+    """A slanted textured square, z = 3 + 0.3 x in the object frame, seen by cameras along an arc; with true depths."""
+    focal = 0.9 * width
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    v, u = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
+    rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-0.9, 0.9, (150, 2))
+    sparse = np.column_stack([xy, 3.0 + 0.3 * xy[:, 0]])
+    images, masks, poses, depths, tracks = [], [], [], [], []
+    for angle in np.linspace(-0.4, 0.4, count):
+        rotation = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
+        centre = np.array([0, 0, 3.0]) - 3.0 * rotation[:, 2]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, centre
+        directions = rays @ rotation.T
+        depth = (3.0 + 0.3 * centre[0] - centre[2]) / (directions[..., 2] - 0.3 * directions[..., 0])
+        points = centre + directions * depth[..., None]
+        mask = (np.abs(points[..., 0]) < 1) & (np.abs(points[..., 1]) < 1)
+        images.append(np.where(mask[..., None], _texture(points[..., 0], points[..., 1]), 90).astype(np.uint8))
+        masks.append(mask)
+        poses.append(pose)
+        depths.append(np.where(mask, depth, 0.0))
+        tracks.append(np.arange(150))
+    held = np.zeros(count, bool)
+    held[count // 2 : count // 2 + held_out] = True
+    names = [f"{i:03d}.jpg" for i in range(count)]
+    k = np.repeat(intrinsics[None], count, 0)
+    return Views(names, np.stack(images), np.stack(masks), k, np.stack(poses), held, sparse, tracks), np.stack(depths)
+
+
+def _settings(**changes: float) -> stage.DepthSettings:
+    base = stage.DepthSettings(64, 56, 4, 16, 2, 1, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.01)
+    return replace(base, **changes)
+
+
+def test_warp_with_identity_pose_is_identity():
+    image = torch.rand(1, 3, 32, 48)
+    warped, valid = warp(image, torch.full((1, 1, 32, 48), 2.0), torch.eye(4)[None], INTRINSICS, INTRINSICS)
+    assert torch.allclose(warped, image, atol=1e-5)
+    assert valid[0, 0, 1:-1, 1:-1].all()
+
+
+def test_warp_follows_the_homography_of_a_plane():
+    # H = K (R + t n^T / d) K^-1 for the plane n^T X = d; z = 2 and a sideways step of 0.1: 40 * 0.1 / 2 = 2 pixels.
+    image = torch.arange(48.0).expand(1, 1, 32, 48).contiguous()
+    move = torch.eye(4)[None].clone()
+    move[0, 0, 3] = 0.1
+    warped, valid = warp(image, torch.full((1, 1, 32, 48), 2.0), move, INTRINSICS, INTRINSICS)
+    assert torch.allclose(warped[0, 0, :, :44], image[0, 0, :, :44] + 2.0, atol=1e-4)
+    assert not valid[0, 0, :, -2:].any() and valid[0, 0, 1:-1, 1:44].all()
+
+
+def test_warp_with_rotation_matches_the_general_homography():
+    move = rigid(torch.tensor([[0.02, -0.03, 0.05]]), torch.tensor([[0.05, 0.02, -0.1]]))
+    normal, distance = torch.tensor([0.1, 0.2, 1.0]), 2.0
+    homography = INTRINSICS[0] @ (move[0, :3, :3] + torch.outer(move[0, :3, 3], normal) / distance)
+    homography = homography @ torch.linalg.inv(INTRINSICS[0])
+    v, u = torch.meshgrid(torch.arange(32.0) + 0.5, torch.arange(48.0) + 0.5, indexing="ij")
+    pixels = torch.stack([u, v, torch.ones_like(u)]).view(3, -1)
+    depth = distance / (normal @ torch.linalg.inv(INTRINSICS[0]) @ pixels)
+    expected = homography @ pixels
+    expected = (expected[:2] / expected[2]).view(2, 32, 48)
+    coordinates = torch.stack([u, v])[None]
+    warped, valid = warp(coordinates, depth.view(1, 1, 32, 48), move, INTRINSICS, INTRINSICS)
+    inner = valid[0, 0]
+    assert inner.sum() > 1000
+    assert torch.allclose(warped[0][:, inner], expected[:, inner], atol=1e-3)
+
+
+def test_ssim_of_equal_images_is_one_and_of_flat_images_is_the_luminance_term():
+    image = torch.rand(1, 3, 8, 8)
+    assert torch.allclose(ssim(image, image), torch.ones(1, 3, 8, 8), atol=1e-4)
+    dark, bright = torch.full((1, 3, 8, 8), 0.2), torch.full((1, 3, 8, 8), 0.4)
+    luminance = (2 * 0.2 * 0.4 + 1e-4) / (0.2**2 + 0.4**2 + 1e-4)
+    assert torch.allclose(ssim(dark, bright), torch.full((1, 3, 8, 8), luminance), atol=1e-3)
+    expected = 0.85 * (1 - luminance) / 2 + 0.15 * 0.2
+    assert torch.allclose(photometric_error(dark, bright, 0.85), torch.full((1, 1, 8, 8), expected), atol=1e-3)
+
+
+def test_minimum_reprojection_picks_the_smallest_valid_error_and_masks_what_did_not_move():
+    errors = torch.tensor([[[[0.3, 0.2, 0.5]], [[0.1, 0.4, 0.5]]]])
+    valid = torch.tensor([[[[True, True, False]], [[False, True, False]]]])
+    smallest, counts = minimum_reprojection(errors, valid, None)
+    assert torch.allclose(smallest[0, 0, 0], torch.tensor([0.3, 0.2, 0.0]))
+    assert counts[0, 0, 0].tolist() == [True, True, False]
+    unmoved = torch.tensor([[[[0.9, 0.15, 0.9]], [[0.8, 0.9, 0.9]]]])
+    _, counts = minimum_reprojection(errors, valid, unmoved)
+    assert counts[0, 0, 0].tolist() == [True, False, False]
+
+
+def test_smoothness_by_hand():
+    disparity = torch.tensor([[[[1.0, 3.0]]]]).repeat(1, 1, 2, 1)
+    image = torch.tensor([0.0, 0.5]).expand(1, 3, 2, 2)
+    # normalised by the mean 2: a step of 1, at an edge of 0.5
+    assert smoothness(disparity, image, torch.ones(1, 1, 2, 2)).item() == pytest.approx(math.exp(-0.5), rel=1e-5)
+    one_column = torch.tensor([[[[1.0, 0.0], [1.0, 0.0]]]])
+    assert smoothness(disparity, image, one_column).item() == 0.0
+
+
+def test_rigid_turns_about_an_axis():
+    quarter = rigid(torch.tensor([[0.0, 0.0, math.pi / 2]]), torch.tensor([[1.0, 2.0, 3.0]]))[0]
+    assert torch.allclose(quarter @ torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([1.0, 3.0, 3.0, 1.0]), atol=1e-6)
+
+
+def test_disparity_and_depth_are_inverse_and_span_the_range():
+    ends = depth_from_disparity(torch.tensor([0.0, 1.0]), 2.0, 5.0)
+    assert torch.allclose(ends, torch.tensor([5.0, 2.0]))
+    depth = torch.tensor([2.0, 3.3, 5.0])
+    assert torch.allclose(depth_from_disparity(disparity_from_depth(depth, 2.0, 5.0), 2.0, 5.0), depth, atol=1e-5)
+
+
+def test_networks_are_small_and_start_from_the_first_disparity():
+    network = DepthNetwork(9)
+    assert parameters(network, PoseNetwork(1.0)) < 1_000_000
+    first = torch.rand(2, 1, 33, 50) * 0.8 + 0.1
+    assert torch.allclose(network(torch.randn(2, 9, 33, 50), first), first, atol=1e-5)
+
+
+def test_warm_up_then_cosine():
+    values = [warmup_then_cosine(step, 100, 10.0) for step in range(100)]
+    assert values[0] < 0.1 and values[10] == pytest.approx(1.0) and values[99] < 0.01
+    assert values[55] == pytest.approx(0.5)
+    assert np.argmax(values) == 10
+
+
+def test_alignment_finds_a_planted_scale_and_shift_among_outliers():
+    rng = np.random.default_rng(0)
+    predicted = rng.uniform(2, 5, 200)
+    measured = 1.7 * predicted - 0.6 + 0.002 * rng.standard_normal(200)
+    measured[:60] = rng.uniform(1, 20, 60)
+    scale, shift = align_to_points(predicted, measured)
+    assert scale == pytest.approx(1.7, abs=0.005) and shift == pytest.approx(-0.6, abs=0.02)
+
+
+def test_alignment_leaves_a_map_alone_that_is_right_but_for_noise():
+    rng = np.random.default_rng(0)
+    predicted = rng.uniform(2, 5, 20)
+    assert align_to_points(predicted, predicted + 0.02 * rng.standard_normal(20)) == (1.0, 0.0)
+    assert align_to_points(predicted[:3], 2 * predicted[:3]) == (1.0, 0.0)
+
+
+def test_inverse_variance_by_hand():
+    def pixels(*values: float) -> torch.Tensor:
+        return torch.tensor(values).view(1, 1, 1, -1)
+
+    inf = math.inf
+    depth, variance, blended = fuse_by_inverse_variance(
+        pixels(10.0, 10.0, 10.0, 10.0, 0.0),
+        pixels(11.0, 20.0, 20.0, 20.0, 5.0),
+        pixels(1.0, 0.01, inf, 1.0, inf),
+        pixels(3.0, 1.0, 1.0, 1.0, 0.5),
+        0.0,
+    )
+    # (10 / 1 + 11 / 3) / (1 + 1 / 3) = 10.25; far apart: the four times better one; alone; far apart and equal: none
+    assert depth.flatten().tolist() == pytest.approx([10.25, 10.0, 20.0, 0.0, 5.0])
+    assert variance.flatten()[:3].tolist() == pytest.approx([0.75, 0.01, 1.0])
+    assert blended.flatten().tolist() == [True, False, False, False, False]
+
+
+def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
+    views, truth = plane_views(held_out=0)
+    frames = make_frames(views, 4, torch.device("cpu"))
+    depth = torch.tensor(truth, dtype=torch.float32)[:, None]
+    right = agreement_between_views(depth, frames, 0.02)
+    inner = torch.nn.functional.max_pool2d(1 - frames.masks, 5, 1, 2) == 0
+    assert right.confidence[inner].mean() > 0.9
+    wrong = depth.clone()
+    wrong[2] *= 1.15
+    assert agreement_between_views(wrong, frames, 0.02).confidence[2][inner[2]].mean() < 0.1
+    assert (right.confidence[frames.masks == 0] == 0).all()
+
+
+def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
+    views, truth = plane_views()
+    frames = make_frames(views, 4, torch.device("cpu"))
+    assert not np.isin(np.flatnonzero(views.held_out), frames.sources.numpy()).any()
+    _, first, _ = network_inputs(frames, 16, True)
+    depth = depth_from_disparity(first, frames.near, frames.far).numpy()[:, 0]
+    error = np.abs(depth - truth)[views.masks] / frames.diagonal
+    assert np.median(error) < 0.005
+
+
+def _recipe() -> Recipe:
+    return Recipe(2, 2, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.0, 0.3, False)
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
+    views, _ = plane_views(6)
+    frames = make_frames(views, 3, torch.device("cpu"))
+    inputs, first, _ = network_inputs(frames, 0, True)
+
+    def train(checkpoint, stop_at=None):
+        torch.manual_seed(0)
+        depth, pose = DepthNetwork(inputs.shape[1]), PoseNetwork(3.0)
+        calls = iter(range(1000))
+        original = torch.optim.Adam.step
+
+        def step(self, *args):
+            if next(calls) == stop_at:
+                raise SystemExit(143)
+            return original(self, *args)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(torch.optim.Adam, "step", step)
+            patch.setattr("scenefuse.objects.depth_training.CHECKPOINT_EVERY", 2)
+            losses = train_networks(depth, pose, frames, Supervision(inputs, first), _recipe(), checkpoint, 3)
+        return depth, losses
+
+    whole, losses = train(tmp_path / "a.pt")
+    with pytest.raises(SystemExit):
+        train(tmp_path / "b.pt", stop_at=3)
+    resumed, again = train(tmp_path / "b.pt")
+    assert losses == again
+    for a, b in zip(whole.parameters(), resumed.parameters()):
+        assert torch.equal(a, b)
+
+
+@pytest.mark.parametrize("source", ["sfm", "network"])
+def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkeypatch, source):
+    views, truth = plane_views()
+    monkeypatch.setattr(stage, "load_views", lambda *_: views)
+    stage.train_depth(
+        cameras=tmp_path,
+        masks=tmp_path,
+        stage=tmp_path / "stage1",
+        report=tmp_path / "stage1.json",
+        checkpoints=tmp_path / "checkpoints",
+        settings=_settings(),
+        pose_source=source,
+        hold_out_every=8,
+        seed=0,
+    )
+    report = json.loads((tmp_path / "stage1.json").read_text())
+    errors, confident = [], []
+    for index, name in enumerate(views.names):
+        depth = read_depth(tmp_path / "stage1" / "depth_maps" / f"{name}.bin")
+        confidence = read_depth(tmp_path / "stage1" / "confidence_maps" / f"{name}.bin")
+        assert (depth[~views.masks[index]] == 0).all() and (confidence[~views.masks[index]] == 0).all()
+        errors.append((np.abs(depth - truth[index]) / truth[index].max())[views.masks[index]])
+        confident.append(confidence[views.masks[index]])
+    assert (tmp_path / "stage1" / "networks.pt").is_file()
+    assert not list((tmp_path / "checkpoints").rglob("state.pt"))
+    if source == "sfm":
+        assert np.median(np.concatenate(errors)) < 0.01
+        assert report["residual_after_alignment"]["value"] < 0.01
+        assert report["consistent_share"]["value"] > 0.7
+        assert np.concatenate(confident).mean() > 0.6
+    else:
+        assert report["trajectory_error_over_extent"]["value"] >= 0
+        assert len(report["object_from_cam_by_network"]["value"]) == 7
+
+
+def test_too_few_points_or_photos_is_one_sentence():
+    views, _ = plane_views()
+    with pytest.raises(StageError, match="SfM points lie on the object"):
+        make_frames(replace(views, tracks=[np.arange(3)] * 8), 4, torch.device("cpu"))
+    with pytest.raises(StageError, match="needs at least 3"):
+        make_frames(replace(views, held_out=np.arange(8) > 1), 4, torch.device("cpu"))

@@ -1,0 +1,100 @@
+"""Stage 3: fusing and gating on planted depth maps."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from scenefuse.maps import read_depth, write_depth
+from scenefuse.objects import depth, feedback
+from scenefuse.stage import StageError
+from tests.unit.test_depth import plane_views
+
+SETTINGS = feedback.FeedbackSettings(1, 1, 4, 1e-3, 1, 1.0, 0.5)
+
+
+def _refine(tmp_path):
+    feedback.refine_depth(
+        cameras=tmp_path,
+        masks=tmp_path,
+        previous=tmp_path / "stage1",
+        rendered=tmp_path / "stage2",
+        stage=tmp_path / "stage3",
+        report=tmp_path / "stage3.json",
+        checkpoints=tmp_path / "checkpoints",
+        settings=SETTINGS,
+        hold_out_every=8,
+        seed=0,
+    )
+    return json.loads((tmp_path / "stage3.json").read_text())
+
+
+@pytest.fixture
+def stage1(tmp_path, monkeypatch):
+    views, truth = plane_views()
+    monkeypatch.setattr(depth, "load_views", lambda *_: views)
+    monkeypatch.setattr(feedback, "load_views", lambda *_: views)
+    depth.train_depth(
+        cameras=tmp_path,
+        masks=tmp_path,
+        stage=tmp_path / "stage1",
+        report=tmp_path / "stage1.json",
+        checkpoints=tmp_path / "checkpoints",
+        settings=depth.DepthSettings(64, 56, 4, 16, 1, 1, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.01),
+        pose_source="sfm",
+        hold_out_every=8,
+        seed=0,
+    )
+    return views, truth
+
+
+def _write_rendered(folder, views, maps):
+    for name, z in zip(views.names, maps):
+        write_depth(folder / "depth_maps" / f"{name}.bin", z.astype(np.float32))
+        write_depth(folder / "confidence_maps" / f"{name}.bin", (z > 0).astype(np.float32))
+
+
+def _error(folder, views, truth):
+    maps = [read_depth(folder / "depth_maps" / f"{name}.bin") for name in views.names]
+    return np.median(np.abs(np.stack(maps) - truth)[views.masks])
+
+
+def test_good_rendered_depth_is_accepted_and_the_result_is_no_worse(tmp_path, stage1):
+    views, truth = stage1
+    _write_rendered(tmp_path / "stage2", views, truth)
+    report = _refine(tmp_path)
+    assert report["kept"]["value"] in ("rendered", "refined")
+    assert report["accepted_share"]["value"] > 0.9
+    assert _error(tmp_path / "stage3", views, truth) <= _error(tmp_path / "stage1", views, truth)
+
+
+def test_bad_rendered_depth_is_not_kept(tmp_path, stage1):
+    views, truth = stage1
+    rng = np.random.default_rng(0)
+    _write_rendered(tmp_path / "stage2", views, truth * rng.uniform(0.8, 1.2, truth.shape))
+    report = _refine(tmp_path)
+    assert report["kept"]["value"] != "rendered"
+    assert report["photometric_rendered"]["value"] > report["photometric_stage1"]["value"]
+    assert _error(tmp_path / "stage3", views, truth) < 0.03
+
+
+def test_the_lowest_rank_sum_wins_and_a_tie_goes_to_the_first():
+    scores = {
+        "rendered": {"photometric": 0.2, "doubt": 0.1, "residual": None},
+        "refined": {"photometric": 0.1, "doubt": 0.1, "residual": 0.0},
+    }
+    assert feedback.choose(scores) == "refined"
+    scores["refined"]["doubt"] = 0.2
+    assert feedback.choose(scores) == "rendered"
+
+
+def test_missing_rendered_depth_or_networks_is_one_sentence(tmp_path, stage1):
+    with pytest.raises(StageError, match="holds no depth for any photo"):
+        _refine(tmp_path)
+    torch.save({"weights": torch.zeros(1)}, tmp_path / "stage1" / "networks.pt")
+    with pytest.raises(StageError, match="holds no networks of stage 1"):
+        _refine(tmp_path)
+    (tmp_path / "stage1" / "networks.pt").unlink()
+    with pytest.raises(StageError, match="run stage 1 first"):
+        _refine(tmp_path)

@@ -1,0 +1,140 @@
+"""Fusion on hand-made clouds: what is added, what is taken away, and where it says it comes from."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.fusion import FusionSettings, fuse, fuse_clouds, match_colors
+from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3
+
+SETTINGS = FusionSettings(
+    fill_spacings=1.5,
+    fill_residuals=2.5,
+    density=1.0,
+    feather_spacings=4.0,
+    match_colors=True,
+    min_confidence=0.0,
+)
+
+
+def sheet(low, high, step, color, z=0.0):
+    """A flat grid, x from low to high, y from 0 to 4."""
+    x, y = np.meshgrid(np.arange(low, high, step), np.arange(0, 4, step))
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, z)], axis=1)
+    shade = 0.6 + 0.4 * np.sin(points[:, 1:2])
+    return Cloud(
+        points,
+        np.tile(np.array([0, 0, 1], np.float32), (len(points), 1)),
+        (np.array(color) * shade).astype(np.uint8),
+    )
+
+
+@pytest.fixture
+def scene():
+    return sheet(0, 4, 0.1, [200, 100, 50])
+
+
+@pytest.fixture
+def obj():
+    return sheet(0, 8, 0.05, [100, 100, 100])
+
+
+def test_fill_adds_only_what_the_scene_lacks(scene, obj):
+    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), "fill", SETTINGS)
+    assert fusion.kept.all()
+    assert fusion.added.points[:, 0].min() > 4.0
+    assert set(fusion.added.fields["source"]) == {1}
+    assert spacing(fusion.added.points) == pytest.approx(0.1, rel=0.2)
+
+
+def test_append_adds_everything_at_its_own_density(scene, obj):
+    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), "append", replace(SETTINGS, density=0.0))
+    assert len(fusion.added) == len(obj) and fusion.kept.all()
+
+
+def test_replace_takes_the_scene_away_under_the_object(scene, obj):
+    half = obj[obj.points[:, 0] > 2]
+    fusion = fuse_clouds(half, scene, scene, Sim3.identity(), "replace", SETTINGS)
+    assert fusion.kept[scene.points[:, 0] < 1.8].all()
+    assert not fusion.kept[scene.points[:, 0] > 2.2].any()
+
+
+def test_the_feathered_seam_moves_a_shifted_object_half_way_to_the_scene(scene):
+    raised = sheet(2, 8, 0.05, [200, 100, 50], z=0.1)
+    settings = replace(SETTINGS, density=0.0, fill_residuals=0.0)
+    added = fuse_clouds(raised, scene, scene, Sim3.identity(), "replace", settings).added
+    at_seam, far = added.points[:, 0] < 2.05, added.points[:, 0] > 4
+    assert np.allclose(added.points[far, 2], 0.1)
+    assert 0.04 < added.points[at_seam, 2].mean() < 0.09
+
+
+def test_colors_of_what_is_added_follow_the_scene(scene, obj):
+    added = fuse_clouds(obj, scene, scene, Sim3.identity(), "fill", SETTINGS).added
+    expected = np.array([200, 100, 50]) * (0.6 + 0.4 * np.sin(added.points[:, 1:2]))
+    assert np.abs(added.colors - expected).mean() < 5
+
+
+def test_gain_and_bias_are_recovered():
+    a = np.random.default_rng(0).integers(20, 120, (500, 3)).astype(np.uint8)
+    gain, bias = match_colors(a, (1.5 * a + 10).astype(np.uint8))
+    assert np.allclose(gain, 1.5, atol=0.03) and np.allclose(bias, 10, atol=3)
+
+
+@pytest.mark.parametrize("status", ["registered", "unregistered"])
+def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, scene, obj, status):
+    pose = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
+    for name, cloud in (("scene", scene), ("crop", scene), ("object", obj.transformed(pose.inverse()))):
+        write_cloud(tmp_path / f"{name}.ply", cloud)
+    write_json(
+        tmp_path / "crop.json",
+        {
+            "level_from_scene": quantity(np.eye(3), ""),
+            "box_low": quantity([-1, -1, -1], ""),
+            "box_high": quantity([3, 9, 1], ""),
+        },
+    )
+    write_json(
+        tmp_path / "fine.json",
+        {
+            "status": quantity(status, ""),
+            "reason": quantity("because", ""),
+            "scene_from_object": quantity(pose.matrix, ""),
+        },
+    )
+    crs_from_scene = Sim3(1.0, np.eye(3), np.array([4e5, 5e6, 100.0]))
+    write_json(
+        tmp_path / "georeference.json",
+        {"crs": quantity("EPSG:32632", ""), "crs_from_scene": quantity(crs_from_scene.matrix, "m")},
+    )
+    fuse(
+        object=tmp_path / "object.ply",
+        scene=tmp_path / "scene.ply",
+        crop=tmp_path / "crop.ply",
+        crop_report=tmp_path / "crop.json",
+        fine=tmp_path / "fine.json",
+        georeference=tmp_path / "georeference.json",
+        fused=tmp_path / "fused.ply",
+        fused_scene=tmp_path / "fused_scene.ply",
+        fused_laz=tmp_path / "fused_scene.laz",
+        report=tmp_path / "fusion.json",
+        mode="fill",
+        settings=SETTINGS,
+    )
+    whole, around, report = (
+        read_cloud(tmp_path / "fused_scene.ply"),
+        read_cloud(tmp_path / "fused.ply"),
+        read_json(tmp_path / "fusion.json"),
+    )
+    added = value(report, "added_points")
+    assert (added > 0) == (status == "registered")
+    assert len(whole) == len(scene) + added and (whole.fields["source"] == 1).sum() == added
+    assert whole.fields["source"].dtype == np.uint8
+    assert whole.fields["confidence"].dtype == np.float32 and whole.fields["views"].dtype == np.int32
+    assert len(around) == (scene.points[:, 0] <= 3).sum() + added
+    import laspy
+
+    las = laspy.read(tmp_path / "fused_scene.laz")
+    assert len(las.points) == len(whole) and np.asarray(las.x).min() == pytest.approx(4e5, abs=0.01)

@@ -1,0 +1,109 @@
+"""The NeRF stage on a tiny workspace: what it writes, and the sentences for bad input."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from test_nerf_train import FIELD, WEIGHTS, sphere_views
+
+from scenefuse.maps import read_depth, write_depth
+from scenefuse.nerf.train import Schedule
+from scenefuse.objects.cloud import CloudSettings, object_cloud
+from scenefuse.objects.train_nerf import NerfSettings, train_nerf
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+
+SETTINGS = NerfSettings(width_px=48, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03)
+SCHEDULE = Schedule(2, 120 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 0.9, 1.0, 1e-5)
+
+
+@pytest.fixture(scope="module")
+def workspace(tmp_path_factory):
+    root = tmp_path_factory.mktemp("object")
+    images, masks, k, poses, depths = sphere_views()
+    for folder in ("cameras/images", "cameras/sparse", "masks", "stage1"):
+        (root / folder).mkdir(parents=True)
+    rows = []
+    for i, (image, mask, pose, depth) in enumerate(zip(images, masks, poses, depths)):
+        cv2.imwrite(str(root / f"cameras/images/{i:02d}.png"), image[..., ::-1])
+        cv2.imwrite(str(root / f"masks/{i:02d}.png"), mask.astype(np.uint8) * 255)
+        write_depth(root / f"stage1/depth_maps/{i:02d}.png.bin", depth.astype(np.float32))
+        write_depth(root / f"stage1/confidence_maps/{i:02d}.png.bin", mask.astype(np.float32))
+        rotation, move = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
+        numbers = " ".join(f"{v:.12g}" for v in (*np.roll(Rotation.from_matrix(rotation).as_quat(), 1), *move))
+        rows.append(f"{i + 1} {numbers} 1 {i:02d}.png\n\n")
+    (root / "cameras/sparse/images.txt").write_text("".join(rows))
+    (root / "cameras/sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
+    (root / "cameras/sparse/points3D.txt").write_text("")
+    write_json(root / "cameras.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
+    return root
+
+
+def _run(root, stage, previous=None, **changes):
+    arguments = dict(
+        cameras=root / "cameras",
+        masks=root / "masks",
+        prior=root / "stage1",
+        previous=previous,
+        stage=root / stage,
+        report=root / f"{stage}.json",
+        checkpoints=root / "checkpoints",
+        field=FIELD,
+        schedule=SCHEDULE,
+        losses=WEIGHTS,
+        settings=SETTINGS,
+        hold_out_every=6,
+        device="cpu",
+        seed=0,
+    )
+    train_nerf(**(arguments | changes))
+
+
+def test_two_stages_and_the_cloud(workspace):
+    _run(workspace, "stage2")
+    _run(workspace, "stage4", previous=workspace / "stage2")
+    report = read_json(workspace / "stage4.json")
+    assert value(report, "started_from_previous") is True
+    assert value(report, "psnr_held_out") > 15 and value(report, "silhouette_iou") > 0.8
+    assert value(report, "photos_measured") == 2 and value(report, "pose_refinement") is True
+    depth = read_depth(workspace / "stage4/depth_maps/00.png.bin")
+    truth = sphere_views()[4][0]
+    both = (depth > 0) & (truth > 0)
+    assert np.median(np.abs(depth - truth)[both]) < 0.1
+    assert sorted(p.name for p in (workspace / "stage4/renders").iterdir()) == ["03.png", "09.png"]
+    saved = torch.load(workspace / "stage4/model.pt", weights_only=True)
+    assert len(saved["names"]) == 12 and saved["nerf_from_object"].shape == (4, 4)
+    assert not list((workspace / "checkpoints").rglob("*.pt"))
+    object_cloud(
+        cameras=workspace / "cameras",
+        masks=workspace / "masks",
+        stage=workspace / "stage4",
+        stage_report=workspace / "stage4.json",
+        cameras_report=workspace / "cameras.json",
+        cloud=workspace / "object.ply",
+        report=workspace / "object.json",
+        settings=CloudSettings(2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
+        seed=0,
+    )
+    cloud = read_json(workspace / "object.json")
+    assert value(cloud, "points") > 200 and value(cloud, "up_in_camera_frame") == [0.0, 0.0, 1.0]
+    assert np.shape(value(cloud, "nerf_from_object")) == (4, 4)
+
+
+def test_a_missing_earlier_stage_is_named(workspace):
+    with pytest.raises(StageError, match="model.pt does not exist; run the earlier NeRF stage first"):
+        _run(workspace, "other", previous=workspace / "nowhere")
+    assert not (workspace / "other").exists()
+
+
+def test_empty_masks_are_named(workspace, tmp_path):
+    for path in (workspace / "masks").iterdir():
+        cv2.imwrite(str(tmp_path / path.name), np.zeros((48, 48), np.uint8))
+    with pytest.raises(StageError, match="no volume for the object: fewer than two photos have a mask"):
+        _run(workspace, "other", masks=tmp_path)
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="only where there is no CUDA")
+def test_missing_cuda_is_named(workspace):
+    with pytest.raises(StageError, match="no CUDA device; set it to auto or cpu"):
+        _run(workspace, "other", device="cuda")

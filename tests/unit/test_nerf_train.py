@@ -1,0 +1,215 @@
+"""A small sphere with a painted surface: geometry, training, resuming, determinism."""
+
+import numpy as np
+import pytest
+import torch
+
+from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.occupancy import tight_cube, visual_hull
+from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
+from scenefuse.nerf.rays import Photos, cube_from_cameras, dilate, draw_batch, pixel_pool
+from scenefuse.nerf.render import render_view
+from scenefuse.nerf.train import Schedule, new_model, train
+from scenefuse.transforms import Sim3
+
+RADIUS, CENTER = 1.5, np.array([4.0, -2.0, 1.0])
+SIZE, FOCAL = 48, 48.0
+
+
+def sphere_views(count=12):
+    """Photos of a sphere with smooth colours: images, masks, intrinsics, poses, true depths."""
+    k = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
+    v, u = np.indices((SIZE, SIZE)) + 0.5
+    rays = np.stack([(u - SIZE / 2) / FOCAL, (v - SIZE / 2) / FOCAL, np.ones_like(u)], -1)
+    images, masks, poses, depths = [], [], [], []
+    for i in range(count):
+        angle, height = 2 * np.pi * i / count, (-0.5, 0.6, 1.5)[i % 3]
+        position = CENTER + 5.0 * np.array([np.cos(angle), np.sin(angle), height]) / np.hypot(1, height)
+        z = (CENTER - position) / np.linalg.norm(CENTER - position)
+        x = np.cross(z, [0, 0, 1.0])
+        x /= np.linalg.norm(x)
+        rotation = np.stack([x, np.cross(z, x), z], axis=1)
+        d = rays @ rotation.T
+        offset = position - CENTER
+        a, b, c = (d**2).sum(-1), d @ offset, offset @ offset - RADIUS**2
+        root = b**2 - a * c
+        depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
+        normal = (position + d * depth[..., None] - CENTER) / RADIUS
+        image = 0.5 + 0.4 * np.sin(normal * 5.0 + np.array([0.0, 1.0, 2.0]))
+        images.append((image * (root > 0)[..., None] * 255).astype(np.uint8))
+        masks.append(root > 0)
+        poses.append(np.vstack([np.column_stack([rotation, position]), [0, 0, 0, 1]]))
+        depths.append(depth)
+    return np.stack(images), np.stack(masks), np.repeat(k[None], count, 0), np.stack(poses), np.stack(depths)
+
+
+@pytest.fixture(scope="module")
+def sphere():
+    return sphere_views()
+
+
+def _volume(sphere, cells=32):
+    _, masks, k, poses, _ = sphere
+    first = cube_from_cameras(masks, k, poses)
+    cube = tight_cube(visual_hull(masks, k, poses, first, 32, 0.0), first, 0.05)
+    return cube, visual_hull(masks, k, poses, cube, cells, 0.0)
+
+
+def _photos(sphere, cube, prior=0.0):
+    images, masks, k, poses, depths = sphere
+    known = depths * cube.scale * (1.0 if prior else 0.0)
+    return Photos(
+        torch.from_numpy(images),
+        torch.from_numpy(masks),
+        torch.from_numpy(k.astype(np.float32)),
+        torch.from_numpy(poses[:, :3, :3].astype(np.float32)),
+        torch.from_numpy(cube.apply(poses[:, :3, 3]).astype(np.float32)),
+        torch.from_numpy(known.astype(np.float32)),
+        torch.from_numpy((known > 0).astype(np.float32)),
+    )
+
+
+FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
+WEIGHTS = LossWeights(1.0, 1.0, 0.02, 0.1, 0.05, 0.01)
+
+
+def _schedule(steps, pose=0.0):
+    return Schedule(2, steps * 512 // 2, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 0.9, 1.0, pose)
+
+
+def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0):
+    cube, hull = _volume(sphere)
+    photos = _photos(sphere, cube, prior=1.0)
+    model = new_model(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
+    schedule = _schedule(steps, pose)
+    result = train(
+        model, photos, schedule, WEIGHTS, warm=False, seed=seed, threads=1, checkpoint=checkpoint, report=report
+    )
+    return model, photos, cube, result
+
+
+def test_hull_holds_the_sphere_and_little_more(sphere):
+    cube, hull = _volume(sphere, cells=64)
+    cells = cube.inverse().apply((np.argwhere(hull) + 0.5) / 64)
+    distance = np.linalg.norm(cells - CENTER, axis=1)
+    volume = hull.mean() / cube.scale**3
+    ball = 4 / 3 * np.pi * RADIUS**3
+    assert ball < volume < 2.0 * ball
+    assert np.percentile(distance, 99) < 1.7 * RADIUS
+
+
+def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
+    _, masks, k, poses, _ = sphere
+    assert not visual_hull(masks & False, k, poses, Sim3.identity(), 32, 0.0).any()
+    with pytest.raises(ValueError, match="fewer than two photos"):
+        cube_from_cameras(masks & False, k, poses)
+
+
+def test_batches_repeat_and_keep_off_the_band(sphere):
+    cube, _ = _volume(sphere)
+    photos = _photos(sphere, cube)
+    pool = pixel_pool(photos, band_px=2, ring_px=6, edge_px=2)
+    batch, again = (draw_batch(photos, pool, 5, 9, 8, 64, 0.25) for _ in range(2))
+    assert torch.equal(batch.uv, again.uv) and torch.equal(batch.view, again.view)
+    assert not torch.equal(batch.uv, draw_batch(photos, pool, 5, 10, 8, 64, 0.25).uv)
+    assert int((~batch.inside).sum()) == 8 * 16
+    column, row = batch.uv.long().unbind(1)
+    inner, outer = dilate(photos.masks, -2), dilate(photos.masks, 2)
+    assert torch.equal(inner[batch.view, row, column], batch.inside)
+    assert torch.equal(outer[batch.view, row, column], batch.inside)
+
+
+def test_training_finds_the_sphere(sphere):
+    model, photos, cube, result = _train(sphere, steps=250)
+    depths, masks = sphere[4], sphere[1]
+    rendered = render_view(
+        model.field,
+        model.occupancy,
+        photos.intrinsics[0],
+        photos.rotation[0],
+        photos.center[0],
+        photos.masks[0],
+        32,
+        0.25,
+    )
+    error = np.abs(rendered.depth.numpy() / cube.scale - depths[0])[masks[0]]
+    assert np.median(error) < 0.01 * 2 * RADIUS
+    picture = photos.images[0].float() / 255
+    assert psnr(rendered.color, picture, dilate(photos.masks, -1)[0]) > 22
+    assert silhouette_iou(rendered.opacity, photos.masks[0]) > 0.95
+    assert result["steps"] == 250
+
+
+def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch):
+    whole = _train(sphere, steps=24)[0]
+    assert torch.equal(whole.field.table, _train(sphere, steps=24)[0].field.table)
+    assert not torch.equal(whole.field.table, _train(sphere, steps=24, seed=1)[0].field.table)
+
+    from scenefuse.nerf import train as module
+
+    step = module._step
+
+    def stop_at_ten(*arguments):
+        if arguments[-1] == 10:
+            import os
+            import signal
+
+            os.kill(os.getpid(), signal.SIGTERM)
+        return step(*arguments)
+
+    monkeypatch.setattr(module, "_step", stop_at_ten)
+    checkpoint = tmp_path / "state.pt"
+    with pytest.raises(SystemExit):
+        _train(sphere, steps=24, checkpoint=checkpoint)
+    assert torch.load(checkpoint, weights_only=True)["step"] == 11
+    monkeypatch.setattr(module, "_step", step)
+    lines = []
+    resumed = _train(sphere, steps=24, checkpoint=checkpoint, report=lines.append)[0]
+    assert "resumed at step 11 of 24" in lines[0]
+    assert torch.equal(whole.field.table, resumed.field.table)
+    assert torch.equal(whole.occupancy.density, resumed.occupancy.density)
+
+
+def test_poses_move_only_when_asked(sphere):
+    assert not _train(sphere, steps=12)[0].pose.any()
+    assert _train(sphere, steps=12, pose=1e-4)[0].pose.any()
+
+
+def test_depth_maps_confirm_each_other_and_give_normals(sphere):
+    _, masks, k, poses, depths = sphere
+    rows, columns = np.nonzero(masks[0])
+    points = back_project(depths[0][rows, columns], k[0], poses[0], rows, columns)
+    assert np.abs(np.linalg.norm(points - CENTER, axis=1) - RADIUS).max() < 1e-9
+    grown = dilate(torch.from_numpy(masks), 1).numpy()
+    said = compare(points, 0, depths.astype(np.float32), grown, k, poses, 0.1)
+    assert np.median(said.agree) >= 1 and np.median(said.through) == 0 and said.off_mask.sum() == 0
+    towards = points + 0.6 * (poses[0][:3, 3] - points) / np.linalg.norm(poses[0][:3, 3] - points, axis=1)[:, None]
+    floating = compare(towards, 0, depths.astype(np.float32), grown, k, poses, 0.1)
+    assert floating.agree.mean() < 0.2 * said.agree.mean()
+    assert np.median(floating.through + floating.off_mask) >= 2
+    normals = normals_from_depth(depths[0].astype(np.float32), k[0], 1, 0.05)[rows, columns]
+    truth = (points - CENTER) @ poses[0][:3, :3] / RADIUS
+    found = normals.any(1)
+    assert found.mean() > 0.95
+    assert np.median((normals * truth).sum(1)[found]) > 0.99
+
+
+def test_quality_measures():
+    rng = torch.Generator().manual_seed(0)
+    picture, everything = torch.rand(20, 20, 3, generator=rng), torch.ones(20, 20, dtype=torch.bool)
+    assert psnr(picture, picture + 0.1, everything) == pytest.approx(20.0, abs=1e-3)
+    assert ssim(picture, picture, everything) == pytest.approx(1.0, abs=1e-5)
+    assert ssim(picture, 1 - picture, everything) < 0.2
+    assert silhouette_iou(torch.tensor([[0.9, 0.9, 0.1]]), torch.tensor([[True, False, True]])) == pytest.approx(1 / 3)
+
+
+def test_plain_pytorch_trains_like_the_kernels(sphere, monkeypatch):
+    from scenefuse.nerf import kernels
+
+    with_kernels = _train(sphere, steps=6)[3]
+    monkeypatch.setattr(kernels, "AVAILABLE", False)
+    plain = _train(sphere, steps=6)[3]
+    for name in ("color", "depth", "mask", "distortion"):
+        assert plain[name] == pytest.approx(with_kernels[name], rel=0.02)

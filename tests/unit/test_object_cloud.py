@@ -1,0 +1,64 @@
+"""Fusing depth maps of a sphere into a cloud; cleaning; the sentences for bad input."""
+
+import numpy as np
+import pytest
+from test_nerf_train import CENTER, RADIUS, sphere_views
+
+from scenefuse.clouds import Cloud
+from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths, object_cloud, with_plane_normals
+from scenefuse.objects.views import Views
+from scenefuse.stage import StageError
+
+SETTINGS = CloudSettings(3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
+
+
+def _views():
+    images, masks, k, poses, depths = sphere_views()
+    empty = [np.zeros(0, np.int64)] * len(images)
+    names = [f"{i}.png" for i in range(len(images))]
+    held_out = np.zeros(len(images), bool)
+    return Views(names, images, masks, k, poses, held_out, np.zeros((0, 3)), empty), depths.astype(np.float32)
+
+
+def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
+    views, depths = _views()
+    rng = np.random.default_rng(0)
+    rows, columns = np.nonzero(views.masks[0])
+    spoiled = rng.choice(len(rows), 60, replace=False)
+    damaged = depths.copy()
+    damaged[0, rows[spoiled], columns[spoiled]] *= 0.8
+    normals = np.zeros((*depths.shape, 3), np.float32)
+    cloud, diagonal = fuse_depths(views, views.object_from_cam, damaged, (depths > 0) * 0.8, normals, SETTINGS)
+    distance = np.abs(np.linalg.norm(cloud.points - CENTER, axis=1) - RADIUS)
+    assert len(cloud) > 1000
+    assert distance.max() < 0.02 * diagonal
+    assert np.median(distance) < 0.005 * diagonal
+    assert cloud.fields["views"].min() >= 3 and cloud.fields["views"].dtype == np.int32
+    assert cloud.colors is not None and cloud.normals is not None
+    outward = (cloud.points - CENTER) / RADIUS
+    planes = with_plane_normals(cloud, 16).normals
+    assert np.median((planes * outward).sum(1)) > 0.98
+
+
+def test_cleaning_drops_a_small_group_and_far_points():
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
+    island = grid[:4] + [100.0, 0.0, 0.0]
+    lonely = np.array([[10.0, 10.0, 60.0]])
+    cleaned = clean(Cloud(np.concatenate([grid, island, lonely])), 3.0, 0.02, 1.0)
+    assert len(cleaned) == len(grid) and cleaned.points[:, 2].max() == 0 and cleaned.points[:, 0].max() < 20
+
+
+def test_a_missing_model_is_named(tmp_path):
+    with pytest.raises(StageError, match="model.pt does not exist; run the NeRF stage first"):
+        object_cloud(
+            cameras=tmp_path,
+            masks=tmp_path,
+            stage=tmp_path / "stage4",
+            stage_report=tmp_path / "stage4.json",
+            cameras_report=tmp_path / "cameras.json",
+            cloud=tmp_path / "object.ply",
+            report=tmp_path / "object.json",
+            settings=SETTINGS,
+            seed=0,
+        )
+    assert not (tmp_path / "object.ply").exists()

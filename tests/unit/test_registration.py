@@ -1,0 +1,254 @@
+"""Registration on planted trials: the truth is found, or the object is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planted import errors, plant
+from scipy.spatial.transform import Rotation
+
+from scenefuse.clouds import Cloud, write_cloud
+from scenefuse.registration.audit import tilt_deg
+from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
+from scenefuse.registration.features import match, ransac_similarities
+from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely
+from scenefuse.registration.ledger import round_trip, write_frame_ledger
+from scenefuse.registration.refine import ScaleRange, refine_planes, refine_points
+from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
+from scenefuse.registration.score import color_agreement, pair, score
+from scenefuse.registration.surface import prepare
+from scenefuse.registration.upright import upright_hypotheses
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3
+
+Z = np.array([0.0, 0.0, 1.0])
+COARSE = CoarseSettings(
+    voxel_fractions=(0.04,),
+    ransac_samples=30000,
+    feature_scale_steps=3,
+    scale_steps=11,
+    yaw_steps=24,
+    sweep_voxel_fraction=0.045,
+    max_tilt_deg=10.0,
+    recall_weight=2.0,
+    score_fraction=0.02,
+    candidates=16,
+    keep=5,
+)
+FINE = FineSettings(
+    fine_voxel_fraction=0.012,
+    start_fraction=0.05,
+    end_fraction=0.02,
+    color_weight=0.3,
+    turn_steps=18,
+    recall_weight=2.0,
+    score_fraction=0.02,
+    min_f_score=0.35,
+    min_recall=0.4,
+    min_color=0.5,
+    min_margin=0.04,
+    max_final_tilt_deg=8.0,
+)
+
+
+# Little work, where only the course of the computation matters.
+LITTLE = (
+    replace(COARSE, ransac_samples=5000, feature_scale_steps=1, scale_steps=3, yaw_steps=8, candidates=4, keep=2),
+    replace(FINE, turn_steps=6, fine_voxel_fraction=0.02),
+)
+
+
+@pytest.fixture(scope="module")
+def house():
+    return plant("house", 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+
+
+def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
+    scene = trial.scene if scene is None else scene
+    ups = (trial.up_in_object, Z)
+    prior = ScaleRange(prior_centre(estimates(trial.object, scene, ups)), 0.5)
+    found = find_hypotheses(trial.object, scene, prior, ups, settings[0], seed)
+    return refine_hypotheses(trial.object, scene, [(h.pose, h.source) for h in found], prior, ups, settings[1], seed)
+
+
+@pytest.mark.parametrize("name", ["house", "balloon"])
+def test_a_planted_pose_is_found_and_accepted(name):
+    trial = plant(name, 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+    outcome = register(trial)
+    scale, angle, shift = errors(
+        outcome.ranked[0].pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal
+    )
+    assert outcome.verdict.registered, outcome.verdict.reason
+    assert abs(scale) < 2 and angle < 2 and shift < 0.01
+
+
+def test_another_object_is_refused(house):
+    other = plant("sculpture", 7, ground=False, noise=0.005, scene_points=4000).scene
+    verdict = register(house, other, LITTLE).verdict
+    assert not verdict.registered
+    assert "F-score" in verdict.reason or "explains" in verdict.reason
+
+
+def test_two_runs_agree_bit_for_bit(house):
+    first, second = register(house, settings=LITTLE), register(house, settings=LITTLE)
+    assert [h.pose.matrix.tobytes() for h in first.ranked] == [h.pose.matrix.tobytes() for h in second.ranked]
+
+
+def test_rms_scale_of_a_scaled_copy_has_the_right_direction():
+    points = np.random.default_rng(0).normal(size=(500, 3))
+    found = estimates(Cloud(points), Cloud(3.0 * points + 5), None)
+    assert found[0].name == "rms" and found[0].scale == pytest.approx(3.0)
+    assert all(e.scale == pytest.approx(3.0, rel=0.02) for e in found)
+
+
+def test_gravity_adds_footprint_and_height_to_the_ledger(house):
+    ledger = {e.name: e.scale for e in estimates(house.object, house.scene, (house.up_in_object, Z))}
+    assert set(ledger) == {"rms", "rms_even", "footprint", "height"}
+    assert ledger["footprint"] == pytest.approx(house.scene_from_object.scale, rel=0.25)
+
+
+def surfaces(trial, voxel):
+    scale = trial.scene_from_object.scale
+    return prepare(trial.object, voxel / scale, 0, 5000), prepare(trial.scene, voxel, 0, 5000)
+
+
+def test_the_true_pose_scores_higher_than_a_turned_one(house):
+    obj, scene = surfaces(house, 0.2)
+    truth = house.scene_from_object
+    centre = truth.apply(house.object.points.mean(0))
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    turned = Sim3(1.0, half_turn, centre - half_turn @ centre) @ truth
+    right, wrong = (score(obj, scene, p, 0.3, 2.0) for p in (truth, turned))
+    assert right.f_score > wrong.f_score and right.total > wrong.total
+    assert right.color > 0.9 > wrong.color
+
+
+def test_refinement_recovers_a_disturbed_similarity(house):
+    obj, scene = surfaces(house, 0.15)
+    truth, centre = house.scene_from_object, house.object.points.mean(0)
+    turn = Rotation.from_rotvec(np.radians([3, -2, 4])).as_matrix()
+    middle = truth.apply(centre)
+    start = Sim3(1.04, turn, middle - 1.04 * turn @ middle + 0.2) @ truth
+    prior = ScaleRange(truth.scale, 0.2)
+    pose = refine_points(obj, scene, start, prior, (0.7, 0.25), 25)
+    pose = refine_planes(obj, scene, pose, prior, 0.25, 10, 0.3)
+    scale, angle, shift = errors(pose, truth, centre, house.diagonal)
+    assert abs(scale) < 1 and angle < 1 and shift < 0.005
+
+
+def test_a_prior_of_no_width_holds_the_scale(house):
+    obj, scene = surfaces(house, 0.2)
+    held = ScaleRange(house.scene_from_object.scale * 1.1, 0.0)
+    pose = refine_points(obj, scene, house.scene_from_object, held, (0.5, 0.3), 5)
+    pose = refine_planes(obj, scene, pose, held, 0.3, 5, 0.3)
+    assert pose.scale == held.centre
+
+
+def test_upright_sweep_proposes_the_true_yaw_and_scale(house):
+    obj, scene = surfaces(house, 0.35)
+    truth = house.scene_from_object
+    proposed = upright_hypotheses(
+        obj, scene, house.up_in_object, ScaleRange(truth.scale * 1.1, 0.3), 11, 24, 0.6, 2.0, 8
+    )
+    centre = house.object.points.mean(0)
+    found = [errors(p, truth, centre, house.diagonal) for p in proposed]
+    assert any(abs(scale) < 6 and angle < 12 and shift < 0.06 for scale, angle, shift in found)
+
+
+def test_ransac_finds_a_similarity_among_false_matches():
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(60, 3))
+    truth = Sim3(2.0, Rotation.random(random_state=3).as_matrix(), np.array([1.0, 2.0, 3.0]))
+    y = truth.apply(x)
+    y[30:] = rng.normal(scale=2.0, size=(30, 3)) + truth.translation
+    best = ransac_similarities(x, y, ScaleRange(1.7, 0.35), 0.05, 20000, 3, 0, None, 10.0)[0]
+    assert np.allclose(best.matrix, truth.matrix, atol=1e-6)
+
+
+def test_mutual_matches_are_each_others_nearest():
+    a = np.array([[0.0, 0.0], [5.0, 0.0], [5.2, 0.0]])
+    b = np.array([[5.1, 0.0], [0.1, 0.0]])
+    assert [0, 1] in match(a, b).tolist() and len(match(a, b)) == 2
+
+
+def test_color_agreement_ignores_gain_and_bias_but_not_place(house):
+    cloud = house.object
+    darker = Cloud(cloud.points, cloud.normals, (cloud.colors * 0.6 + 20).astype(np.uint8))
+    a, b = prepare(cloud, 0.01, 0, 4000), prepare(darker, 0.01, 0, 4000)
+    pairs = pair(a, b, Sim3.identity(), 0.1)
+    assert color_agreement(a, b, pairs) > 0.99
+    shuffled = Cloud(cloud.points, cloud.normals, np.random.default_rng(0).permutation(cloud.colors))
+    assert color_agreement(a, prepare(shuffled, 0.01, 0, 4000), pairs) < 0.3
+
+
+def test_tilt_is_the_angle_between_the_ups():
+    turn = Rotation.from_rotvec([np.radians(30), 0, 0]).as_matrix()
+    assert tilt_deg(Sim3(2.0, turn, np.zeros(3)), (Z, Z)) == pytest.approx(30)
+
+
+def test_stages_write_their_files_and_refuse_honestly(tmp_path, house):
+    write_cloud(tmp_path / "object.ply", house.object)
+    write_cloud(tmp_path / "crop.ply", house.scene)
+    write_json(tmp_path / "crop.json", {"up_in_scene": quantity(Z, "")})
+    write_json(tmp_path / "cameras.json", {"up_in_camera_frame": quantity(house.up_in_object, "")})
+    files = {"object": tmp_path / "object.ply", "crop": tmp_path / "crop.ply", "crop_report": tmp_path / "crop.json"}
+    scale, coarse, fine = (tmp_path / f"{n}.json" for n in ("scale", "coarse", "fine"))
+    estimate_scale(**files, cameras=tmp_path / "cameras.json", report=scale, method="rms", width_log=0.35)
+    assert value(read_json(scale), "width_log") == 0.0
+    paper = {"recipe": "paper", "seed": 0}
+    from dataclasses import replace
+
+    settings = replace(COARSE, ransac_samples=20000)
+    register_coarsely(**files, scale=scale, report=coarse, **paper, settings=settings)
+    register_finely(
+        **files,
+        scale=scale,
+        coarse=coarse,
+        fine=fine,
+        picture=tmp_path / "fine.png",
+        **paper,
+        voxel_fraction=0.04,
+        settings=FINE,
+    )
+    content = read_json(fine)
+    assert value(content, "status") == "registered" and value(content, "tilt_deg") is None
+    matrix = np.array(value(content, "scene_from_object"))
+    assert Sim3.from_matrix(matrix).scale == pytest.approx(value(content, "scale"))
+    assert (tmp_path / "fine.png").stat().st_size > 1000
+
+
+def test_frame_ledger_inverts_every_transform(tmp_path):
+    pose = Sim3(2.5, Rotation.random(random_state=1).as_matrix(), np.array([4e5, 5e6, 100.0]))
+    write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([0.5, 0.5, 0.5, 1.0]), "")})
+    write_json(
+        tmp_path / "f.json", {"scene_from_object": quantity(pose.matrix, ""), "status": quantity("registered", "")}
+    )
+    write_frame_ledger(object_report=tmp_path / "o.json", fine=tmp_path / "f.json", frames=tmp_path / "frames.json")
+    ledger = read_json(tmp_path / "frames.json")
+    assert np.allclose(value(ledger, "scene_from_nerf"), (pose @ Sim3(2.0, np.eye(3), np.zeros(3))).matrix)
+    assert value(ledger, "world_from_scene") is None
+    assert round_trip(pose) < 1e-8
+    write_json(tmp_path / "f.json", {"scene_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
+    with pytest.raises(StageError, match="not a similarity"):
+        write_frame_ledger(object_report=tmp_path / "o.json", fine=tmp_path / "f.json", frames=tmp_path / "x.json")
+
+
+def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
+    truth = house.scene_from_object
+    prior = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
+    outcome = refine_hypotheses(
+        house.object, house.scene, [(truth, "planted")], prior, None, replace(FINE, turn_steps=2, min_f_score=0.0), 0
+    )
+    assert not outcome.verdict.registered
+
+
+def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
+    def egg(seed):
+        points = np.random.default_rng(seed).normal(size=(4000, 3))
+        return Cloud(points / np.linalg.norm(points, axis=1, keepdims=True) * [1, 1, 1.6])
+
+    turned = Sim3(1.0, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.zeros(3))
+    poses = [(Sim3.identity(), "one"), (turned, "other")]
+    settings = replace(FINE, turn_steps=6, fine_voxel_fraction=0.02, score_fraction=0.04)
+    outcome = refine_hypotheses(egg(0), egg(1), poses, ScaleRange(1.0, 0.2), (Z, Z), settings, 0)
+    assert outcome.verdict.registered and outcome.verdict.free_axis
