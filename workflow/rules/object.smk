@@ -279,7 +279,7 @@ rule stage2:
         "results/benchmarks/stage2/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
@@ -355,7 +355,7 @@ rule stage4:
         "results/benchmarks/stage4/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
@@ -391,7 +391,7 @@ rule object_cloud:
         "results/benchmarks/object_cloud/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,

@@ -1,0 +1,127 @@
+"""Depth maps held against each other: which pixels other views confirm, and normals from depth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """What the other views say about N points of one view.
+
+    Attributes:
+        agree: (N,) views whose depth at the point is the point's own, within the tolerance.
+        through: (N,) views that see past the point: it floats in front of their surface.
+        hidden: (N,) views for which the point is behind their surface.
+        off_mask: (N,) views in whose picture the point lies off the mask.
+        mean: (N, 3) mean of the point and the points that agree with it.
+    """
+
+    agree: NDArray[np.int32]
+    through: NDArray[np.int32]
+    hidden: NDArray[np.int32]
+    off_mask: NDArray[np.int32]
+    mean: Floats
+
+
+def back_project(
+    depth: Floats, intrinsics: Floats, frame_from_cam: Floats, rows: NDArray[Any], columns: NDArray[Any]
+) -> Floats:
+    """Points (N, 3) of pixels (integer rows and columns) with depths (N,) along z."""
+    x = (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    in_camera = np.stack([x, y, np.ones_like(x)], axis=1) * depth[:, None]
+    return in_camera @ frame_from_cam[:3, :3].T + frame_from_cam[:3, 3]
+
+
+def compare(
+    points: Floats,
+    view: int,
+    depths: NDArray[np.float32],
+    masks: NDArray[np.bool_],
+    intrinsics: Floats,
+    frame_from_cam: Floats,
+    tolerance: float,
+) -> Agreement:
+    """Project points of one view into all others and compare depths.
+
+    Args:
+        points: (N, 3) in the cameras' common frame.
+        view: index of the view they come from.
+        depths: (V, H, W) along z, 0 for none.
+        masks: (V, H, W), True on the object and a little around it.
+        intrinsics: (V, 3, 3) in pixels.
+        frame_from_cam: (V, 4, 4).
+        tolerance: largest difference of depth that agrees, unit of the frame.
+    """
+    count = len(points)
+    agree, through, hidden, off_mask = (np.zeros(count, np.int32) for _ in range(4))
+    total = points.copy()
+    height, width = depths.shape[1:]
+    for other in range(len(depths)):
+        if other == view:
+            continue
+        pose, k = frame_from_cam[other], intrinsics[other]
+        in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+        z = in_camera[:, 2]
+        safe = np.maximum(z, 1e-9)
+        x, y = in_camera[:, 0] / safe * k[0, 0] + k[0, 2], in_camera[:, 1] / safe * k[1, 1] + k[1, 2]
+        index = np.flatnonzero((z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
+        column, row = x[index].astype(np.int64), y[index].astype(np.int64)
+        off_mask[index] += ~masks[other, row, column]
+        measured = depths[other, row, column].astype(np.float64)
+        index, column, row = (a[measured > 0] for a in (index, column, row))
+        measured = measured[measured > 0]
+        difference = z[index] - measured
+        through[index] += difference < -tolerance
+        hidden[index] += difference > tolerance
+        same = np.abs(difference) <= tolerance
+        agree[index] += same
+        # The other view's depth, taken along the ray through the point itself, not through the pixel's centre.
+        confirmed = index[same]
+        total[confirmed] += (
+            in_camera[confirmed] * (measured[same] / z[confirmed])[:, None] @ pose[:3, :3].T + pose[:3, 3]
+        )
+    return Agreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None])
+
+
+def normals_from_depth(
+    depth: NDArray[np.float32], intrinsics: Floats, radius_px: int, jump: float
+) -> NDArray[np.float32]:
+    """Unit normals (H, W, 3) in the camera frame, towards the camera, zero where there is no depth.
+
+    Differences are taken over `radius_px` on the side where the depth changes less, so that edges stay sharp.
+
+    Args:
+        depth: (H, W) along z, 0 for none.
+        intrinsics: (3, 3) in pixels.
+        radius_px: distance of the differences.
+        jump: relative change of depth beyond which two pixels are not one surface.
+    """
+    rows, columns = np.indices(depth.shape)
+    points = back_project(
+        depth.reshape(-1).astype(np.float64), intrinsics, np.eye(4), rows.reshape(-1), columns.reshape(-1)
+    )
+    points = points.reshape(*depth.shape, 3)
+    tangents = []
+    for axis in (1, 0):
+        sides = []
+        for sign in (1, -1):
+            shifted = np.roll(points, -sign * radius_px, axis=axis)
+            step = (shifted - points) * sign
+            bad = (depth <= 0) | (shifted[..., 2] <= 0) | (np.abs(step[..., 2]) > jump * np.maximum(depth, 1e-9))
+            edge = [slice(None), slice(None)]
+            edge[axis] = slice(-radius_px, None) if sign > 0 else slice(0, radius_px)
+            bad[tuple(edge)] = True
+            sides.append(np.where(bad[..., None], np.nan, step))
+        both = np.nansum(np.stack(sides), axis=0)
+        both[np.isnan(sides[0][..., 0]) & np.isnan(sides[1][..., 0])] = np.nan
+        tangents.append(both)
+    normal = -np.cross(tangents[0], tangents[1])
+    with np.errstate(invalid="ignore"):
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+    return np.nan_to_num(normal).astype(np.float32)

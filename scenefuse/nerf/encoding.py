@@ -1,0 +1,157 @@
+"""Multi-resolution hash encoding of positions and spherical harmonics of directions."""
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scenefuse.nerf import kernels
+
+
+@dataclass(frozen=True)
+class HashGrid:
+    """Where each level of the grid lives in one (T, 2) table.
+
+    Attributes:
+        resolution: (L,) float32, cells per side of the unit cube.
+        stride: (L,) uint32, vertices per side of a level stored densely, 0 for a hashed level.
+        offset: (L,) int64, first row of the level in the table.
+        mask: (L,) uint32, rows of a hashed level minus one.
+        rows: T, rows of the whole table.
+    """
+
+    resolution: np.ndarray
+    stride: np.ndarray
+    offset: np.ndarray
+    mask: np.ndarray
+    rows: int
+
+
+def hash_grid(levels: int, log2_table: int, coarsest: int, finest: int) -> HashGrid:
+    """Levels in geometric progression (Mueller et al. 2022, equations 2 and 3).
+
+    A level whose vertices all fit into 2^log2_table rows is stored densely, without collisions.
+    """
+    growth = math.exp(math.log(finest / coarsest) / max(levels - 1, 1))
+    cells = [int(coarsest * growth**level + 1e-6) for level in range(levels)]
+    dense = [(size + 1) ** 3 <= 2**log2_table for size in cells]
+    rows = [(size + 1) ** 3 if fits else 2**log2_table for size, fits in zip(cells, dense)]
+    return HashGrid(
+        np.array(cells, dtype=np.float32),
+        np.array([size + 1 if fits else 0 for size, fits in zip(cells, dense)], dtype=np.uint32),
+        np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64),
+        np.full(levels, 2**log2_table - 1, dtype=np.uint32),
+        int(sum(rows)),
+    )
+
+
+def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor) -> Tensor:
+    """Plain PyTorch encoding of (N, 3) positions in 0..1 as (N, 2 L) features; every device, differentiable."""
+    device = x.device
+    resolution = torch.from_numpy(grid.resolution).to(device)
+    stride = torch.from_numpy(grid.stride.astype(np.int64)).to(device)[None, :, None]
+    offset = torch.from_numpy(grid.offset).to(device)[None, :, None]
+    mask = torch.from_numpy(grid.mask.astype(np.int64)).to(device)[None, :, None]
+    scaled = x[:, None, :] * resolution[None, :, None]
+    low = scaled.detach().floor()
+    part = (scaled - low)[:, :, None, :]
+    corners = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=device)
+    vertex = low.long()[:, :, None, :] + corners
+    vx, vy, vz = vertex.unbind(-1)
+    hashed = (vx ^ (vy * kernels.PRIMES[1]) ^ (vz * kernels.PRIMES[2])) & mask
+    row = torch.where(stride > 0, vx + stride * (vy + stride * vz), hashed) + offset
+    weight = torch.where(corners.bool(), part, 1 - part).prod(-1)
+    features = (table[row] * weight[..., None]).sum(2)
+    return (features * level_weight.to(device)[None, :, None]).flatten(1)
+
+
+class _Encode(torch.autograd.Function):
+    """The Numba kernels as one differentiable function of positions and table."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
+                fine_from: int) -> Tensor:  # fmt: skip
+        out = torch.empty(x.shape[0], 2 * len(grid.resolution))
+        kernels.encode(x.detach().numpy(), table.detach().numpy(), *_levels(grid), level_weight.numpy(), out.numpy())
+        ctx.save_for_backward(x, table, level_weight)
+        ctx.grid, ctx.boost, ctx.fine_from = grid, boost, fine_from
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> Any:
+        x, table, level_weight = ctx.saved_tensors
+        gradient = gradients[0].contiguous().numpy()
+        positions, weight = x.detach().numpy(), level_weight.numpy()
+        g_x = g_table = None
+        if ctx.needs_input_grad[0]:
+            g_x = torch.empty_like(x)
+            kernels.encode_backward_x(
+                positions, gradient, table.detach().numpy(), *_levels(ctx.grid), weight, g_x.numpy()
+            )
+        if ctx.needs_input_grad[1]:
+            boost = np.ones(len(positions), np.float32) if ctx.boost is None else ctx.boost.numpy()
+            g_table = torch.zeros_like(table)
+            kernels.encode_backward(
+                positions, gradient, *_levels(ctx.grid), weight, boost, ctx.fine_from, g_table.numpy()
+            )
+        return g_x, g_table, None, None, None, None
+
+
+def encode(
+    x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None = None, fine_from: int = 0
+) -> Tensor:
+    """Encode (N, 3) positions in 0..1 as (N, 2 L) features.
+
+    Args:
+        x: positions; the upper bound 1 itself is excluded.
+        table: (T, 2) trainable features.
+        grid: the levels.
+        level_weight: (L,) in 0..1: coarse-to-fine training holds fine levels back.
+        boost: (N,) factor on each sample's gradient on levels >= fine_from (adaptive grid update), or None.
+        fine_from: first level that `boost` acts on.
+    """
+    if kernels.AVAILABLE and x.device.type == "cpu":
+        return _Encode.apply(x.contiguous(), table, grid, level_weight, boost, fine_from)
+    out = encode_reference(x, table, grid, level_weight)
+    return out if boost is None or not out.requires_grad else _boost(out, boost, 2 * fine_from)
+
+
+def _boost(features: Tensor, boost: Tensor, first_column: int) -> Tensor:
+    """Leave the values, multiply the gradient of the columns from `first_column` on."""
+    fine = features[:, first_column:] * boost[:, None]
+    fine = fine + (features[:, first_column:] - fine).detach()
+    return torch.cat([features[:, :first_column], fine], dim=1)
+
+
+def _levels(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return grid.resolution, grid.stride, grid.offset, grid.mask
+
+
+def spherical_harmonics(direction: Tensor) -> Tensor:
+    """Real spherical harmonics of degrees 0 to 3 ("degree 4" in hash-grid papers) of (N, 3) unit vectors: (N, 16)."""
+    x, y, z = direction.unbind(-1)
+    xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+    return torch.stack(
+        [
+            torch.full_like(x, 0.28209479177387814),
+            -0.48860251190291987 * y,
+            0.48860251190291987 * z,
+            -0.48860251190291987 * x,
+            1.0925484305920792 * xy,
+            -1.0925484305920792 * yz,
+            0.94617469575755997 * zz - 0.31539156525251999,
+            -1.0925484305920792 * xz,
+            0.54627421529603959 * (xx - yy),
+            0.59004358992664352 * y * (-3.0 * xx + yy),
+            2.8906114426405538 * xy * z,
+            0.45704579946446572 * y * (1.0 - 5.0 * zz),
+            0.3731763325901154 * z * (5.0 * zz - 3.0),
+            0.45704579946446572 * x * (1.0 - 5.0 * zz),
+            1.4453057213202769 * z * (xx - yy),
+            0.59004358992664352 * x * (-xx + 3.0 * yy),
+        ],
+        dim=-1,
+    )

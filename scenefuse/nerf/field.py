@@ -1,0 +1,82 @@
+"""The radiance field: hash grid, density network, colour network."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
+
+GEOMETRY_FEATURES = 15
+
+
+@dataclass(frozen=True)
+class FieldSettings:
+    """Size of the radiance field."""
+
+    levels: int
+    """levels of the hash grid"""
+    log2_table: int
+    """2-logarithm of the rows a hashed level has"""
+    coarsest: int
+    """cells per side at the coarsest level"""
+    finest: int
+    """cells per side at the finest level"""
+    width: int
+    """width of the hidden layers"""
+
+
+class Field(nn.Module):
+    """Density and colour at positions of the unit cube (instant-ngp's architecture).
+
+    `level_weight` (L,) in 0..1 holds fine levels back while training goes from coarse to fine.
+    """
+
+    def __init__(self, settings: FieldSettings, generator: torch.Generator) -> None:
+        super().__init__()
+        self.settings = settings
+        self.grid = hash_grid(settings.levels, settings.log2_table, settings.coarsest, settings.finest)
+        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * 1e-4)
+        width, inputs = settings.width, 2 * settings.levels
+        self.density_in = _linear(inputs, width, generator)
+        self.density_out = _linear(width, 1 + GEOMETRY_FEATURES, generator)
+        self.color_geometry = _linear(1 + GEOMETRY_FEATURES, width, generator)
+        self.color_direction = _linear(16, width, generator)
+        self.color_hidden = _linear(width, width, generator)
+        self.color_out = _linear(width, 3, generator)
+        self.level_weight: Tensor
+        self.register_buffer("level_weight", torch.ones(settings.levels))
+
+    def geometry(self, x: Tensor, boost: Tensor | None = None, fine_from: int = 0) -> tuple[Tensor, Tensor]:
+        """Density (N,) per unit of length and features (N, 16) at positions (N, 3), in the unit cube."""
+        inside = x.clamp(0.0, 1.0 - 1e-6)
+        features = encode(inside, self.table, self.grid, self.level_weight, boost, fine_from)
+        out = self.density_out(torch.relu(self.density_in(features)))
+        return torch.exp(out[:, 0].clamp(max=11.0)), out
+
+    def color(self, features: Tensor, direction: Tensor) -> Tensor:
+        """RGB (R, S, 3) in 0..1 from features (R S, 16) of S samples on each of R rays with unit directions (R, 3)."""
+        rays = direction.shape[0]
+        view = self.color_direction(spherical_harmonics(direction))
+        hidden = self.color_geometry(features).view(rays, -1, self.settings.width) + view[:, None, :]
+        return torch.sigmoid(self.color_out(torch.relu(self.color_hidden(torch.relu(hidden)))))
+
+    def density(self, x: Tensor) -> Tensor:
+        """Density (N,) at positions (N, 3)."""
+        return self.geometry(x)[0]
+
+
+def coarse_to_fine(field: Field, progress: float, finished: float, levels_at_start: int) -> None:
+    """Open the levels one after the other: all of them once `progress` (0..1) reaches `finished`."""
+    levels = field.settings.levels
+    opened = levels if finished <= 0 else levels_at_start + (levels - levels_at_start) * progress / finished
+    field.level_weight.copy_((opened - torch.arange(levels, device=field.level_weight.device)).clamp(0.0, 1.0))
+
+
+def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    layer = nn.Linear(inputs, outputs)
+    bound = (6.0 / (inputs + outputs)) ** 0.5
+    with torch.no_grad():
+        layer.weight.copy_((torch.rand(outputs, inputs, generator=generator) * 2 - 1) * bound)
+        layer.bias.zero_()
+    return layer

@@ -1,0 +1,130 @@
+"""Where the object can be: the visual hull of its masks, and a grid of cached densities that prunes it."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scenefuse.nerf.field import Field
+from scenefuse.nerf.rays import dilate
+from scenefuse.transforms import Sim3
+
+
+@dataclass
+class Occupancy:
+    """A grid over the unit cube; it changes while a field is trained.
+
+    Attributes:
+        hull: (G, G, G) bool, cells inside the visual hull; nothing is ever sampled elsewhere.
+        density: (G, G, G) float32, cached density.
+        occupied: (G, G, G) bool, cells that rays are sampled in.
+    """
+
+    hull: Tensor
+    density: Tensor
+    occupied: Tensor
+
+    @property
+    def size(self) -> int:
+        """Cells per side."""
+        return self.hull.shape[0]
+
+    @classmethod
+    def from_hull(cls, hull: Tensor) -> "Occupancy":
+        """All of the hull occupied, nothing known about densities."""
+        return cls(hull, torch.zeros(hull.shape), hull.clone())
+
+
+def visual_hull(
+    masks: NDArray[np.bool_],
+    intrinsics: NDArray[np.float64],
+    object_from_cam: NDArray[np.float64],
+    unit_from_object: Sim3,
+    size: int,
+    tolerance: float,
+) -> NDArray[np.bool_]:
+    """Cells (size, size, size) of the unit cube that project into (nearly) every mask that could see them.
+
+    Args:
+        masks: (V, H, W), True on the object.
+        intrinsics: (V, 3, 3) in pixels.
+        object_from_cam: (V, 4, 4).
+        unit_from_object: the cube.
+        size: cells per side, a multiple of 4.
+        tolerance: share of the views that may disagree.
+    """
+    object_from_unit = unit_from_object.inverse()
+    cells, count = np.stack(np.meshgrid(*[np.arange(size // 4)] * 3, indexing="ij"), -1).reshape(-1, 3), size // 4
+    stack = torch.from_numpy(np.ascontiguousarray(masks))
+    while True:
+        points = object_from_unit.apply((cells + 0.5) / count)
+        half = object_from_unit.scale * 0.87 / count
+        outside, seen = np.zeros(len(cells), np.int32), np.zeros(len(cells), np.int32)
+        for view, (k, pose) in enumerate(zip(intrinsics, object_from_cam)):
+            in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
+            z = np.maximum(in_camera[:, 2], 1e-9)
+            u = np.floor(in_camera[:, 0] / z * k[0, 0] + k[0, 2]).astype(np.int64)
+            v = np.floor(in_camera[:, 1] / z * k[1, 1] + k[1, 2]).astype(np.int64)
+            radius = int(np.ceil(half * k[0, 0] / max(float(np.median(z)), 1e-9)))
+            grown = dilate(stack[view : view + 1], radius)[0].numpy()
+            height, width = grown.shape
+            visible = (in_camera[:, 2] > 0) & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+            seen += visible
+            outside += visible & ~grown[np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)]
+        keep = (outside <= tolerance * seen) & (seen >= max(2, 0.3 * len(masks)))
+        cells = cells[keep]
+        if count == size or len(cells) == 0:
+            hull = np.zeros((size, size, size), dtype=bool)
+            hull[tuple(cells.T)] = True
+            return hull
+        children = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), -1).reshape(-1, 3)
+        cells, count = (2 * cells[:, None] + children).reshape(-1, 3), 2 * count
+
+
+def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -> Sim3:
+    """The cube around a hull's cells, `margin` (share of its side) wider on each side: nerf_from_object.
+
+    Raises:
+        ValueError: the hull is empty.
+    """
+    cells = np.argwhere(hull)
+    if len(cells) == 0:
+        raise ValueError("the visual hull of the masks is empty")
+    low, high = cells.min(0) / len(hull), (cells.max(0) + 1) / len(hull)
+    object_from_unit = unit_from_object.inverse()
+    center = object_from_unit.apply((low + high) / 2)
+    scale = 1.0 / (object_from_unit.scale * float((high - low).max()) * (1 + 2 * margin))
+    return Sim3(scale, np.eye(3), 0.5 - scale * center)
+
+
+@torch.no_grad()
+def update(occupancy: Occupancy, field: Field, seed: int, step: int, cells: int, decay: float, prune: bool,
+           threshold: float) -> None:  # fmt: skip
+    """Refresh the cached density of `cells` random hull cells, and drop nearly empty ones when `prune`.
+
+    Args:
+        occupancy: changed in place.
+        field: the field being trained.
+        seed: seed of the run.
+        step: training step; seed and step determine the cells.
+        cells: how many to evaluate.
+        decay: factor on the old value before the maximum with the new one is taken.
+        prune: False keeps all of the hull occupied.
+        threshold: opacity over one cell below which it is empty.
+    """
+    rng = np.random.default_rng((seed, step, 1))
+    inside = torch.nonzero(occupancy.hull.flatten())[:, 0]
+    chosen = inside[torch.from_numpy(rng.integers(0, len(inside), min(cells, 2 * len(inside))))].unique()
+    size = occupancy.size
+    index = torch.stack([chosen // (size * size), chosen // size % size, chosen % size], dim=1)
+    jitter = torch.from_numpy(rng.random((len(chosen), 3), dtype=np.float32)).to(chosen.device)
+    density = field.density((index + jitter) / size)
+    flat = occupancy.density.view(-1)
+    flat[chosen] = torch.maximum(flat[chosen] * decay, density)
+    if prune:
+        opacity = 1 - torch.exp(-occupancy.density / size)
+        # A neighbour of an occupied cell stays: the surface may still move by one cell.
+        near = torch.nn.functional.max_pool3d((opacity > threshold).float()[None, None], 3, 1, 1)[0, 0] > 0
+        occupancy.occupied = occupancy.hull & near
