@@ -126,21 +126,22 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
         PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
 
 
-def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str) -> None:
-    """Write LAZ 1.4 with a CRS: easting, northing and height are `origin` plus the cloud's positions, to a millimetre.
+def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
+    """Write LAZ 1.4: coordinates are `origin` plus the cloud's positions, to a thousandth of the unit.
 
     Args:
         path: output, .laz or .las.
-        cloud: in metres, axes east, north, up, relative to `origin`.
-        origin: (3,) coordinates of the cloud's local origin in the CRS.
-        crs: anything pyproj understands, "EPSG:32632" for instance.
+        cloud: with the axes of the CRS, relative to `origin`.
+        origin: (3,) coordinates of the cloud's local origin.
+        crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
     """
     import laspy
     import pyproj
 
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales, header.offsets = np.full(3, 0.001), np.floor(origin)
-    header.add_crs(pyproj.CRS.from_user_input(crs))
+    if crs is not None:
+        header.add_crs(pyproj.CRS.from_user_input(crs))
     names = {"uint8": "u1", "int32": "i4", "float32": "f4", "float64": "f8", "uint16": "u2", "int64": "i8"}
     for name, values in cloud.fields.items():
         header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=names[values.dtype.name]))

@@ -62,11 +62,13 @@ def _tree(module: Path) -> ast.Module:
 
 @functools.cache
 def _normalised(module: Path) -> str:
-    """The module's code without comments, docstrings and formatting."""
+    """The module's code without comments, formatting, and strings that stand alone (docstrings of anything)."""
     tree = ast.parse(module.read_text())
     for node in ast.walk(tree):
-        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and ast.get_docstring(
-            node
-        ):
-            node.body = node.body[1:] or [ast.Pass()]
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
+            node.body = [part for part in node.body if not _is_docstring(part)] or [ast.Pass()]
     return ast.unparse(ast.fix_missing_locations(tree))
+
+
+def _is_docstring(part: ast.stmt) -> bool:
+    return isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)

@@ -64,12 +64,12 @@ def fuse(
     georeference: Path | None = None,
     fused: Path,
     fused_scene: Path,
-    fused_laz: Path | None = None,
+    fused_laz: Path,
     report: Path,
     mode: Literal["fill", "append", "replace"],
     settings: FusionSettings,
 ) -> None:
-    """Add a registered object to the scene (PAPER F1, F2); an unregistered one leaves the scene as it is.
+    """Add a registered object to the scene (method F1, F2); an unregistered one leaves the scene as it is.
 
     `append` adds every object point; `fill` those the scene lacks; `replace` takes the scene's points on the object
     away and puts the object in their place, with a feathered seam.
@@ -83,7 +83,7 @@ def fuse(
         georeference: JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing.
         fused: output PLY, the object's surroundings: the scene in the crop's box and what was added.
         fused_scene: output PLY, the whole scene with what was added.
-        fused_laz: output LAZ with the CRS; written only when the scene is georeferenced.
+        fused_laz: output LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one.
         report: output JSON: counts, distances, gain, status.
         mode: fill, append or replace.
         settings: see FusionSettings.
@@ -110,10 +110,9 @@ def fuse(
     complete = concatenate([kept, added]) if len(added) else kept
     write_cloud(fused, concatenate([around, added]) if len(added) else around)
     write_cloud(fused_scene, complete)
-    located = _crs_from_scene(georeference)
-    if fused_laz is not None and located is not None:
-        about_origin = replace(located[0], translation=np.zeros(3))
-        write_laz(fused_laz, complete.transformed(about_origin), located[0].translation, located[1])
+    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
+    about_origin = replace(crs_from_scene, translation=np.zeros(3))
+    write_laz(fused_laz, complete.transformed(about_origin), crs_from_scene.translation, crs)
     unit = "scene units"
     write_json(
         report,
@@ -131,7 +130,7 @@ def fuse(
             "fill_distance": quantity(fusion.fill_distance, unit),
             "color_gain": quantity(fusion.gain, "1"),
             "color_bias": quantity(fusion.bias, "of 255"),
-            "laz": quantity(fused_laz is not None and located is not None, ""),
+            "crs": quantity(crs, ""),
             "seconds": quantity(time.perf_counter() - start, "s"),
         },
     )

@@ -20,7 +20,7 @@ def primitive_fitting_score(
     angle_deg: float,
     seed: int,
 ) -> float:
-    """Share of points on any of the primitives found one after the other (PAPER G5).
+    """Share of points on any of the primitives found one after the other (method G5).
 
     Each round draws planes (one oriented point), spheres and cylinders (two oriented points, Schnabel 2007) from
     neighbouring points that are left, takes the one with the largest connected set of inliers, and removes it.

@@ -48,7 +48,7 @@ def compute_metrics(
     seed: int,
     settings: MetricSettings,
 ) -> None:
-    """Measure one registration and, where the object was fused, the completion (PAPER G1 to G5, R10, R11).
+    """Measure one registration and, where the object was fused, the completion (method G1 to G5, R10, R11).
 
     Args:
         object: object cloud (PLY) in its own frame.

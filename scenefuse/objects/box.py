@@ -58,7 +58,7 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
     RANSAC for a plane over the sparse points beside the box (at most one and a half of its width away),
     tilted by at most 30 degrees, then
     a quadratic surface by least squares through the points near it that are not the object's: ground is
-    seldom flat. No prompt lies below it.
+    seldom flat. No prompt lies below it by more than it scatters.
 
     Args:
         points_in_box: (N, 3) sparse points along the box's axes.
@@ -99,7 +99,8 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
         fit = np.linalg.lstsq(np.vstack([terms[use], ridge]), np.concatenate([near[use, 2], np.zeros(6)]), rcond=None)[
             0
         ]
-    fit[0] += min(0.0, float(Ground(fit, centre[:2]).height_of(prompts_in_box).min()))
+    scatter = float(np.std(near[use, 2] - terms[use] @ fit))
+    fit[0] += min(0.0, float(Ground(fit, centre[:2]).height_of(prompts_in_box).min()) + 2 * scatter)
     return Ground(fit, centre[:2]), True
 
 

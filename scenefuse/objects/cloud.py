@@ -52,7 +52,7 @@ def object_cloud(
     settings: CloudSettings,
     seed: int,
 ) -> None:
-    """Fuse a NeRF stage's depth maps into the object's cloud (PAPER N13), in the object's camera (SfM) frame.
+    """Fuse a NeRF stage's depth maps into the object's cloud (method N13), in the object's camera (SfM) frame.
 
     Args:
         cameras: undistorted COLMAP workspace of the object.

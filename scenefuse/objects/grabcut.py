@@ -91,10 +91,12 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     """
     inner = ndimage.distance_transform_edt(outline)
     outer = ndimage.distance_transform_edt(~outline)
-    likely = np.where(outline == mask, mask, evidence > 0)
-    trimap = np.where(likely, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
-    trimap[(inner > band_px) & mask] = cv2.GC_FGD
-    trimap[(outer > band_px) & ~mask | (outer > 4 * band_px)] = cv2.GC_BGD
+    # One pixel's colour is noise: its neighbours within half a band have their say.
+    colour = cv2.GaussianBlur(np.clip(evidence, -3, 3), (0, 0), band_px / 4)
+    votes = colour + np.where(outline, 1, -1) + np.where(mask, 1, -1)
+    trimap = np.where(votes > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap[(inner > band_px) & mask & (colour > 0)] = cv2.GC_FGD
+    trimap[(outer > band_px) & ~mask & (colour < 0) | (outer > 4 * band_px)] = cv2.GC_BGD
     return trimap
 
 

@@ -1,6 +1,6 @@
 """Masks of the object in every photo: GrabCut or SAM 2 from prompts, or supplied; the visual hull makes them agree."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -77,7 +77,8 @@ class _Object:
         box: where it is.
         ground: under which nothing belongs to it.
         ground_found: whether the ground was measured; otherwise it is the box's bottom.
-        spanning: (N, 3) points on the object that span it: the prompts.
+        spanning: (N, 3) points on the object that span it.
+        prompts: (M, 3) those of them that a person clicked.
         sparse: (P, 3) sparse points.
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
     """
@@ -86,6 +87,7 @@ class _Object:
     ground: Ground
     ground_found: bool
     spanning: Array
+    prompts: Array
     sparse: Array
     kind: NDArray[np.int8]
 
@@ -107,7 +109,7 @@ def make_masks(
     contact_sheet: Path,
     report: Path,
 ) -> None:
-    """Write a mask of the object for every undistorted photo (PAPER K1, K3).
+    """Write a mask of the object for every undistorted photo (method K1, K3).
 
     Prompts give an upright box; the sparse points in it and above the ground seed GrabCut or SAM 2 in each
     photo. The masks carve a visual
@@ -234,37 +236,7 @@ def _read_frames(cameras: Path) -> tuple[list[Frame], Array]:
         )
     if not frames:
         raise StageError(f"{cameras} holds no photo with a camera; look at the report of the object's SfM")
-    return _with_neighbours_points(frames, sparse), sparse
-
-
-def _with_neighbours_points(frames: list[Frame], sparse: Array, max_angle_deg: float = 15.0) -> list[Frame]:
-    """The same frames, each with the points that another one observes from nearly the same direction: tracks have gaps.
-
-    Args:
-        frames: photos with the points they observe themselves.
-        sparse: (P, 3) sparse points.
-        max_angle_deg: between the two rays to the point.
-    """
-    centres = np.array([-f.cam_from_object[:, :3].T @ f.cam_from_object[:, 3] for f in frames])
-    rows = np.concatenate([f.point_rows for f in frames])
-    rays = np.concatenate([c - sparse[f.point_rows] for c, f in zip(centres, frames)])
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    completed = []
-    for centre, frame in zip(centres, frames):
-        own = centre - sparse[rows]
-        near = (own * rays).sum(1) > np.cos(np.radians(max_angle_deg)) * np.linalg.norm(own, axis=1)
-        others = np.setdiff1d(rows[near], frame.point_rows)
-        pixels, depth = frame.project(sparse[others])
-        height, width = frame.image.shape[:2]
-        inside = (depth > 0) & ((pixels >= 0) & (pixels < [width, height])).all(1)
-        completed.append(
-            replace(
-                frame,
-                observed=np.concatenate([frame.observed, pixels[inside]]),
-                point_rows=np.concatenate([frame.point_rows, others[inside]]),
-            )
-        )
-    return completed
+    return frames, sparse
 
 
 def _prompt_points(prompts: Path | None, sfm: Path, photos: Path, settings: MaskSettings) -> Array:
@@ -297,7 +269,7 @@ def _object_from_points(points: Array, sparse: Array, up: Array, settings: MaskS
     if found:
         kind[height < 0.5 * margin] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > margin)] = 1
-    return _Object(box, ground, found, points, sparse, kind)
+    return _Object(box, ground, found, points, points, sparse, kind)
 
 
 def _object_from_masks(
@@ -347,14 +319,20 @@ def _outline(target: _Object, frame: Frame, settings: MaskSettings) -> Array:
 
 
 def _stamp(trimap: NDArray[np.uint8], target: _Object, frame: Frame) -> None:
-    """Mark what the sparse points of a photo make certain."""
+    """Mark what the sparse points that a photo sees make certain, and the prompts.
+
+    A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+    """
+    pixels, depth = frame.project(target.prompts)
+    height, width = trimap.shape
+    shown = (depth > 0) & ((pixels >= 0) & (pixels < [width, height])).all(1)
     rows = frame.point_rows
     stamp_seeds(
         trimap,
-        frame.observed,
-        target.sparse[rows],
-        target.kind[rows],
-        0.003 * frame.image.shape[1],
+        np.concatenate([frame.observed, pixels[shown]]),
+        np.concatenate([target.sparse[rows], target.prompts[shown]]),
+        np.concatenate([target.kind[rows], np.ones(shown.sum(), np.int8)]),
+        0.003 * width,
         0.06 * target.box.diagonal,
     )
 

@@ -65,7 +65,7 @@ def train_nerf(
     """Train a NeRF of one object and render depth, normals and confidence for every photo.
 
     Instant-ngp's field (Mueller et al. 2022) in a cube around the visual hull of the masks, with the paper's losses:
-    photometric, absolute and relative depth, mask, sparsity, distortion (PAPER N2 to N9). Depth is the median along
+    photometric, absolute and relative depth, mask, sparsity, distortion (method N2 to N9). Depth is the median along
     the ray where opacity exceeds 0.9; its confidence is opacity times the share of other views that agree.
 
     Args:
@@ -237,7 +237,7 @@ def _key(*parts: Any) -> str:
 def _final_poses(
     views: Views, training: NDArray[np.int64], nerf_from_object: Sim3, model: Model
 ) -> tuple[NDArray[np.float64], Sim3, dict[str, Any]]:
-    """Refined poses with the gauge's drift moved into nerf_from_object (PAPER N11), and how far they went."""
+    """Refined poses with the gauge's drift moved into nerf_from_object (method N11), and how far they went."""
     poses = views.object_from_cam.copy()
     correction = model.pose.cpu()
     if not correction.any():

@@ -13,7 +13,7 @@ from scenefuse.transforms import Array, Sim3
 
 @dataclass(frozen=True)
 class Gate:
-    """What a pose must reach to count as registered (PAPER R12)."""
+    """What a pose must reach to count as registered (method R12)."""
 
     min_f_score: float
     """Smallest two-way F-score of an accepted pose."""

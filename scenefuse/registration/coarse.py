@@ -85,7 +85,7 @@ def register_coarsely(
 ) -> None:
     """Find scene_from_object hypotheses of an object of unknown pose and roughly known scale.
 
-    Default: similarity RANSAC on FPFH matches over a pyramid of voxels (PAPER R3, R4, R6) and, where gravity is known
+    Default: similarity RANSAC on FPFH matches over a pyramid of voxels (method R3, R4, R6) and, where gravity is known
     on both sides, a sweep of yaw, scale and shift by correlation; each is briefly refined and scored both ways (R9).
     Paper: one rigid FPFH RANSAC at the first voxel and the given scale (R5, R7).
 

@@ -76,7 +76,7 @@ def crop_scene(
     mode: Literal["fiducials", "none"],
     settings: CropSettings,
 ) -> None:
-    """Cut an object's surroundings out of the scene by its fiducials (PAPER C1, C2).
+    """Cut an object's surroundings out of the scene by its fiducials (method C1, C2).
 
     Args:
         scene: dense scene cloud (PLY), z up as the georegister stage leaves it.

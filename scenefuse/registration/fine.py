@@ -76,7 +76,7 @@ def register_finely(
     seed: int,
     settings: FineSettings,
 ) -> None:
-    """Refine the coarse hypotheses into one pose, or refuse it with a reason (PAPER R8, R9, R12).
+    """Refine the coarse hypotheses into one pose, or refuse it with a reason (method R8, R9, R12).
 
     Default: two-way Tukey-weighted similarity ICP of every hypothesis; turned copies of the leaders; point-to-plane
     and colour polish; ranking by the two-way F-score times the agreement of colours; the gate.

@@ -10,7 +10,7 @@ from scenefuse.transforms import Sim3
 
 
 def write_frame_ledger(*, object_report: Path, fine: Path, georeference: Path | None = None, frames: Path) -> None:
-    """Collect the transforms between the frames of one object (DESIGN, frames and units).
+    """Collect the transforms between the frames of one object (docs/frames.md).
 
     Frames: `nerf` (normalised, what the field is trained in), `object` (the object's cameras), `scene`, `world`
     (easting, northing, height in the scene's CRS, where it is georeferenced).

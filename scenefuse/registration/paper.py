@@ -1,4 +1,4 @@
-"""The paper's registration to the letter, as PAPER R5 to R8 read it: rigid FPFH RANSAC, then point-to-point ICP."""
+"""The paper's registration to the letter, as method R5 to R8 read it: rigid FPFH RANSAC, then point-to-point ICP."""
 
 import ctypes
 from collections.abc import Iterator

@@ -38,7 +38,7 @@ def estimate_scale(
     method: Literal["rms", "prior", "none"],
     width_log: float,
 ) -> None:
-    """Estimate scene units per object unit before any pose is known (PAPER R1 to R3).
+    """Estimate scene units per object unit before any pose is known (method R1 to R3).
 
     `rms` is the paper's: the ratio of the root mean square distances to the centroids of the whole clouds, held
     fixed afterwards. `prior` takes the upper quartile of all estimates of extent as the centre of a prior with a width;

@@ -66,7 +66,7 @@ def estimate_depth_maps(
 ) -> None:
     """Write depth and normal maps for one chunk of the photos of an undistorted workspace.
 
-    COLMAP's patch-match runs where CUDA is present (the paper's method; PAPER M3: the sources are
+    COLMAP's patch-match runs where CUDA is present (the paper's method; method M3: the sources are
     `__auto__`); otherwise a plane sweep
     in PyTorch, on CUDA or the CPU, takes its place. Which one ran, and why, is in the report.
 
@@ -376,7 +376,7 @@ def _workspace_of_links(
 def _stereo_fusion(folder: Path, settings: FusionSettings) -> Cloud:
     """COLMAP's fusion of a temporary workspace, as a cloud."""
     options = pycolmap.StereoFusionOptions()
-    options.num_threads = threads()
+    options.num_threads = 1  # With more, which thread comes first decides the points.
     options.min_num_pixels = settings.min_photos
     options.max_reproj_error = settings.max_reprojection_px
     options.max_depth_error = settings.max_depth_error

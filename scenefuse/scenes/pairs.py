@@ -36,7 +36,7 @@ class PairSettings:
 
 
 def choose_pairs(photos: list[Photo], is_video: bool, settings: PairSettings) -> tuple[str, str, list[Pair]]:
-    """The kind of pairs, why, and the pairs themselves, sorted by the photos' order (PAPER: M5).
+    """The kind of pairs, why, and the pairs themselves, sorted by the photos' order (method M5).
 
     Args:
         photos: in name order.

@@ -14,7 +14,7 @@ class UndistortSettings:
     """Size and quality of undistorted photos."""
 
     max_size_px: int
-    """Longest side of an undistorted photo; larger ones are scaled down (PAPER: M4)."""
+    """Longest side of an undistorted photo; larger ones are scaled down (method M4)."""
     jpeg_quality: int
     """Quality of undistorted JPEG files, 1 to 100."""
 

@@ -20,7 +20,7 @@ def project(tmp_path):
 START = {
     "scripts__s": "from lib.a import f\nf()\n",
     "lib__a": "from . import b\ndef f():\n    '''Doc.'''\n    return b.g()\n",
-    "lib__b": "def g():\n    import lib.late\n    return 1\n",
+    "lib__b": "class C:\n    a: int = 0\n    '''An attribute.'''\n\n\ndef g():\n    import lib.late\n    return 1\n",
     "lib__late": "x = 1\n",
     "lib__unused": "y = 1\n",
 }
@@ -31,9 +31,9 @@ START = {
     [
         {"lib__a": "from . import b\n\n\n# why\ndef f():\n    '''Other doc.'''\n    return b.g()  # because\n"},
         {"lib__unused": "y = 2\n"},
-        {"lib__b": "def g():\n    import lib.late\n    return (\n        1\n    )\n"},
+        {"lib__b": "class C:\n    a: int = 0\n    '''Other words.'''\n\n\ndef g():\n    import lib.late\n    return (\n        1\n    )\n"},
     ],
-    ids=["comment and docstring", "module not imported", "formatting"],
+    ids=["comment and docstring", "module not imported", "formatting and attribute docstring"],
 )
 def test_edits_that_change_nothing(project, edit):
     assert project(**START) == project(**edit)

@@ -1,0 +1,215 @@
+"""The signal that trains depth without depth: one photo, warped by the right depth and pose, must look like another.
+
+The losses are those of Monodepth2 (Godard et al., ICCV 2019). For target photo I_t, source photos I_s, depth D and the
+pose T of the source camera, a target pixel p (homogeneous) is seen in the source at
+
+    p_s ~ K_s T (D(p) K_t^-1 p)                                                            (1) warping
+    I_{s->t}(p) = I_s(p_s), bilinear
+    pe(a, b) = alpha / 2 (1 - SSIM(a, b)) + (1 - alpha) |a - b|,  alpha = 0.85              (2) photometric error
+    L_p = min over s of pe(I_t, I_{s->t})                                                  (3) minimum reprojection
+    mu = [ min_s pe(I_t, I_{s->t}) < min_s pe(I_t, I_s) ]                                   (4) auto-mask
+    L_s = |dx d*| exp(-|dx I_t|) + |dy d*| exp(-|dy I_t|),  d* = d / mean(d)                (5) edge-aware smoothness
+
+Images are (B, 3, H, W) in 0..1, depths (B, 1, H, W) along z, pixel centres at +0.5.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+
+def points_in_cam(depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """(B, 1, H, W) depth and (B, 3, 3) intrinsics -> (B, 3, H*W) points in the camera's frame."""
+    batch, _, height, width = depth.shape
+    v, u = torch.meshgrid(
+        torch.arange(height, device=depth.device) + 0.5, torch.arange(width, device=depth.device) + 0.5, indexing="ij"
+    )
+    pixels = torch.stack([u, v, torch.ones_like(u)]).view(1, 3, -1).to(depth.dtype)
+    return torch.linalg.inv(intrinsics) @ pixels * depth.reshape(batch, 1, -1)
+
+
+def project(points: Tensor, source_from_target: Tensor, intrinsics: Tensor) -> tuple[Tensor, Tensor]:
+    """Equation (1): (B, 3, N) points -> (B, N, 2) pixels in the source, (B, N) depths there."""
+    moved = source_from_target[:, :3, :3] @ points + source_from_target[:, :3, 3:]
+    z = moved[:, 2]
+    pixels = intrinsics @ moved
+    return (pixels[:, :2] / z[:, None].clamp_min(1e-6)).transpose(1, 2), z
+
+
+def sample(image: Tensor, pixels: Tensor) -> Tensor:
+    """Bilinear values of (B, C, H, W) maps at (B, ..., 2) pixels -> (B, C, ...); the border is repeated."""
+    size = pixels.new_tensor([image.shape[3], image.shape[2]])
+    grid = (pixels * 2.0 / size - 1.0).view(len(image), -1, 1, 2)
+    values = functional.grid_sample(image, grid, mode="bilinear", padding_mode="border", align_corners=False)
+    return values.view(*values.shape[:2], *pixels.shape[1:-1])
+
+
+def inside(pixels: Tensor, z: Tensor, height: int, width: int) -> Tensor:
+    """True for (B, N, 2) pixels that lie in the image and in front of the camera, at least half a pixel inside."""
+    u, v = pixels.unbind(-1)
+    return (u > 0.5) & (u < width - 0.5) & (v > 0.5) & (v < height - 0.5) & (z > 1e-6)
+
+
+def warp(
+    source: Tensor, depth: Tensor, source_from_target: Tensor, of_target: Tensor, of_source: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Draw the source as the target camera would see it.
+
+    Args:
+        source: (B, C, H, W) photo or map of the source.
+        depth: (B, 1, H, W) depth of the target.
+        source_from_target: (B, 4, 4) rigid transforms.
+        of_target: (B, 3, 3) intrinsics of the target.
+        of_source: (B, 3, 3) intrinsics of the source.
+
+    Returns:
+        (B, C, H, W) warped values and (B, 1, H, W) bool, True where the source has the pixel.
+    """
+    height, width = depth.shape[2:]
+    pixels, z = project(points_in_cam(depth, of_target), source_from_target, of_source)
+    valid = inside(pixels, z, height, width)
+    return sample(source, pixels.view(len(depth), height, width, 2)), valid.view(-1, 1, height, width)
+
+
+def ssim(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity in 3x3 windows, per pixel and channel (Wang et al. 2004)."""
+    a, b = (functional.pad(x, (1, 1, 1, 1), mode="reflect") for x in (a, b))
+    mean_a, mean_b, aa, bb, ab = functional.avg_pool2d(torch.cat([a, b, a * a, b * b, a * b], 1), 3, 1).chunk(5, 1)
+    c1, c2 = 0.01**2, 0.03**2
+    covariance, spread = ab - mean_a * mean_b, (aa - mean_a**2) + (bb - mean_b**2)
+    return (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (spread + c2))
+
+
+def photometric_error(a: Tensor, b: Tensor, ssim_weight: float) -> Tensor:
+    """Equation (2), averaged over colours: (B, 1, H, W)."""
+    absolute = (a - b).abs()
+    structure = (1.0 - ssim(a, b)).div(2.0).clamp(0.0, 1.0)
+    return (ssim_weight * structure + (1.0 - ssim_weight) * absolute).mean(1, keepdim=True)
+
+
+def minimum_reprojection(errors: Tensor, valid: Tensor, unmoved: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Equations (3) and (4).
+
+    Args:
+        errors: (B, S, H, W) photometric error against each warped source.
+        valid: (B, S, H, W) bool, True where that source has the pixel.
+        unmoved: (B, S, H, W) error against the sources as they are, or None for no auto-mask.
+
+    Returns:
+        (B, 1, H, W) smallest error and (B, 1, H, W) bool, True where it counts.
+    """
+    infinite = errors.new_tensor(torch.inf)
+    smallest = torch.where(valid, errors, infinite).amin(1, keepdim=True)
+    counts = torch.isfinite(smallest)
+    if unmoved is not None:
+        counts = counts & (smallest < unmoved.amin(1, keepdim=True))
+    return torch.where(counts, smallest, torch.zeros_like(smallest)), counts
+
+
+def smoothness(disparity: Tensor, image: Tensor, mask: Tensor) -> Tensor:
+    """Equation (5) inside a (B, 1, H, W) mask of zeros and ones: a scalar."""
+    mean = (disparity * mask).sum((2, 3), keepdim=True) / mask.sum((2, 3), keepdim=True).clamp_min(1.0)
+    disparity = disparity / mean.clamp_min(1e-6)
+    total = disparity.new_zeros(())
+    for axis in (2, 3):
+        step = torch.diff(disparity, dim=axis).abs()
+        edge = torch.exp(-torch.diff(image, dim=axis).abs().mean(1, keepdim=True))
+        size = mask.shape[axis] - 1
+        both = mask.narrow(axis, 1, size) * mask.narrow(axis, 0, size)
+        total = total + (step * edge * both).sum() / both.sum().clamp_min(1.0)
+    return total
+
+
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean of values where the mask is non-zero; zero where it is nowhere."""
+    weights = mask.to(values.dtype)
+    return (values * weights).sum() / weights.sum().clamp_min(1.0)
+
+
+def reprojection_differences(
+    depth: Tensor, others: Tensor, other_from_view: Tensor, of_view: Tensor, of_others: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Forward-backward check of one view's depth map against those of other views.
+
+    Each pixel goes into another view with its depth, takes the depth found there, and comes back.
+
+    Args:
+        depth: (1, 1, H, W) depth, 0 where there is none.
+        others: (S, 1, H, W) depths of the other views, 0 where there is none.
+        other_from_view: (S, 4, 4) rigid transforms.
+        of_view: (1, 3, 3) intrinsics.
+        of_others: (S, 3, 3) intrinsics.
+
+    Returns:
+        (S, H, W) depth that came back minus depth; (S, H, W) distance in pixels between start and return; (S, H, W)
+        bool, True where both views have a depth.
+    """
+    count, (height, width) = len(others), depth.shape[2:]
+    points = points_in_cam(depth, of_view).expand(count, -1, -1)
+    pixels, z = project(points, other_from_view, of_others)
+    have = (others > 0).to(depth.dtype)
+    found = sample(torch.cat([others, have], 1), pixels)
+    seen = inside(pixels, z, height, width) & (found[:, 1] > 0.999) & (depth > 0).view(1, -1)
+    rays = torch.linalg.inv(of_others) @ torch.cat([pixels, torch.ones_like(pixels[..., :1])], 2).transpose(1, 2)
+    back, returned = project(rays * found[:, :1], torch.linalg.inv(other_from_view), of_view.expand(count, -1, -1))
+    start, _ = project(
+        points, torch.eye(4, dtype=depth.dtype, device=depth.device)[None].expand(count, -1, -1), of_view
+    )
+    shape = (count, height, width)
+    return (
+        (returned - depth.view(1, -1)).view(shape),
+        (back - start).norm(dim=2).view(shape),
+        seen.view(shape),
+    )
+
+
+def plane_sweep(
+    image: Tensor,
+    sources: Tensor,
+    depths: Tensor,
+    source_from_target: Tensor,
+    of_target: Tensor,
+    of_sources: Tensor,
+    silhouettes: Tensor,
+    window: int,
+) -> Tensor:
+    """Score every depth hypothesis of one photo by normalised cross-correlation with its sources (Collins 1996).
+
+    The score is the mean over the better half of the sources, which ignores those where the point is hidden. A
+    hypothesis that leaves the silhouette of a source is outside the visual hull and scores -1.
+
+    Args:
+        image: (1, 1, H, W) grey photo, possibly cut out of a larger one.
+        sources: (S, 1, h, w) grey source photos.
+        depths: (D, H, W) hypotheses.
+        source_from_target: (S, 4, 4).
+        of_target: (1, 3, 3) intrinsics of the (cut) photo.
+        of_sources: (S, 3, 3) intrinsics.
+        silhouettes: (S, 1, h, w) 1 where a source may see the object.
+        window: side of the correlation window in pixels, odd.
+
+    Returns:
+        (D, H, W) scores in -1..1.
+    """
+    count, (height, width) = len(sources), image.shape[2:]
+    stacked = torch.cat([sources, silhouettes], 1)
+
+    def mean(x: Tensor) -> Tensor:
+        return functional.avg_pool2d(functional.pad(x, (window // 2,) * 4, mode="replicate"), window, 1)
+
+    mean_t = mean(image)
+    spread_t = (mean(image * image) - mean_t**2).clamp_min(1e-6)
+    scores = []
+    for depth in depths:
+        pixels, z = project(
+            points_in_cam(depth[None, None], of_target).expand(count, -1, -1), source_from_target, of_sources
+        )
+        seen = inside(pixels, z, *sources.shape[2:]).view(count, 1, height, width)
+        values, hull = sample(stacked, pixels.view(count, height, width, 2)).split(1, 1)
+        mean_s, squares, products = mean(torch.cat([values, values**2, values * image], 1)).split(1, 1)
+        spread_s = (squares - mean_s**2).clamp_min(1e-6)
+        score = (products - mean_t * mean_s) / torch.sqrt(spread_t * spread_s)
+        best = torch.where(seen, score, torch.full_like(score, -1.0)).topk(max(1, (count + 1) // 2), 0).values.mean(0)
+        outside = (seen & (hull < 0.5)).any(0)
+        scores.append(torch.where(outside, torch.full_like(best, -1.0), best)[0])
+    return torch.stack(scores)
