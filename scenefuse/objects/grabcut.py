@@ -23,9 +23,9 @@ def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spannin
         spanning_px: (M, 2) projected points of the object, seen or hidden; their convex hull is likely object.
     """
     trimap = np.full(size, cv2.GC_BGD, dtype=np.uint8)
-    _fill_hull(trimap, outline_px, cv2.GC_PR_BGD)
+    fill_hull(trimap, outline_px, cv2.GC_PR_BGD)
     likely = np.zeros(size, dtype=np.uint8)
-    _fill_hull(likely, spanning_px, 1)
+    fill_hull(likely, spanning_px, 1)
     trimap[(trimap == cv2.GC_PR_BGD) & (likely > 0)] = cv2.GC_PR_FGD
     return trimap
 
@@ -80,13 +80,13 @@ def _cells(image: NDArray[np.uint8]) -> NDArray[np.intp]:
 def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band_px: float) -> Trimap:
     """GrabCut labels from the hull's outline and the mask so far, (H, W).
 
-    Certain is only what both agree on, away from the outline; beyond four bands outside it nothing is
-    object, whatever the mask says.
+    Certain is only what both and the colours agree on, away from the outline; beyond two bands outside it
+    nothing is object, whatever the mask says. Elsewhere the three vote.
 
     Args:
         outline: the hull as the photo sees it.
         mask: the photo's own mask.
-        evidence: (H, W) log ratio of the colour's densities; it sides with one of the two where they differ.
+        evidence: (H, W) log ratio of the colour's densities; it can overrule one of the two, not both.
         band_px: half width of the band along the outline that is never certain.
     """
     inner = ndimage.distance_transform_edt(outline)
@@ -96,7 +96,7 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     votes = colour + np.where(outline, 1, -1) + np.where(mask, 1, -1)
     trimap = np.where(votes > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[(inner > band_px) & mask & (colour > 0)] = cv2.GC_FGD
-    trimap[(outer > band_px) & ~mask & (colour < 0) | (outer > 4 * band_px)] = cv2.GC_BGD
+    trimap[(outer > band_px) & ~mask & (colour < 0) | (outer > 2 * band_px)] = cv2.GC_BGD
     return trimap
 
 
@@ -181,7 +181,7 @@ def cleaned(mask: Mask, smallest_share: float = 0.02) -> Mask:
     return mask
 
 
-def _fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int) -> None:
+def fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int) -> None:
     """Fill the convex hull of (N, 2) pixels."""
     # cv2 draws with 16-bit coordinates internally: far-away corners are clipped to a frame around the photo.
     clipped = np.clip(points, -4 * max(canvas.shape), 5 * max(canvas.shape)).astype(np.int32)

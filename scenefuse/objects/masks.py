@@ -9,12 +9,14 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.spatial import Delaunay
 
 from scenefuse.fiducials import locate
 from scenefuse.objects.box import Ground, find_ground, in_hull, span, upright_box
 from scenefuse.objects.frames import original_sizes
 from scenefuse.objects.grabcut import (
     cleaned,
+    fill_hull,
     first_trimap,
     grabcut,
     learn_colours,
@@ -77,8 +79,8 @@ class _Object:
         box: where it is.
         ground: under which nothing belongs to it.
         ground_found: whether the ground was measured; otherwise it is the box's bottom.
-        spanning: (N, 3) points on the object that span it.
-        prompts: (M, 3) those of them that a person clicked.
+        spanning: (N, 3) points on the object that span it: the prompts.
+        parts: (K, 4) rows of them whose tetrahedron is taken for object.
         sparse: (P, 3) sparse points.
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
     """
@@ -87,7 +89,7 @@ class _Object:
     ground: Ground
     ground_found: bool
     spanning: Array
-    prompts: Array
+    parts: NDArray[np.intp]
     sparse: Array
     kind: NDArray[np.int8]
 
@@ -150,7 +152,7 @@ def make_masks(
         final = first
     else:
         points = _prompt_points(prompts, sfm, photos, settings)
-        target = _object_from_points(points, sparse, up, settings, seed)
+        target = _object_from_points(points, frames, sparse, up, settings, seed)
         print(f"{np.sum(target.kind > 0)} sparse points on the object, {np.sum(target.kind < 0)} not", flush=True)
         if method == "sam2":
             encoder = check_weights(sam2_encoder, settings.sam2_encoder_sha256, "encoder")
@@ -159,8 +161,8 @@ def make_masks(
             first = [_sam2_mask(network, target, f, settings) for f in frames]
         else:
             first = _grabcut_masks(target, frames, settings)
-        # The first masks miss parts in many photos: their hull lets three times as many of them disagree.
-        hull = _carve(target, frames, first, settings, 3 * settings.hull_tolerance)
+        # The first masks are made photo by photo: their hull lets twice as many of them disagree.
+        hull = _carve(target, frames, first, settings, 2 * settings.hull_tolerance)
         final = first
         for _ in range(2 if method == "grabcut" else 1):
             if method == "grabcut":
@@ -187,7 +189,7 @@ def make_masks(
         files = manifest(folder)
     with atomic_file(contact_sheet) as path:
         cv2.imwrite(str(path), _contact_sheet(frames, final, after, dropped))
-    photos = {
+    per_photo = {
         f.name: {"area": round(float(m.mean()), 5), "agreement": round(a, 4), "first_agreement": round(b, 4)}
         for f, m, a, b in zip(frames, final, after, before)
     }
@@ -202,7 +204,7 @@ def make_masks(
             "ground": quantity("measured" if target.ground_found else "not found; bottom of the box", ""),
             "hull_voxel": quantity(hull.voxel, "object units"),
             "dropped": dropped,
-            "per_photo": photos,
+            "per_photo": per_photo,
             "files": files,
         },
     )
@@ -251,12 +253,15 @@ def _prompt_points(prompts: Path | None, sfm: Path, photos: Path, settings: Mask
     return points
 
 
-def _object_from_points(points: Array, sparse: Array, up: Array, settings: MaskSettings, seed: int) -> _Object:
+def _object_from_points(
+    points: Array, frames: list[Frame], sparse: Array, up: Array, settings: MaskSettings, seed: int
+) -> _Object:
     """Box, ground and the kind of each sparse point, from (N, 3) points that span the object.
 
     A sparse point is on the object when it lies above the ground in the convex hull of the points, grown
-    by half the margin; not on it when
-    outside the box or below the ground; in between nobody knows.
+    by a quarter of the margin; not on it when outside the hull grown by the whole margin, or below the ground; in
+    between nobody knows. Nobody knows either of a point of two photos: two rays that are mismatched along their
+    epipolar lines meet somewhere all the same.
     """
     box = upright_box(points, up, settings.box_margin)
     x_in_box = box.to_box(sparse)
@@ -269,7 +274,17 @@ def _object_from_points(points: Array, sparse: Array, up: Array, settings: MaskS
     if found:
         kind[height < 0.5 * margin] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > margin)] = 1
-    return _Object(box, ground, found, points, points, sparse, kind)
+    kind[np.bincount(np.concatenate([f.point_rows for f in frames]), minlength=len(sparse)) < 3] = 0
+    return _Object(box, ground, found, points, _parts(points, 0.12 * box.diagonal), sparse, kind)
+
+
+def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:
+    """(K, 4) rows of (N, 3) prompts, tetrahedra with short edges: close clicks mark the corners of a small part."""
+    if len(points) < 5:
+        return np.empty((0, 4), dtype=np.intp)
+    corners = Delaunay(points, qhull_options="Qbb Qc QJ").simplices.astype(np.intp)
+    edges = np.linalg.norm(points[corners][:, :, None] - points[corners][:, None], axis=-1)
+    return corners[edges.max((1, 2)) < max_edge]
 
 
 def _object_from_masks(
@@ -290,7 +305,7 @@ def _object_from_masks(
     axes = upright_box(own, up, 0.0)
     x = axes.to_box(own)
     low, high = np.percentile(x, [0.5, 99.5], axis=0)
-    return _object_from_points(own[((x >= low) & (x <= high)).all(1)], sparse, up, settings, seed)
+    return _object_from_points(own[((x >= low) & (x <= high)).all(1)], frames, sparse, up, settings, seed)
 
 
 def _grabcut_masks(target: _Object, frames: list[Frame], settings: MaskSettings) -> list[Mask]:
@@ -319,22 +334,18 @@ def _outline(target: _Object, frame: Frame, settings: MaskSettings) -> Array:
 
 
 def _stamp(trimap: NDArray[np.uint8], target: _Object, frame: Frame) -> None:
-    """Mark what the sparse points that a photo sees make certain, and the prompts.
+    """Mark what the sparse points that a photo sees make certain, the prompts, and what close prompts enclose.
 
     A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
     """
-    pixels, depth = frame.project(target.prompts)
     height, width = trimap.shape
-    shown = (depth > 0) & ((pixels >= 0) & (pixels < [width, height])).all(1)
     rows = frame.point_rows
-    stamp_seeds(
-        trimap,
-        np.concatenate([frame.observed, pixels[shown]]),
-        np.concatenate([target.sparse[rows], target.prompts[shown]]),
-        np.concatenate([target.kind[rows], np.ones(shown.sum(), np.int8)]),
-        0.003 * width,
-        0.06 * target.box.diagonal,
-    )
+    radius, diagonal = 0.003 * width, target.box.diagonal
+    stamp_seeds(trimap, frame.observed, target.sparse[rows], target.kind[rows], radius, 0.06 * diagonal)
+    pixels, depth = frame.project(target.spanning)
+    for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
+        if (depth[part] > 0).all():
+            fill_hull(trimap, pixels[part], cv2.GC_FGD)
 
 
 def _sam2_mask(network: Sam2, target: _Object, frame: Frame, settings: MaskSettings) -> Mask:

@@ -176,7 +176,7 @@ def plane_sweep(
     """Score every depth hypothesis of one photo by normalised cross-correlation with its sources (Collins 1996).
 
     The score is the mean over the better half of the sources, which ignores those where the point is hidden. A
-    hypothesis that leaves the silhouette of a source is outside the visual hull and scores -1.
+    hypothesis that leaves the silhouettes of two sources (one may be wrong) is outside the visual hull and scores -1.
 
     Args:
         image: (1, 1, H, W) grey photo, possibly cut out of a larger one.
@@ -210,6 +210,6 @@ def plane_sweep(
         spread_s = (squares - mean_s**2).clamp_min(1e-6)
         score = (products - mean_t * mean_s) / torch.sqrt(spread_t * spread_s)
         best = torch.where(seen, score, torch.full_like(score, -1.0)).topk(max(1, (count + 1) // 2), 0).values.mean(0)
-        outside = (seen & (hull < 0.5)).any(0)
+        outside = (seen & (hull < 0.5)).sum(0) >= min(2, count)
         scores.append(torch.where(outside, torch.full_like(best, -1.0), best)[0])
     return torch.stack(scores)
