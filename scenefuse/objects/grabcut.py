@@ -86,7 +86,7 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     Args:
         outline: the hull as the photo sees it.
         mask: the photo's own mask.
-        evidence: (H, W) log ratio of the colour's densities; it can overrule one of the two, not both.
+        evidence: (H, W) log ratio of the colour's densities; where it is strong it overrules both.
         band_px: half width of the band along the outline that is never certain.
     """
     inner = ndimage.distance_transform_edt(outline)

@@ -11,7 +11,7 @@ import pytest
 from scenefuse.objects.box import find_ground, upright_box
 from scenefuse.objects.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.objects.hull import Frame, agreement, carve, silhouette
-from scenefuse.objects.masks import MaskSettings, make_masks
+from scenefuse.objects.masks import MaskSettings, _object_from_points, _stamp, make_masks
 from scenefuse.objects.sam2 import check_weights
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
 
@@ -236,7 +236,8 @@ def test_labels_where_hull_mask_and_seeds_meet():
     mask[10:50, 30:50] = False
     evidence = np.where(np.arange(60)[:, None] < 30, 1.0, -1.0) * np.ones((60, 60))
     trimap = second_trimap(outline, mask, evidence.astype(np.float32), 3)
-    assert trimap[30, 20] == cv2.GC_FGD
+    assert trimap[20, 20] == cv2.GC_FGD
+    assert trimap[40, 20] == cv2.GC_PR_FGD
     assert trimap[20, 40] == cv2.GC_PR_FGD
     assert trimap[40, 40] == cv2.GC_PR_BGD
     assert trimap[2, 2] == cv2.GC_BGD
@@ -249,3 +250,35 @@ def test_labels_where_hull_mask_and_seeds_meet():
     labels[:] = cv2.GC_PR_BGD
     stamp_seeds(labels, pixels, positions, np.array([1, 1, 1, -1], np.int8), 1.0, 0.5)
     assert labels[26, 30] == cv2.GC_PR_BGD
+
+
+def test_strong_colours_overrule_hull_and_mask():
+    both = np.zeros((60, 60), dtype=bool)
+    both[10:50, 10:50] = True
+    evidence = np.full((60, 60), 3.0, np.float32)
+    evidence[20:40, 20:40] = -3.0
+    trimap = second_trimap(both, both, evidence, 4)
+    assert trimap[30, 30] == cv2.GC_PR_BGD
+    assert trimap[15, 30] == cv2.GC_FGD
+    assert trimap[7, 30] == cv2.GC_PR_FGD
+    assert trimap[0, 30] == cv2.GC_BGD
+
+
+def test_close_prompts_fill_their_part_and_points_of_two_photos_have_no_say():
+    cube = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (0, 0.2)])
+    prompts = np.concatenate([cube, [[1, 0, 2], [-1, 0, 2], [0, 1, 2], [0, -1, 2], [0, 0, 3.0]]])
+    sparse = np.array([[0, 0, 2.0], [0, 0, 2.1], [0, 4, 1.0], [0, 4, 1.5]])
+    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    blank = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    frames = []
+    for k in range(3):
+        rows = np.array([0, 2]) if k == 2 else np.arange(4)
+        frame = Frame(f"{k}", blank, intrinsics, camera_pose(k), np.empty((0, 2)), rows)
+        frames.append(dataclasses.replace(frame, observed=frame.project(sparse[rows])[0]))
+    target = _object_from_points(prompts, frames, sparse, np.array([0, 0, 1.0]), SETTINGS, 0)
+    assert target.kind.tolist() == [1, 0, -1, 0]
+    trimap = np.full((HEIGHT, WIDTH), cv2.GC_PR_BGD, np.uint8)
+    _stamp(trimap, target, frames[0])
+    for point, label in (([0, 0, 0.1], cv2.GC_FGD), ([0.5, 0, 1.0], cv2.GC_PR_BGD), ([0, 0, 3.0], cv2.GC_FGD)):
+        x, y = frames[0].project(np.array([point]))[0][0].astype(int)
+        assert trimap[y, x] == label
