@@ -17,10 +17,11 @@ def project(tmp_path):
     return write
 
 
+START_B = "class C:\n    a: int = 0\n    '''An attribute.'''\n\n\ndef g():\n    import lib.late\n    return 1\n"
 START = {
     "scripts__s": "from lib.a import f\nf()\n",
     "lib__a": "from . import b\ndef f():\n    '''Doc.'''\n    return b.g()\n",
-    "lib__b": "class C:\n    a: int = 0\n    '''An attribute.'''\n\n\ndef g():\n    import lib.late\n    return 1\n",
+    "lib__b": START_B,
     "lib__late": "x = 1\n",
     "lib__unused": "y = 1\n",
 }
@@ -31,7 +32,11 @@ START = {
     [
         {"lib__a": "from . import b\n\n\n# why\ndef f():\n    '''Other doc.'''\n    return b.g()  # because\n"},
         {"lib__unused": "y = 2\n"},
-        {"lib__b": "class C:\n    a: int = 0\n    '''Other words.'''\n\n\ndef g():\n    import lib.late\n    return (\n        1\n    )\n"},
+        {
+            "lib__b": START["lib__b"]
+            .replace("An attribute", "Other words")
+            .replace("return 1", "return (\n        1\n    )")
+        },
     ],
     ids=["comment and docstring", "module not imported", "formatting and attribute docstring"],
 )

@@ -13,11 +13,11 @@ from snakemake.exceptions import WorkflowError
 from scenefuse.fingerprint import fingerprint
 
 ROOT = Path(workflow.basedir)
-SCRIPTS = os.path.relpath(ROOT / "scripts")
 # Jobs find the project's package and this environment's Python without an installed package or an activated shell.
-os.environ["PYTHONPATH"] = str(ROOT)
-if str(Path(sys.executable).parent) not in os.environ["PATH"].split(":"):
-    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+os.environ.update(
+    PYTHONPATH=str(ROOT),
+    PATH=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}",
+)
 
 
 def check(content, schema, where):
@@ -140,9 +140,14 @@ def optional(path):
     return [path] if path else []
 
 
-def code(script):
-    """Fingerprint of everything that a script can reach, for `params:`."""
-    return fingerprint(ROOT / "scripts" / script, ROOT)
+def script(name):
+    """Path of a stage's script, from the working directory."""
+    return os.path.relpath(ROOT / "scripts" / name)
+
+
+def code(name):
+    """Fingerprint of everything that a script can reach."""
+    return fingerprint(ROOT / "scripts" / name, ROOT)
 
 
 def flags(settings):
@@ -155,3 +160,109 @@ def flags(settings):
             for item in (value if isinstance(value, list) else [value])
         ]
     return " ".join(words)
+
+
+def scene_photos(wildcards):
+    """The photos of a scene."""
+    return photos_in(
+        scene_row(wildcards.scene)["photos"],
+        f"{config['scenes']}, scene '{wildcards.scene}'",
+    )
+
+
+def scene_folder(wildcards):
+    """Their folder, for a command line."""
+    return shlex.quote(scene_row(wildcards.scene)["photos"])
+
+
+def object_photos(wildcards):
+    """The photos, or the video, of an object."""
+    return photos_in(
+        object_row(wildcards.object)["photos"],
+        f"{config['objects']}, object '{wildcards.object}'",
+    )
+
+
+def object_source(wildcards):
+    """Their folder, or the video, for a command line."""
+    return shlex.quote(object_row(wildcards.object)["photos"])
+
+
+def mask_inputs(wildcards):
+    """What the masks of an object are made from: your own masks, or prompts and perhaps weights."""
+    row = object_row(wildcards.object)
+    if row.get("masks"):
+        return photos_in(
+            row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
+        )
+    if not row.get("prompts"):
+        raise WorkflowError(
+            f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
+        )
+    weights = config["object"]["masks"]
+    return [row["prompts"]] + (
+        [weights["sam2_encoder"], weights["sam2_decoder"]]
+        if weights["method"] == "sam2"
+        else []
+    )
+
+
+def mask_options(wildcards):
+    """Settings of the masks; your own masks beat any method."""
+    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    if row.get("masks"):
+        return flags(
+            settings | {"method": "supplied", "supplied": row["masks"], "prompts": None}
+        )
+    return flags(settings | {"supplied": None, "prompts": row.get("prompts") or None})
+
+
+def arm_options(part):
+    """Params function: the settings of one step of an arm."""
+    return lambda wildcards: flags(ARMS[wildcards.arm][part])
+
+
+def fiducials(wildcards):
+    """The points that bound an object in its scene."""
+    return object_row(wildcards.object)["fiducials"]
+
+
+def results_of(wildcards):
+    """Everything that the summary reads: what the last stage of each scene and object writes, and the truth where it is known."""
+    ends = [
+        "metrics.json",
+        "fusion.json",
+        "frames.json",
+        *(f"registration/{arm}/metrics.json" for arm in ARMS),
+    ]
+    files = [f"results/scenes/{name}/dense_cloud.json" for name in SCENES]
+    files += [f"results/objects/{name}/{end}" for name in OBJECTS for end in ends]
+    files += [
+        f"results/scenes/{name}/truth.json"
+        for name, row in SCENES.items()
+        if row.get("truth")
+    ]
+    files += [
+        f"results/objects/{name}/truth.json"
+        for name, row in OBJECTS.items()
+        if row.get("truth")
+    ]
+    return files
+
+
+def crops_of(wildcards):
+    """The crops of all objects of a scene."""
+    return [
+        f"results/objects/{name}/registration/full/crop.ply"
+        for name, row in OBJECTS.items()
+        if row["scene"] == wildcards.scene
+    ]
+
+
+def summary_command(log):
+    """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
+    return (
+        f"python {script('summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
+        f" --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)} --arms {' '.join(ARMS)}"
+        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary &> {log}"
+    )

@@ -27,11 +27,12 @@ rule demo_scene:
     params:
         options=flags(config["demo"]["flight"]),
         seed=config["seed"],
+        script=script("demo_scene.py"),
         code=code("demo_scene.py"),
     message:
         "Demo {wildcards.scene}: rendering the flight"
     shell:
-        "exec python {SCRIPTS}/demo_scene.py --photos {output.photos} --truth {output.truth} --seed {params.seed}"
+        "exec python {params.script} --photos {output.photos} --truth {output.truth} --seed {params.seed}"
         " {params.options} &> {log}"
 
 
@@ -55,11 +56,12 @@ rule demo_object:
     params:
         options=flags(config["demo"]["orbit"]),
         seed=config["seed"],
+        script=script("demo_object.py"),
         code=code("demo_object.py"),
     message:
         "Demo {wildcards.scene}: rendering the photos around the {wildcards.object}"
     shell:
-        "exec python {SCRIPTS}/demo_object.py --name {wildcards.object} --photos {output.photos} --truth {output.truth}"
+        "exec python {params.script} --name {wildcards.object} --photos {output.photos} --truth {output.truth}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
@@ -83,11 +85,12 @@ rule demo_fiducials:
     params:
         options=flags(config["demo"]["fiducials"]),
         seed=config["seed"],
+        script=script("demo_clicks.py"),
         code=code("demo_clicks.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in the flight's photos"
     shell:
-        "exec python {SCRIPTS}/demo_clicks.py --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
+        "exec python {params.script} --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
         " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"
 
 
@@ -111,9 +114,10 @@ rule demo_prompts:
     params:
         options=flags(config["demo"]["prompts"]),
         seed=config["seed"],
+        script=script("demo_clicks.py"),
         code=code("demo_clicks.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
     shell:
-        "exec python {SCRIPTS}/demo_clicks.py --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
+        "exec python {params.script} --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
         " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"

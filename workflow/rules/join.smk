@@ -9,15 +9,6 @@
 # by the same scripts, with the settings that config `arms` lays over config `registration`, and measured at the same thresholds.
 
 
-def arm_options(part):
-    """Params function: the settings of one step of an arm."""
-    return lambda wildcards: flags(ARMS[wildcards.arm][part])
-
-
-def fiducials(wildcards):
-    return object_row(wildcards.object)["fiducials"]
-
-
 rule crop:
     """Cut the object's surroundings out of the scene by its fiducials (paper 3.3)."""
     input:
@@ -39,11 +30,12 @@ rule crop:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         options=arm_options("crop"),
+        script=script("crop.py"),
         code=code("crop.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: crop"
     shell:
-        "exec python {SCRIPTS}/crop.py --scene {input.scene} --model {input.model} --fiducials {input.fiducials}"
+        "exec python {params.script} --scene {input.scene} --model {input.model} --fiducials {input.fiducials}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
@@ -68,11 +60,12 @@ rule scale:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         options=arm_options("scale"),
+        script=script("scale.py"),
         code=code("scale.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: scale"
     shell:
-        "exec python {SCRIPTS}/scale.py --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
         " --report {output} {params.options} &> {log}"
 
 
@@ -100,11 +93,12 @@ rule coarse:
     params:
         options=arm_options("coarse"),
         seed=config["seed"],
+        script=script("coarse.py"),
         code=code("coarse.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: coarse registration"
     shell:
-        "exec python {SCRIPTS}/coarse.py --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
         " --scale {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -139,11 +133,12 @@ rule fine:
     params:
         options=arm_options("fine"),
         seed=config["seed"],
+        script=script("fine.py"),
         code=code("fine.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: fine registration"
     shell:
-        "exec python {SCRIPTS}/fine.py --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
         " --scale {input.scale} --coarse {input.coarse} --fine {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
 
@@ -174,11 +169,12 @@ rule fuse:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=flags(config["fusion"]),
+        script=script("fuse.py"),
         code=code("fuse.py"),
     message:
         "{wildcards.object}: fusion"
     shell:
-        "exec python {SCRIPTS}/fuse.py --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-report {input.crop_json}"
+        "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-report {input.crop_json}"
         " --fine {input.fine} --georeference {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
         " --fused-laz {output.laz} --report {output.report} {params.options} &> {log}"
 
@@ -201,11 +197,12 @@ rule frame_ledger:
         mem_mb=lambda wildcards, attempt: 500 * attempt,
         runtime=lambda wildcards, attempt: 10 * attempt,
     params:
+        script=script("frame_ledger.py"),
         code=code("frame_ledger.py"),
     message:
         "{wildcards.object}: frame ledger"
     shell:
-        "exec python {SCRIPTS}/frame_ledger.py --object-report {input.cloud} --fine {input.fine} --georeference {input.georeference}"
+        "exec python {params.script} --object-report {input.cloud} --fine {input.fine} --georeference {input.georeference}"
         " --frames {output} &> {log}"
 
 
@@ -232,11 +229,12 @@ rule metrics:
     params:
         options=flags(config["metrics"]),
         seed=config["seed"],
+        script=script("metrics.py"),
         code=code("metrics.py"),
     message:
         "{wildcards.object}: metrics"
     shell:
-        "exec python {SCRIPTS}/metrics.py --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
         " --fused {input.fused} --metrics {output} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -262,9 +260,10 @@ rule arm_metrics:
     params:
         options=flags(config["metrics"]),
         seed=config["seed"],
+        script=script("metrics.py"),
         code=code("metrics.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: metrics"
     shell:
-        "exec python {SCRIPTS}/metrics.py --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
         " --fused None --metrics {output} --seed {params.seed} {params.options} &> {log}"

@@ -13,44 +13,6 @@
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
-def object_photos(wildcards):
-    return photos_in(
-        object_row(wildcards.object)["photos"],
-        f"{config['objects']}, object '{wildcards.object}'",
-    )
-
-
-def object_source(wildcards):
-    return shlex.quote(object_row(wildcards.object)["photos"])
-
-
-def mask_inputs(wildcards):
-    row = object_row(wildcards.object)
-    if row.get("masks"):
-        return photos_in(
-            row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
-        )
-    if not row.get("prompts"):
-        raise WorkflowError(
-            f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
-        )
-    weights = config["object"]["masks"]
-    return [row["prompts"]] + (
-        [weights["sam2_encoder"], weights["sam2_decoder"]]
-        if weights["method"] == "sam2"
-        else []
-    )
-
-
-def mask_options(wildcards):
-    row, settings = object_row(wildcards.object), config["object"]["masks"]
-    if row.get("masks"):
-        return flags(
-            settings | {"method": "supplied", "supplied": row["masks"], "prompts": None}
-        )
-    return flags(settings | {"supplied": None, "prompts": row.get("prompts") or None})
-
-
 rule frames:
     """Frames from a folder of photos or a video."""
     input:
@@ -70,11 +32,12 @@ rule frames:
     params:
         source=object_source,
         options=flags(config["object"]["frames"]),
+        script=script("frames.py"),
         code=code("frames.py"),
     message:
         "{wildcards.object}: frames"
     shell:
-        "exec python {SCRIPTS}/frames.py --source {params.source} --frames {output.frames} --photos {output.photos} {params.options} &> {log}"
+        "exec python {params.script} --source {params.source} --frames {output.frames} --photos {output.photos} {params.options} &> {log}"
 
 
 rule object_features:
@@ -96,11 +59,12 @@ rule object_features:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=flags(config["object"]["features"]),
+        script=script("features.py"),
         code=code("features.py"),
     message:
         "{wildcards.object}: features"
     shell:
-        "exec python {SCRIPTS}/features.py --folder {input.frames} --photos {input.photos} --features {output} {params.options} &> {log}"
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --features {output} {params.options} &> {log}"
 
 
 rule object_matches:
@@ -124,11 +88,12 @@ rule object_matches:
     params:
         options=flags(config["object"]["matches"]),
         seed=config["seed"],
+        script=script("matches.py"),
         code=code("matches.py"),
     message:
         "{wildcards.object}: matching"
     shell:
-        "exec python {SCRIPTS}/matches.py --photos {input.photos} --features {input.features} --database {output.database}"
+        "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
         " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -154,11 +119,12 @@ rule object_sfm:
     params:
         options=flags(config["object"]["sparse"]),
         seed=config["seed"],
+        script=script("sparse.py"),
         code=code("sparse.py"),
     message:
         "{wildcards.object}: cameras and sparse points"
     shell:
-        "exec python {SCRIPTS}/sparse.py --folder {input.frames} --photos {input.photos} --database {input.database}"
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --database {input.database}"
         " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -183,11 +149,12 @@ rule cameras:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         options=flags(config["object"]["cameras"]),
+        script=script("cameras.py"),
         code=code("cameras.py"),
     message:
         "{wildcards.object}: undistorting"
     shell:
-        "exec python {SCRIPTS}/cameras.py --folder {input.frames} --photos {input.photos} --sparse {input.model}"
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --sparse {input.model}"
         " --cameras {output.cameras} --report {output.report} {params.options} &> {log}"
 
 
@@ -220,11 +187,12 @@ rule masks:
     params:
         options=mask_options,
         seed=config["seed"],
+        script=script("masks.py"),
         code=code("masks.py"),
     message:
         "{wildcards.object}: masks"
     shell:
-        "exec python {SCRIPTS}/masks.py --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm} --photos {input.photos}"
+        "exec python {params.script} --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm} --photos {input.photos}"
         " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -253,11 +221,12 @@ rule stage1:
         options=flags(config["object"]["stage1"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
+        script=script("depth.py"),
         code=code("depth.py"),
     message:
         "{wildcards.object}: stage 1, depth and pose networks"
     shell:
-        "exec python {SCRIPTS}/depth.py --cameras {input.cameras} --masks {input.masks} --stage {output.stage} --report {output.report}"
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stage {output.stage} --report {output.report}"
         " --checkpoints {params.checkpoints} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -288,11 +257,12 @@ rule stage2:
         options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
+        script=script("train_nerf.py"),
         code=code("train_nerf.py"),
     message:
         "{wildcards.object}: stage 2, depth-guided NeRF"
     shell:
-        "exec python {SCRIPTS}/train_nerf.py --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous None"
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous None"
         " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}"
         " --seed {params.seed} {params.options} &> {log}"
 
@@ -326,11 +296,12 @@ rule stage3:
         options=flags(config["object"]["stage3"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage3",
         seed=config["seed"],
+        script=script("feedback.py"),
         code=code("feedback.py"),
     message:
         "{wildcards.object}: stage 3, feedback"
     shell:
-        "exec python {SCRIPTS}/feedback.py --cameras {input.cameras} --masks {input.masks} --previous {input.previous}"
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --previous {input.previous}"
         " --rendered {input.rendered} --stage {output.stage} --report {output.report}"
         " --checkpoints {params.checkpoints} --seed {params.seed} {params.options} &> {log}"
 
@@ -364,11 +335,12 @@ rule stage4:
         options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
+        script=script("train_nerf.py"),
         code=code("train_nerf.py"),
     message:
         "{wildcards.object}: stage 4, final NeRF"
     shell:
-        "exec python {SCRIPTS}/train_nerf.py --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous {input.nerf}"
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous {input.nerf}"
         " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}"
         " --seed {params.seed} {params.options} &> {log}"
 
@@ -398,10 +370,11 @@ rule object_cloud:
     params:
         options=flags(config["object"]["cloud"]),
         seed=config["seed"],
+        script=script("object_cloud.py"),
         code=code("object_cloud.py"),
     message:
         "{wildcards.object}: cloud"
     shell:
-        "exec python {SCRIPTS}/object_cloud.py --cameras {input.cameras} --cameras-report {input.cameras_json} --masks {input.masks}"
+        "exec python {params.script} --cameras {input.cameras} --cameras-report {input.cameras_json} --masks {input.masks}"
         " --stage {input.stage} --stage-report {input.stage_json} --cloud {output.cloud} --report {output.report}"
         " --seed {params.seed} {params.options} &> {log}"

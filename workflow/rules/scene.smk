@@ -9,17 +9,6 @@
 #           results/scenes/{scene}/dense.ply, dense_cloud.json           the cloud
 
 
-def scene_photos(wildcards):
-    return photos_in(
-        scene_row(wildcards.scene)["photos"],
-        f"{config['scenes']}, scene '{wildcards.scene}'",
-    )
-
-
-def scene_folder(wildcards):
-    return shlex.quote(scene_row(wildcards.scene)["photos"])
-
-
 CHUNKS = range(config["scene"]["chunks"])
 
 
@@ -40,11 +29,12 @@ rule scene_photos:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         folder=scene_folder,
+        script=script("photos.py"),
         code=code("photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
     shell:
-        "exec python {SCRIPTS}/photos.py --folder {params.folder} --photos {output} &> {log}"
+        "exec python {params.script} --folder {params.folder} --photos {output} &> {log}"
 
 
 rule scene_features:
@@ -67,11 +57,12 @@ rule scene_features:
     params:
         folder=scene_folder,
         options=flags(config["scene"]["features"]),
+        script=script("features.py"),
         code=code("features.py"),
     message:
         "Scene {wildcards.scene}: features"
     shell:
-        "exec python {SCRIPTS}/features.py --folder {params.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
+        "exec python {params.script} --folder {params.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
 
 
 rule scene_matches:
@@ -95,11 +86,12 @@ rule scene_matches:
     params:
         options=flags(config["scene"]["matches"]),
         seed=config["seed"],
+        script=script("matches.py"),
         code=code("matches.py"),
     message:
         "Scene {wildcards.scene}: matching"
     shell:
-        "exec python {SCRIPTS}/matches.py --photos {input.photos} --features {input.features} --database {output.database}"
+        "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
         " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -126,11 +118,12 @@ rule scene_sparse:
         folder=scene_folder,
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
+        script=script("sparse.py"),
         code=code("sparse.py"),
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
     shell:
-        "exec python {SCRIPTS}/sparse.py --folder {params.folder} --photos {input.photos} --database {input.database}"
+        "exec python {params.script} --folder {params.folder} --photos {input.photos} --database {input.database}"
         " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -155,11 +148,12 @@ rule georegister:
     params:
         options=flags(config["scene"]["georegister"]),
         seed=config["seed"],
+        script=script("georegister.py"),
         code=code("georegister.py"),
     message:
         "Scene {wildcards.scene}: georeferencing"
     shell:
-        "exec python {SCRIPTS}/georegister.py --sparse {input.model} --photos {input.photos} --georeferenced {output.model}"
+        "exec python {params.script} --sparse {input.model} --photos {input.photos} --georeferenced {output.model}"
         " --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -185,11 +179,12 @@ rule undistort:
     params:
         folder=scene_folder,
         options=flags(config["scene"]["undistort"]),
+        script=script("undistort.py"),
         code=code("undistort.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
     shell:
-        "exec python {SCRIPTS}/undistort.py --folder {params.folder} --sparse {input.model} --dense {output.workspace}"
+        "exec python {params.script} --folder {params.folder} --sparse {input.model} --dense {output.workspace}"
         " --report {output.report} {params.options} &> {log}"
 
 
@@ -216,11 +211,12 @@ rule depth_maps:
         options=flags(config["scene"]["depth_maps"]),
         chunks=len(CHUNKS),
         seed=config["seed"],
+        script=script("depth_maps.py"),
         code=code("depth_maps.py"),
     message:
         "Scene {wildcards.scene}: depth maps, chunk {wildcards.chunk}"
     shell:
-        "exec python {SCRIPTS}/depth_maps.py --workspace {input.workspace} --chunk {wildcards.chunk} --chunks {params.chunks}"
+        "exec python {params.script} --workspace {input.workspace} --chunk {wildcards.chunk} --chunks {params.chunks}"
         " --depth {output.depth} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -251,9 +247,10 @@ rule dense_cloud:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=flags(config["scene"]["dense_cloud"]),
+        script=script("dense_cloud.py"),
         code=code("dense_cloud.py"),
     message:
         "Scene {wildcards.scene}: dense cloud"
     shell:
-        "exec python {SCRIPTS}/dense_cloud.py --workspace {input.workspace} --depth {input.depth} --depth-reports {input.reports}"
+        "exec python {params.script} --workspace {input.workspace} --depth {input.depth} --depth-reports {input.reports}"
         " --cloud {output.cloud} --report {output.report} {params.options} &> {log}"

@@ -7,50 +7,6 @@
 TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects"]
 
 
-def results_of(wildcards):
-    """Everything that the summary reads: what the last stage of each scene and object writes, and the truth where it is known."""
-    scenes = [f"results/scenes/{name}/" for name in SCENES]
-    objects = [f"results/objects/{name}/" for name in OBJECTS]
-    known = [
-        f"results/scenes/{name}/truth.json"
-        for name, row in SCENES.items()
-        if row.get("truth")
-    ]
-    known += [
-        f"results/objects/{name}/truth.json"
-        for name, row in OBJECTS.items()
-        if row.get("truth")
-    ]
-    ends = [
-        "metrics.json",
-        "fusion.json",
-        "frames.json",
-        *(f"registration/{arm}/metrics.json" for arm in ARMS),
-    ]
-    return (
-        [scene + "dense_cloud.json" for scene in scenes]
-        + [object + end for object in objects for end in ends]
-        + known
-    )
-
-
-def crops_of(wildcards):
-    return [
-        f"results/objects/{name}/registration/full/crop.ply"
-        for name, row in OBJECTS.items()
-        if row["scene"] == wildcards.scene
-    ]
-
-
-def summary_command(log):
-    """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
-    return (
-        f"python {SCRIPTS}/summary.py --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
-        f" --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)} --arms {' '.join(ARMS)}"
-        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary &> {log}"
-    )
-
-
 rule evaluate_scene:
     """Judge a scene whose truth is known: cameras, georeferencing, dense cloud (G8)."""
     input:
@@ -72,11 +28,12 @@ rule evaluate_scene:
     params:
         options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
+        script=script("evaluate_scene.py"),
         code=code("evaluate_scene.py"),
     message:
         "Scene {wildcards.scene}: comparing with the truth"
     shell:
-        "exec python {SCRIPTS}/evaluate_scene.py --model {input.model} --georeference {input.georeference} --cloud {input.cloud}"
+        "exec python {params.script} --model {input.model} --georeference {input.georeference} --cloud {input.cloud}"
         " --truth {input.truth} --evaluation {output} --seed {params.seed} {params.options} &> {log}"
 
 
@@ -117,11 +74,12 @@ rule evaluate_object:
     params:
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
+        script=script("evaluate_object.py"),
         code=code("evaluate_object.py"),
     message:
         "{wildcards.object}: comparing with the truth"
     shell:
-        "exec python {SCRIPTS}/evaluate_object.py --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
         " --cloud {input.cloud} --arms {input.arms} --before {input.before} --after {input.after}"
         " --scene-evaluation {input.scene} --truth-scene {input.truth_scene} --truth-object {input.truth_object}"
         " --evaluation {output} --seed {params.seed} {params.options} &> {log}"
@@ -152,11 +110,12 @@ rule scene_figure:
         objects=lambda wildcards: [
             name for name, row in OBJECTS.items() if row["scene"] == wildcards.scene
         ],
+        script=script("scene_figure.py"),
         code=code("scene_figure.py"),
     message:
         "Scene {wildcards.scene}: figure"
     shell:
-        "exec python {SCRIPTS}/scene_figure.py --name {wildcards.scene} --dense {input.cloud} --georeferenced {input.model}"
+        "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} --georeferenced {input.model}"
         " --crops {input.crops} --objects {params.objects} --figure {output} &> {log}"
 
 
@@ -194,11 +153,12 @@ rule object_figures:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
+        script=script("object_figures.py"),
         code=code("object_figures.py"),
     message:
         "{wildcards.object}: figures"
     shell:
-        "exec python {SCRIPTS}/object_figures.py --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
+        "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
         " --crop {input.crop} --crop-report {input.crop_json} --object-cloud {input.cloud} --fine {input.fine}"
         " --metrics {input.metrics} --cameras {input.cameras} --masks {input.masks} --stage1 {input.stage1}"
         " --stage2 {input.stage2} --stage3 {input.stage3} --stage4 {input.stage4} --figures {output} &> {log}"
@@ -253,11 +213,12 @@ rule report_page:
     params:
         scenes=expand("results/scenes/{scene}", scene=SCENES),
         objects=expand("results/objects/{object}", object=OBJECTS),
+        script=script("report.py"),
         code=code("report.py"),
     message:
         "Summary: report page"
     shell:
-        "exec python {SCRIPTS}/report.py --summary results/summary --scenes {params.scenes} --objects {params.objects}"
+        "exec python {params.script} --summary results/summary --scenes {params.scenes} --objects {params.objects}"
         " --title scenefuse --report {output} &> {log}"
 
 
