@@ -1,9 +1,9 @@
-# make demo | test | lint | bench | report | docs | clean      (CORES=2 by default, PYTHON=python3)
+# make demo | test | lint | report | docs | clean      (CORES=2 by default, PYTHON=python3)
 CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo test lint bench report docs clean
+.PHONY: demo test lint report docs clean
 
 demo: .venv/ready
 	snakemake --cores $(CORES)

@@ -16,7 +16,8 @@ missing=()
 for package in "${PACKAGES[@]}"; do
     case $package in
         python3-venv) "$PYTHON" -c 'import ensurepip' 2>/dev/null || missing+=("$package") ;;
-        *) dpkg-query -W -f '${Status}\n' "$package" "${package}t64" 2>/dev/null | grep -q '^install ok installed' || missing+=("$package") ;;
+        # Ubuntu 24.04 renamed some of them with a t64 suffix.
+        *) [[ $(dpkg-query -W -f '${Status}\n' "$package" "${package}t64" 2>/dev/null || true) == *"ok installed"* ]] || missing+=("$package") ;;
     esac
 done
 if [ ${#missing[@]} -gt 0 ]; then
