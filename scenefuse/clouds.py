@@ -127,11 +127,11 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
 
 
 def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
-    """Write LAZ 1.4: coordinates are `origin` plus the cloud's positions, to a thousandth of the unit.
+    """Write LAZ 1.4, coordinates to a millimetre; without a CRS to 1e-8 of the cloud's diagonal.
 
     Args:
         path: output, .laz or .las.
-        cloud: with the axes of the CRS, relative to `origin`.
+        cloud: with the axes of the CRS, relative to `origin`, which is added.
         origin: (3,) coordinates of the cloud's local origin.
         crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
     """
@@ -139,7 +139,8 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
     import pyproj
 
     header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales, header.offsets = np.full(3, 0.001), np.floor(origin)
+    step = 0.001 if crs is not None else max(cloud.diagonal, 1e-300) * 1e-8
+    header.scales, header.offsets = np.full(3, step), np.floor(origin)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_user_input(crs))
     names = {"uint8": "u1", "int32": "i4", "float32": "f4", "float64": "f8", "uint16": "u2", "int64": "i8"}

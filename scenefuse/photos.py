@@ -81,6 +81,9 @@ def photo_names(folder: Path) -> list[str]:
             f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there "
             f"({len(files)} other files were found)"
         )
+    spaced = next((name for name in names if any(c.isspace() for c in name)), None)
+    if spaced is not None:
+        raise StageError(f"'{spaced}' in {folder} has a space in its name, which COLMAP's lists cannot hold; rename it")
     return names
 
 

@@ -143,8 +143,10 @@ def make_masks(
     cv2.setNumThreads(threads())
     frames, sparse = _read_frames(cameras)
     up = np.array(value(read_json(cameras_json), "up_in_camera_frame"), dtype=np.float64)
+    without: dict[str, str] = {}
     if method == "supplied":
         found = _supplied_masks(supplied, sfm, frames)
+        without = {f.name: "no mask was supplied" for f in frames if f.name not in found}
         frames = [f for f in frames if f.name in found]
         first = [found[f.name] for f in frames]
         target = _object_from_masks(frames, first, sparse, up, settings, seed)
@@ -173,7 +175,7 @@ def make_masks(
     outlines = [silhouette(hull, f) for f in frames]
     before = [agreement(m, o) for m, o in zip(first, outlines)]
     after = [agreement(m, o) for m, o in zip(final, outlines)]
-    dropped = _dropped(frames, final, after, settings)
+    dropped = without | _dropped(frames, final, after, settings)
     kept = [k for k, f in enumerate(frames) if f.name not in dropped]
     for name, reason in sorted(dropped.items()):
         print(f"{name} dropped: {reason}", flush=True)
@@ -199,7 +201,7 @@ def make_masks(
         {
             "method": quantity(method, ""),
             "masks": quantity(len(kept), "1"),
-            "photos": quantity(len(frames), "1"),
+            "photos": quantity(len(frames) + len(without), "1"),
             "median_agreement": quantity(float(np.median([after[k] for k in kept])), "1"),
             "ground": quantity("measured" if target.ground_found else "not found; bottom of the box", ""),
             "hull_voxel": quantity(hull.voxel, "object units"),

@@ -137,7 +137,7 @@ def train_nerf(
         "occupied_share": quantity(float(model.occupancy.occupied.float().mean()), "1"),
         "diagonal": quantity(diagonal, "object units"),
         **{f"loss_{name}": quantity(v, "1") for name, v in result.items() if name in _TERMS},
-        "psnr_training": quantity(result["psnr"], "dB"),
+        "psnr_training": quantity(result.get("psnr"), "dB"),
         **drift,
         "confident_share": quantity(float((confidence > CONFIDENT).sum() / views.masks.sum()), "1"),
     }

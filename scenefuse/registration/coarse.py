@@ -14,7 +14,7 @@ from scenefuse.registration.refine import ScaleRange, refine_points
 from scenefuse.registration.score import Score, score
 from scenefuse.registration.surface import Surface, prepare, probing
 from scenefuse.registration.upright import upright_hypotheses
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg, rotation_between
 
 MOST_POINTS = 6000
@@ -101,8 +101,6 @@ def register_coarsely(
         seed: of all random choices.
         settings: see CoarseSettings.
 
-    Raises:
-        StageError: no hypothesis was found at all.
     """
     start = time.perf_counter()
     cloud, scene = read_cloud(object), read_cloud(crop)
@@ -120,9 +118,9 @@ def register_coarsely(
     else:
         found = find_hypotheses(cloud, scene, scales, ups, settings, seed)
     if not found:
-        raise StageError(
-            f"no pose of {object} was found in {crop}; look at the crop: it may show too little of the object"
-        )
+        notes.append("no feature or heading gave a pose; the clouds' centres were laid on each other instead")
+        print(notes[-1], flush=True)
+        found = [_centred(cloud, scene, scales, ups, settings, seed)]
     seconds = time.perf_counter() - start
     for h in found:
         print(f"{h.source:8s} scale {h.pose.scale:.4g} score {h.score.total:.3f} F {h.score.f_score:.3f}", flush=True)
@@ -149,6 +147,23 @@ def known_ups(cameras: Path | None, crop_report: Path) -> tuple[Array, Array] | 
         return None
     a, b = np.array(up_in_object["value"], float), np.array(up_in_scene["value"], float)
     return a / np.linalg.norm(a), b / np.linalg.norm(b)
+
+
+def _centred(
+    cloud: Cloud,
+    scene: Cloud,
+    scales: ScaleRange,
+    ups: tuple[Array, Array] | None,
+    settings: CoarseSettings,
+    seed: int,
+) -> Hypothesis:
+    """The clouds' centres on each other, upright where gravity is known: a last resort that the gate has to judge."""
+    rotation = np.eye(3) if ups is None else rotation_between(*ups)
+    centre = scene.points.mean(0) - scales.centre * (rotation @ cloud.points.mean(0))
+    pose = Sim3(scales.centre, rotation, centre)
+    obj, target = prepare_both(cloud, scene, scales.centre, settings.score_fraction / 2, seed)
+    tau = settings.score_fraction * scene.diagonal
+    return Hypothesis(pose, "centres", score(obj, target, pose, tau, settings.recall_weight))
 
 
 def prepare_both(cloud: Cloud, scene: Cloud, scale: float, fraction: float, seed: int) -> tuple[Surface, Surface]:

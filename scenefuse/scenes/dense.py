@@ -158,19 +158,23 @@ def fuse_depth_maps(
         StageError: no depth maps, or no point on which enough photos agree.
     """
     model = _read_model(workspace)
-    maps = {p.name[: -len(".bin")]: p for folder in depth for p in sorted((folder / "depth_maps").glob("*.bin"))}
+    maps = {
+        p.relative_to(folder / "depth_maps").as_posix()[: -len(".bin")]: (folder, p)
+        for folder in depth
+        for p in sorted((folder / "depth_maps").rglob("*.bin"))
+    }
     if not maps:
         raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
     stages = [read_json(r) for r in depth_reports]
     backends = sorted({value(s, "backend") for s in stages})
     print(f"fusing {len(maps)} depth maps by {', '.join(backends)}", flush=True)
-    widths = {image.camera_id: _map_width(maps[image.name]) for image in model.images.values() if image.name in maps}
+    widths = {image.camera_id: _map_width(maps[image.name][1]) for image in model.images.values() if image.name in maps}
     with _workspace_of_links(workspace, model, lambda c: widths.get(c.camera_id, c.width)) as folder:
-        for name, path in maps.items():
+        for name, (folder_of_map, path) in maps.items():
             for kind in ("depth_maps", "normal_maps"):
                 link = folder / "stereo" / kind / f"{name}.geometric.bin"
                 link.parent.mkdir(parents=True, exist_ok=True)
-                link.symlink_to((path.parent.parent / kind / path.name).resolve())
+                link.symlink_to((folder_of_map / kind / path.relative_to(folder_of_map / "depth_maps")).resolve())
         (folder / "stereo" / "fusion.cfg").write_text("".join(f"{n}\n" for n in sorted(maps)))
         fused = _stereo_fusion(folder, settings)
     # COLMAP counts pixels, of which one photo may bring several; we count photos.
@@ -308,7 +312,7 @@ def _run_torch(
 
 def _read_photo(workspace: Path, model: pycolmap.Reconstruction, image: Any, size_px: int) -> Photo:
     """A photo in grey with its camera, its longer side at most size_px."""
-    gray = cv2.imread(str(workspace / "images" / image.name), cv2.IMREAD_GRAYSCALE)
+    gray = cv2.imread(str(workspace / "images" / image.name), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     if gray is None:
         raise StageError(f"{workspace}/images/{image.name} cannot be read; rerun the undistortion stage")
     photo = Photo(

@@ -22,7 +22,7 @@ _TABLES = {
 }
 _NOTES = {
     "scenes": "How many photos the scene model holds, how well it fits them, and the cloud that came out. Lengths are "
-    "in the unit named in the row: metres only where GPS or control points made it so.",
+    "in the unit named in the row: metres only where GPS made it so.",
     "objects": "PSNR (dB) and SSIM compare renders with photos that training never saw: higher is better. Depth error, "
     "accuracy, completeness and F-score exist only where the true surface is known.",
     "registration": "Fitness: share of object (source) or scene (target) points with a partner within the threshold. "

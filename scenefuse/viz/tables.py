@@ -205,8 +205,9 @@ def collect(folder: Path, arms: list[str], logs: Path) -> Collected:
     for arm in arms:
         prefix = f"truth.arms.{arm}."
         per_arm[arm] |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
-    wanted = ["object.json", *(f"registration/{arm}/fine.json" for arm in arms), "fused.ply", "metrics.json"]
-    missing = [name for name in wanted if not (folder / name).is_file()]
+    wanted = [f"{name}.json" for name in (*_OBJECT_FILES, "fusion", "metrics")]
+    wanted += [f"registration/{arm}/{name}.json" for arm in arms for name in _JOIN_FILES if name != "truth"]
+    missing = [name for name in wanted if not (folder / name).is_file()][:1]  # what comes later misses it too
     reason = (last_error(logs, folder.name) or "no error in its logs; it has not run yet") if missing else ""
     stages = read_fields(folder, _OBJECT_FILES) | of_object
     return Collected(folder.name, stages, per_arm, read_fields(folder, ("fusion",)), missing, reason)

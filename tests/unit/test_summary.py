@@ -96,7 +96,7 @@ def test_objects_and_scenes(results):
     objects = read(summary, "objects").set_index("object")
     assert objects.loc["house", "stage4_psnr_db"] == 27.5
     assert objects.loc["house", "stage1_depth_error_over_diagonal"] == 0.02
-    assert objects.loc["sculpture", "missing"].startswith("object.json")
+    assert objects.loc["sculpture", "missing"] == "photos.json"
     assert read(summary, "scenes").loc[0, "registered"] == 59
 
 

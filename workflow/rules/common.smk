@@ -46,7 +46,7 @@ def table(path, schema):
         raise WorkflowError(
             f"{path} does not exist; write it as config/README.md describes"
         )
-    with open(source, newline="") as file:
+    with open(source, newline="", encoding="utf-8-sig") as file:
         rows = list(
             csv.DictReader(
                 (line for line in file if not line.startswith("#")), delimiter="\t"
@@ -106,6 +106,16 @@ def scene_row(name):
     return SCENES[name]
 
 
+def scene_truth(name):
+    """The truth of the scene that an object with known truth lies in."""
+    truth = scene_row(name).get("truth")
+    if not truth:
+        raise WorkflowError(
+            f"{config['scenes']}: scene '{name}' has no truth, but an object in it has; fill both or neither"
+        )
+    return truth
+
+
 def object_row(name):
     if name not in OBJECTS:
         raise WorkflowError(
@@ -130,7 +140,7 @@ def photos_in(path, where):
         raise WorkflowError(
             f"{where}: the photos '{path}' do not exist; give a folder or a video, relative to {os.getcwd()}"
         )
-    return [str(file) for file in sorted(path.iterdir()) if file.is_file()] or [
+    return [str(file) for file in sorted(path.rglob("*")) if file.is_file()] or [
         str(path)
     ]
 

@@ -5,7 +5,7 @@
 #           results/demo/{scene}/{object}/photos/           an orbit of each object
 #           results/demo/{scene}/{object}/fiducials.tsv     what a person would click in the flight's photos
 #           results/demo/{scene}/{object}/prompts.tsv       what a person would click in the object's photos
-#           results/demo/{scene}/truth/                     cameras, surfaces, masks; read by evaluation only
+#           results/demo/{scene}/truth/                     cameras, surfaces, masks; read by evaluation, and by the clicks
 DEMO_OBJECTS = "house|balloon|sculpture"
 
 

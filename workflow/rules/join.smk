@@ -35,7 +35,7 @@ rule crop:
     message:
         "{wildcards.object}, arm {wildcards.arm}: crop"
     shell:
-        "exec python {params.script} --scene {input.scene} --model {input.model} --fiducials {input.fiducials}"
+        "exec python {params.script} --scene {input.scene} --model {input.model} --fiducials {input.fiducials:q}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 

@@ -227,7 +227,7 @@ rule stage1:
         "{wildcards.object}: stage 1, depth and pose networks"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stage {output.stage} --report {output.report}"
-        " --checkpoints {params.checkpoints} --seed {params.seed} {params.options} &> {log}"
+        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
 
 
 rule stage2:
@@ -263,7 +263,7 @@ rule stage2:
         "{wildcards.object}: stage 2, depth-guided NeRF"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous None"
-        " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}"
+        " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}/{params.code}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
@@ -303,7 +303,7 @@ rule stage3:
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --previous {input.previous}"
         " --rendered {input.rendered} --stage {output.stage} --report {output.report}"
-        " --checkpoints {params.checkpoints} --seed {params.seed} {params.options} &> {log}"
+        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
 
 
 rule stage4:
@@ -341,7 +341,7 @@ rule stage4:
         "{wildcards.object}: stage 4, final NeRF"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous {input.nerf}"
-        " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}"
+        " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}/{params.code}"
         " --seed {params.seed} {params.options} &> {log}"
 
 

@@ -13,7 +13,7 @@ rule evaluate_scene:
         model="results/scenes/{scene}/georeferenced",
         georeference="results/scenes/{scene}/georeference.json",
         cloud="results/scenes/{scene}/dense.ply",
-        truth=lambda wildcards: scene_row(wildcards.scene)["truth"],
+        truth=lambda wildcards: scene_truth(wildcards.scene),
     output:
         "results/scenes/{scene}/truth.json",
     log:
@@ -34,7 +34,7 @@ rule evaluate_scene:
         "Scene {wildcards.scene}: comparing with the truth"
     shell:
         "exec python {params.script} --model {input.model} --georeference {input.georeference} --cloud {input.cloud}"
-        " --truth {input.truth} --evaluation {output} --seed {params.seed} {params.options} &> {log}"
+        " --truth {input.truth:q} --evaluation {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule evaluate_object:
@@ -56,9 +56,7 @@ rule evaluate_object:
         before=in_scene("dense.ply"),
         after="results/objects/{object}/fused_scene.ply",
         scene=in_scene("truth.json"),
-        truth_scene=lambda wildcards: scene_row(object_row(wildcards.object)["scene"])[
-            "truth"
-        ],
+        truth_scene=lambda wildcards: scene_truth(object_row(wildcards.object)["scene"]),
         truth_object=lambda wildcards: object_row(wildcards.object)["truth"],
     output:
         "results/objects/{object}/truth.json",
@@ -81,7 +79,7 @@ rule evaluate_object:
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
         " --cloud {input.cloud} --arms {input.arms} --before {input.before} --after {input.after}"
-        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene} --truth-object {input.truth_object}"
+        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
         " --evaluation {output} --seed {params.seed} {params.options} &> {log}"
 
 
