@@ -163,7 +163,7 @@ def code(name):
 def flags(settings):
     """Settings as command line flags: {"max_size_px": 2000} -> --max-size-px 2000."""
     words = []
-    for key, value in settings.items():
+    for key, value in sorted(settings.items()):
         words.append(f"--{key.replace('_', '-')}")
         words += [
             shlex.quote(str(item))
