@@ -39,7 +39,7 @@ def test_the_object_is_registered_where_it_really_is(finished):
     fine = json.loads((finished / "results/objects/house/registration/full/fine.json").read_text())
     truth = json.loads((finished / "results/objects/house/truth.json").read_text())
     assert fine["status"]["value"] == "registered", fine["reason"]
-    # The tiny capture is coarse: this tells the right pose from a wrong one. The demo holds the accuracy (docs/results.md).
+    # The tiny capture is coarse: this tells the right pose from a wrong one; docs/results.md has the accuracy.
     assert abs(truth["scale_error_pct"]["value"]) <= 5.0
     assert truth["rotation_error_deg"]["value"] <= 5.0
     assert truth["translation_error_over_diagonal"]["value"] <= 0.05
