@@ -1,4 +1,4 @@
-"""Point clouds in memory and on disk: binary PLY with float64 positions, LAS and LAZ with a CRS."""
+"""Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement, PlyParseError
+from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
+from scenefuse.formats import COLOR, NORMAL, POSITION, bytes_of, read_columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 
@@ -86,28 +87,26 @@ def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> f
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read a PLY file.
+    """Read PLY, LAS, LAZ, E57, PCD, or text (XYZ, PTS, TXT, ASC, CSV). Rows without a finite position are left out.
 
     Raises:
-        StageError: the file is missing, is no PLY, or holds no points.
+        StageError: the file is missing, damaged, of an unknown ending, or holds no points.
     """
-    path = Path(path)
-    try:
-        vertex = PlyData.read(path)["vertex"].data
-    except FileNotFoundError:
-        raise StageError(f"{path} does not exist; give the path of a PLY cloud") from None
-    except (PlyParseError, KeyError, UnicodeDecodeError) as error:
-        raise StageError(f"{path} is not a readable PLY cloud ({error}); export it again as binary PLY") from None
-    if len(vertex) == 0:
-        raise StageError(f"{path} holds no points; look at the log of the stage that wrote it")
-    names = vertex.dtype.names
-    known = {"x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"}
-    has_normals, has_colors = {"nx", "ny", "nz"} <= set(names), {"red", "green", "blue"} <= set(names)
+    columns = read_columns(Path(path))
+    points = np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1)
+    finite = np.isfinite(points).all(1)
+    if not finite.all():
+        print(f"{path}: {np.sum(~finite)} of {len(points)} rows have no finite position and are left out", flush=True)
+        if not finite.any():
+            raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
+        points, columns = points[finite], {name: values[finite] for name, values in columns.items()}
+    normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
+    colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
     return Cloud(
-        np.stack([vertex[k] for k in ("x", "y", "z")], axis=1).astype(np.float64),
-        np.stack([vertex[k] for k in ("nx", "ny", "nz")], axis=1).astype(np.float32) if has_normals else None,
-        np.stack([vertex[k] for k in ("red", "green", "blue")], axis=1).astype(np.uint8) if has_colors else None,
-        {name: np.array(vertex[name]) for name in names if name not in known},
+        points,
+        None if normals is None else np.nan_to_num(normals.astype(np.float32)),
+        None if colors is None else bytes_of(colors),
+        {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
     )
 
 
@@ -118,7 +117,10 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
     if cloud.colors is not None:
         columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
-    columns |= cloud.fields
+    # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
+    columns |= {
+        name: v.astype(np.float64) if v.dtype in (np.int64, np.uint64) else v for name, v in cloud.fields.items()
+    }
     vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         vertex[name] = values
@@ -143,14 +145,15 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
     header.scales, header.offsets = np.full(3, step), np.floor(origin)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_user_input(crs))
-    names = {"uint8": "u1", "int32": "i4", "float32": "f4", "float64": "f8", "uint16": "u2", "int64": "i8"}
+    taken = set(header.point_format.dimension_names)
+    names = {name: (f"{name}_" if name in taken else name)[:32] for name in cloud.fields}  # LAS allows 32 letters
     for name, values in cloud.fields.items():
-        header.add_extra_dim(laspy.ExtraBytesParams(name=name, type=names[values.dtype.name]))
+        header.add_extra_dim(laspy.ExtraBytesParams(names[name], f"{values.dtype.kind}{values.dtype.itemsize}"))
     las = laspy.LasData(header)
     las.x, las.y, las.z = (cloud.points + origin).T
     if cloud.colors is not None:
         las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * 257
     for name, values in cloud.fields.items():
-        las[name] = values
+        las[names[name]] = values
     with atomic_file(path) as temporary:
         las.write(str(temporary))

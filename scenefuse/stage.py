@@ -23,7 +23,8 @@ class StageError(Exception):
 def run(function: Callable[..., Any]) -> None:
     """Run a stage function as a command line built from its signature and docstring.
 
-    A StageError ends in one sentence on stderr and exit status 1. SIGTERM and SIGINT unwind the stack, so that
+    A StageError ends in one sentence on stderr and exit status 1; a number that the function returns is the exit
+    status. SIGTERM and SIGINT unwind the stack, so that
     temporary outputs are removed; the process also gets SIGTERM when its parent dies.
     """
     import tyro
@@ -32,10 +33,12 @@ def run(function: Callable[..., Any]) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _exit_on_signal)
     try:
-        tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
+        status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
+    if isinstance(status, int):
+        sys.exit(status)
 
 
 def threads() -> int:

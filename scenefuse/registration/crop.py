@@ -98,22 +98,32 @@ def crop_scene(
         write_json(report, _report(cloud, cloud, None, None, up, mode))
         return
     names, points, _ = locate(fiducials, model, settings.max_residual_px)
-    if len(points) < 4:
-        raise StageError(
-            f"{fiducials} gives {len(points)} fiducials; an object needs at least 4 different points on it"
-        )
-    _check_near(names, points, cloud, fiducials)
-    cut = crop_cloud(cloud, points, up, settings)
+    cut = crop_marked(cloud, names, points, up, settings, fiducials)
     part = cloud[cut.keep]
-    if len(part) < settings.min_points:
+    write_cloud(crop, part)
+    write_json(report, _report(cloud, part, points, cut, up, mode))
+
+
+def crop_marked(
+    scene: Cloud, names: list[str], fiducials: Array, up: Array, settings: CropSettings, path: Path
+) -> Crop:
+    """`crop_cloud` for fiducials that a person marked in the file `path`: checked, and the notes printed.
+
+    Raises:
+        StageError: fewer than four fiducials, one far from every scene point, or too few points in the box.
+    """
+    if len(fiducials) < 4:
+        raise StageError(f"{path} gives {len(fiducials)} fiducials; an object needs at least 4 different points on it")
+    _check_near(names, fiducials, scene, path)
+    cut = crop_cloud(scene, fiducials, up, settings)
+    if cut.keep.sum() < settings.min_points:
         raise StageError(
-            f"only {len(part)} scene points are left in the box of {fiducials}, {settings.min_points} are needed:"
+            f"only {cut.keep.sum()} scene points are left in the box of {path}, {settings.min_points} are needed:"
             " a fiducial may lie outside the object, or the scene may not show it"
         )
     for note in cut.notes:
         print(note, flush=True)
-    write_cloud(crop, part)
-    write_json(report, _report(cloud, part, points, cut, up, mode))
+    return cut
 
 
 def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings) -> Crop:

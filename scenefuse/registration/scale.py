@@ -9,6 +9,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.registration.coarse import known_ups
+from scenefuse.registration.refine import ScaleRange
 from scenefuse.stage import quantity, write_json
 from scenefuse.transforms import Array, rotation_between
 
@@ -55,21 +56,15 @@ def estimate_scale(
     """
     obj, scene = read_cloud(object), read_cloud(crop)
     ledger = estimates(obj, scene, known_ups(cameras, crop_report))
-    if method == "none":
-        scale, width = 1.0, 0.0
-    elif method == "rms":
-        scale, width = ledger[0].scale, 0.0
-    else:
-        scale = prior_centre(ledger)
-        width = width_log
+    scales = prior(ledger, method, width_log)
     for e in ledger:
         print(f"{e.name:12s} {e.scale:.5g}", flush=True)
     spread = float(np.std([np.log(e.scale) for e in ledger]))
     write_json(
         report,
         {
-            "scale": quantity(scale, "scene units per object unit"),
-            "width_log": quantity(width, "1"),
+            "scale": quantity(scales.centre, "scene units per object unit"),
+            "width_log": quantity(scales.width, "1"),
             "method": quantity(method, ""),
             "spread_log": quantity(spread, "1"),
             "ledger": quantity([{"name": e.name, "scale": e.scale, "used": e.used} for e in ledger], ""),
@@ -97,6 +92,15 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
     found.append(Estimate("footprint", _hull_size(b[:, :2]) / _hull_size(a[:, :2]), True))
     found.append(Estimate("height", heights[1] / max(heights[0], 1e-12), True))
     return found
+
+
+def prior(ledger: list[Estimate], method: str, width_log: float) -> ScaleRange:
+    """The prior that a method of `estimate_scale` makes of the estimates."""
+    if method == "none":
+        return ScaleRange(1.0, 0.0)
+    if method == "rms":
+        return ScaleRange(ledger[0].scale, 0.0)
+    return ScaleRange(prior_centre(ledger), width_log)
 
 
 def prior_centre(ledger: list[Estimate]) -> float:

@@ -1,16 +1,15 @@
 # Tables, settings and the few functions that the rules share.
 import csv
-import difflib
 import os
 import shlex
 import sys
 from pathlib import Path
 
-import jsonschema
 import yaml
 from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import fingerprint
+from scenefuse.settings import merge, problem
 
 ROOT = Path(workflow.basedir)
 # Jobs find the project's package and this environment's Python without an installed package or an activated shell.
@@ -22,21 +21,11 @@ os.environ.update(
 
 def check(content, schema, where):
     """Stop with one sentence at the first thing in `content` that the schema does not allow."""
-    schema = yaml.safe_load((ROOT / "workflow/schemas" / schema).read_text())
-    for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
-        key = ".".join(str(part) for part in error.absolute_path)
-        message = error.message
-        if error.validator == "additionalProperties":
-            known = list(error.schema["properties"])
-            unknown = next(name for name in error.instance if name not in known)
-            close = difflib.get_close_matches(str(unknown), known, 1)
-            advice = (
-                f"did you mean '{close[0]}'?"
-                if close
-                else f"known keys are: {', '.join(known)}"
-            )
-            message = f"unknown key '{unknown}'; {advice}"
-        raise WorkflowError(f"{where}{f', {key}' if key else ''}: {message}")
+    wrong = problem(
+        content, yaml.safe_load((ROOT / "workflow/schemas" / schema).read_text())
+    )
+    if wrong:
+        raise WorkflowError(f"{where}, {wrong}")
 
 
 def table(path, schema):
@@ -68,13 +57,6 @@ def table(path, schema):
             f"{path}: '{max(names, key=names.count)}' stands in two rows; names must differ"
         )
     return dict(zip(names, rows))
-
-
-def merge(base, over):
-    """`base` with the keys of `over` laid over it, at every depth."""
-    if not (isinstance(base, dict) and isinstance(over, dict)):
-        return over
-    return base | {key: merge(base.get(key), value) for key, value in over.items()}
 
 
 check(config, "config.schema.yaml", "config")

@@ -1,0 +1,295 @@
+"""Point cloud files of any known ending as named columns: PLY, LAS and LAZ, E57, PCD, and rows of text.
+
+Columns have the names that PLY uses (x, y, z, nx, ny, nz, red, green, blue); all others keep their own. Positions keep
+the precision of the file. Libraries are loaded when a file needs them.
+"""
+
+import re
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.stage import StageError
+
+Columns = dict[str, NDArray[Any]]
+
+POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+# What other programs call the same columns, in lower case and without spaces, dots and underscores.
+OTHER_NAMES = {
+    **dict(zip(("normalx", "normaly", "normalz", "nor:normalx", "nor:normaly", "nor:normalz"), NORMAL * 2)),
+    **dict(zip(("r", "g", "b", "rf", "gf", "bf"), COLOR * 2)),
+    **dict(zip(("diffusered", "diffusegreen", "diffuseblue", "colorred", "colorgreen", "colorblue"), COLOR * 2)),
+    **dict(zip(("cartesianx", "cartesiany", "cartesianz"), POSITION)),
+}
+
+
+def read_columns(path: Path) -> Columns:
+    """The columns of a cloud file, as the file holds them.
+
+    Raises:
+        StageError: the ending is not known, or the file is missing, damaged, without positions or without points.
+    """
+    reader = READERS.get(path.suffix.lower())
+    if reader is None:
+        raise StageError(
+            f"{path}: '{path.suffix}' is no known ending of a point cloud; convert it to one of {', '.join(READERS)}"
+        )
+    if not path.is_file():
+        raise StageError(f"{path} does not exist; give the path of a cloud ({', '.join(READERS)})")
+    try:
+        columns = reader(path)
+    except (StageError, MemoryError):
+        raise
+    except Exception as error:  # each library has its own errors for a damaged file
+        kind = path.suffix.removeprefix(".").upper()
+        why = (str(error) or type(error).__name__).splitlines()[0]
+        raise StageError(f"{path} is not a readable {kind} cloud ({why}); export it again") from None
+    columns = {_common_name(name): values for name, values in columns.items()}
+    if not set(POSITION) <= set(columns):
+        raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
+    if len(columns["x"]) == 0:
+        raise StageError(f"{path} holds no points; look at what wrote it")
+    return columns
+
+
+def bytes_of(colors: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours (N, 3) as 0..255, from bytes, from 16 bits, or from fractions of 1; which one it is, the values tell."""
+    if colors.dtype == np.uint8:
+        return colors
+    values = np.nan_to_num(colors.astype(np.float64))
+    if values.max(initial=0) > 255:
+        values = values / 257
+    elif np.issubdtype(colors.dtype, np.floating) and values.max(initial=0) <= 1:
+        values = values * 255
+    return np.clip(np.rint(values), 0, 255).astype(np.uint8)
+
+
+def las_crs(path: Path) -> str | None:
+    """The coordinate system of a LAS or LAZ file as WKT; None where it has none, and for any other file."""
+    if path.suffix.lower() not in (".las", ".laz"):
+        return None
+    import laspy
+
+    with laspy.open(path) as file:
+        crs = _crs(file.header)
+    return None if crs is None else crs.to_wkt()
+
+
+def _common_name(name: str) -> str:
+    plain = re.sub(r"[\s._]", "", name.lower())
+    return OTHER_NAMES.get(plain, plain if plain in (*POSITION, *NORMAL, *COLOR) else name)
+
+
+def _ply(path: Path) -> Columns:
+    from plyfile import PlyData
+
+    vertex = PlyData.read(path)["vertex"].data
+    return {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
+
+
+def _las(path: Path) -> Columns:
+    """Positions, colours (unless all are black, which means none), and extra dimensions of one number."""
+    import laspy
+
+    las = laspy.read(path)
+    crs = _crs(las.header)
+    if crs is not None and crs.is_geographic:
+        raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
+    columns = {name: np.asarray(las[name]) for name in POSITION}
+    if set(COLOR) <= set(las.point_format.dimension_names):
+        colors = {name: np.asarray(las[name]) for name in COLOR}
+        columns |= colors if any(values.any() for values in colors.values()) else {}
+    extra = {name: np.asarray(las[name]) for name in las.point_format.extra_dimension_names}
+    return columns | {name: values for name, values in extra.items() if values.ndim == 1}
+
+
+def _crs(header: Any) -> Any:
+    """The pyproj CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        return header.parse_crs()
+    except CRSError as error:
+        print(f"the file's coordinate system cannot be read and is ignored: {error}", flush=True)
+        return None
+
+
+def _e57(path: Path) -> Columns:
+    """All scans of the file, each moved by its pose; points marked as invalid are left out."""
+    import pye57
+
+    file = pye57.E57(str(path))
+    try:
+        scans = [_e57_scan(file, pye57.ScanHeader(node)) for node in file.data3d]
+    finally:
+        file.close()
+    if not scans:
+        return {name: np.empty(0) for name in POSITION}
+    common = [name for name in scans[0] if all(name in scan for scan in scans)]
+    return {name: np.concatenate([scan[name] for scan in scans]) for name in common}
+
+
+def _e57_scan(file: Any, header: Any) -> Columns:
+    """One scan in the file's frame, read as float64: pye57's own reader takes no colours above 255 and no normals."""
+    from pye57 import libe57
+    from scipy.spatial.transform import Rotation
+
+    spherical = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+    cartesian = ("cartesianX", "cartesianY", "cartesianZ")
+    normal = ("nor:normalX", "nor:normalY", "nor:normalZ")
+    color = ("colorRed", "colorGreen", "colorBlue")
+    states = ("cartesianInvalidState", "sphericalInvalidState")
+    wanted = [name for name in (*cartesian, *spherical, *normal, *color, *states) if name in header.point_fields]
+    columns = {name: np.empty(header.point_count) for name in wanted}
+    buffers = libe57.VectorSourceDestBuffer()
+    for name, values in columns.items():
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, len(values), True, True))
+    if header.point_count:
+        header.points.reader(buffers).read()
+    if cartesian[0] in columns:
+        points, state = np.stack([columns[name] for name in cartesian], axis=1), states[0]
+    else:
+        distance, azimuth, elevation = (columns[name] for name in spherical)
+        level = distance * np.cos(elevation)
+        points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+        state = states[1]
+    turn, shift = np.eye(3), np.zeros(3)
+    if header.has_pose():
+        rotation, translation = header.pose["rotation"], header.pose["translation"]
+        turn = Rotation.from_quat([rotation[part].value() for part in "xyzw"]).as_matrix()
+        shift = np.array([translation[part].value() for part in "xyz"])
+    found = dict(zip(POSITION, (points @ turn.T + shift).T))
+    if normal[0] in columns:
+        found |= dict(zip(NORMAL, (np.stack([columns[name] for name in normal], axis=1) @ turn.T).T))
+    if color[0] in columns:
+        found |= {name: columns[own].astype(np.uint16) for name, own in zip(COLOR, color)}
+    valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
+    return {name: values[valid] for name, values in found.items()}
+
+
+def _pcd(path: Path) -> Columns:
+    """PCD 0.7, ASCII, binary and compressed. Open3D misreads positions that are binary doubles, without a word."""
+    header: dict[str, list[str]] = {}
+    with open(path, "rb") as file:
+        while "DATA" not in header:
+            line = file.readline()
+            words = line.decode("ascii").split()
+            header |= {words[0]: words[1:]} if words else {}
+            if not line:
+                raise ValueError("it has no PCD header")
+        body = file.read()
+    names, kinds, sizes = header["FIELDS"], header["TYPE"], header["SIZE"]
+    repeats = [int(n) for n in header.get("COUNT", ["1"] * len(names))]
+    count = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
+    types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(kinds, sizes)]
+    if count == 0:
+        arrays = [np.empty((0, n)) for n in repeats]
+    elif header["DATA"] == ["ascii"]:
+        rows = np.loadtxt(body.decode("ascii").splitlines(), ndmin=2)
+        cuts = np.cumsum(repeats)[:-1]
+        arrays = [part.astype(kind) for part, kind in zip(np.split(rows, cuts, axis=1), types)]
+    elif header["DATA"] == ["binary"]:
+        row = np.dtype([(str(k), kind, (n,)) for k, (kind, n) in enumerate(zip(types, repeats))])
+        table = np.frombuffer(body, row, count)
+        arrays = [table[str(k)] for k in range(len(names))]
+    else:
+        packed, size = np.frombuffer(body, "<u4", 2)
+        raw = _lzf(np.frombuffer(body, np.uint8, packed, 8), size).tobytes()
+        ends = np.cumsum([0] + [kind.itemsize * n * count for kind, n in zip(types, repeats)])
+        arrays = [
+            np.frombuffer(raw, kind, count * n, at).reshape(count, n) for kind, n, at in zip(types, repeats, ends)
+        ]
+    columns = {name: array[:, 0] for name, array, n in zip(names, arrays, repeats) if n == 1 and name != "_"}
+    for name in {"rgb", "rgba"} & set(columns):
+        bits = np.ascontiguousarray(columns.pop(name).astype(types[names.index(name)])).view(np.uint32)
+        columns |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
+    return columns
+
+
+def _lzf(packed: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+    """Undo LZF, the compression of PCD: runs of literal bytes, and copies of bytes that came before."""
+    from numba import njit
+
+    @njit
+    def unpack(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
+        at, end = 0, 0
+        while at < len(source):
+            control = int(source[at])
+            at += 1
+            if control < 32:
+                length, start = control + 1, -1
+            else:
+                length = (control >> 5) + 2
+                if length == 9:
+                    length += int(source[at])
+                    at += 1
+                start = end - ((control & 31) << 8) - int(source[at]) - 1
+                at += 1
+                if start < 0:
+                    return -1
+            if end + length > len(target) or (start < 0 and at + length > len(source)):
+                return -1
+            for k in range(length):
+                target[end + k] = source[at + k] if start < 0 else target[start + k]
+            end += length
+            at += length if start < 0 else 0
+        return end
+
+    target = np.zeros(size, np.uint8)
+    if unpack(packed, target) != size:
+        raise ValueError("its compressed part is damaged")
+    return target
+
+
+def _text(path: Path) -> Columns:
+    """Rows of numbers, separated by blanks, commas or semicolons, below any number of other lines.
+
+    A line above the rows that names the columns (`//X Y Z R G B`) is believed. Without one, the first three columns are
+    x, y, z and each three that follow are normals if they have unit length, else colours; PTS may have an intensity
+    between.
+    """
+    with open(path, encoding="utf-8-sig") as file:
+        head = list(islice(file, 50))
+    if not "".join(head).strip():
+        return {name: np.empty(0) for name in POSITION}
+    above = next((k for k, line in enumerate(head) if len(_numbers(line)) >= 3), None)
+    if above is None:
+        raise ValueError("none of its first lines holds three numbers")
+    separator = _separator(head[above])
+    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig")
+    names = [cell.strip() for cell in head[above - 1].strip(" \t\r\n/#").split(separator)] if above else []
+    if len(names) == rows.shape[1] and set(POSITION) <= {_common_name(name) for name in names}:
+        return dict(zip(names, rows.T))
+    columns, start = dict(zip(POSITION, rows.T)), 3
+    if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
+        columns["intensity"], start = rows[:, 3], 4
+    for first in range(start, rows.shape[1] - 2, 3):
+        three = rows[:, first : first + 3]
+        unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
+        columns |= dict(zip(NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR, three.T))
+    return columns
+
+
+def _separator(line: str) -> str | None:
+    return next((mark for mark in ";," if mark in line), None)
+
+
+def _numbers(line: str) -> list[float]:
+    """The numbers of a line of numbers, none of any other."""
+    try:
+        return [float(cell) for cell in line.split(_separator(line))]
+    except ValueError:
+        return []
+
+
+READERS = {
+    ".ply": _ply,
+    ".las": _las,
+    ".laz": _las,
+    ".e57": _e57,
+    ".pcd": _pcd,
+    **dict.fromkeys((".xyz", ".pts", ".txt", ".asc", ".csv"), _text),
+}

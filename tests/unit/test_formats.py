@@ -1,0 +1,186 @@
+"""Cloud files of other programs: what was written comes back, in float64, or one sentence says why not."""
+
+import laspy
+import numpy as np
+import open3d as o3d
+import pye57
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.formats import bytes_of, las_crs
+from scenefuse.stage import StageError
+
+UTM = np.array([500_000.0, 5_572_094.0, 300.0])
+
+
+@pytest.fixture
+def cloud() -> Cloud:
+    """40 points at UTM coordinates with sub-millimetre digits."""
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    colors = rng.integers(0, 256, (40, 3)).astype(np.uint8)
+    return Cloud(rng.uniform(0, 1, (40, 3)) + UTM, normals.astype(np.float32), colors)
+
+
+def write_pcd(path, cloud, data, kind="U"):
+    """PCD with double positions and packed colours, as PCL writes it."""
+    names = "x y z rgb normal_x normal_y normal_z"
+    header = (
+        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {names}\nSIZE 8 8 8 4 4 4 4\nTYPE F F F {kind} F F F\nCOUNT 1 1 1 1 1 1 1\n"
+    )
+    header += f"WIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA {data}\n"
+    table = np.empty(len(cloud), [(n, "<f8" if n in "xyz" else "<u4" if n == "rgb" else "<f4") for n in names.split()])
+    table["x"], table["y"], table["z"] = cloud.points.T
+    table["rgb"] = cloud.colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    table["normal_x"], table["normal_y"], table["normal_z"] = cloud.normals.T
+    body = (
+        table.tobytes() if data == "binary" else "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
+    )
+    path.write_bytes(header.encode() + body)
+
+
+def write_e57(path, scans, **options):
+    file = pye57.E57(str(path), mode="w")
+    for points, colors, rotation, translation in scans:
+        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T.astype(np.float64)))
+        columns |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colors.T)) | options
+        file.write_scan_raw(columns, rotation=rotation, translation=translation)
+    file.close()
+
+
+@pytest.mark.parametrize("data", ["binary", "ascii"])
+def test_pcd_keeps_doubles_colours_and_normals(tmp_path, cloud, data):
+    write_pcd(tmp_path / "a.pcd", cloud, data)
+    found = read_cloud(tmp_path / "a.pcd")
+    assert np.array_equal(found.points, cloud.points) and np.array_equal(found.colors, cloud.colors)
+    assert np.allclose(found.normals, cloud.normals, atol=1e-7)
+
+
+def test_compressed_pcd_reads_as_its_writer_reads_it(tmp_path):
+    grid = np.stack(np.meshgrid(*[np.arange(16) / 8] * 3), axis=-1).reshape(-1, 3)
+    written = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(grid))
+    written.colors = o3d.utility.Vector3dVector(np.round(grid / 2 * 255) / 255)
+    o3d.io.write_point_cloud(str(tmp_path / "a.pcd"), written, compressed=True)
+    read = o3d.io.read_point_cloud(str(tmp_path / "a.pcd"))
+    found = read_cloud(tmp_path / "a.pcd")
+    assert (tmp_path / "a.pcd").stat().st_size < 8 * len(grid)
+    assert np.array_equal(found.points, np.asarray(read.points))
+    assert np.array_equal(found.colors, np.rint(np.asarray(read.colors) * 255))
+
+
+def test_e57_scans_are_moved_by_their_poses_and_joined(tmp_path, cloud):
+    turn = Rotation.from_euler("xyz", [20, -30, 50], degrees=True)
+    local = turn.inv().apply(cloud.points - UTM).astype(np.float32)
+    x, y, z, w = turn.as_quat()
+    scans = [(local[part], cloud.colors[part], np.array([w, x, y, z]), UTM) for part in (slice(0, 25), slice(25, 40))]
+    write_e57(tmp_path / "a.e57", scans)
+    found = read_cloud(tmp_path / "a.e57")
+    assert np.abs(found.points - cloud.points).max() < 1e-6
+    assert np.array_equal(found.colors, cloud.colors)
+
+
+def test_e57_points_that_are_marked_invalid_are_left_out(tmp_path, cloud):
+    state = (np.arange(40) % 4 == 0).astype(np.int8)
+    still = np.array([1.0, 0, 0, 0])
+    write_e57(tmp_path / "a.e57", [(cloud.points - UTM, cloud.colors, still, UTM)], cartesianInvalidState=state)
+    found = read_cloud(tmp_path / "a.e57")
+    assert np.array_equal(found.colors, cloud.colors[state == 0])
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_las_at_utm_coordinates_keeps_a_millimetre_and_its_crs(tmp_path, cloud, ending):
+    near = Cloud(cloud.points - UTM, None, cloud.colors, {"intensity": np.linspace(0, 1, 40, dtype=np.float32)})
+    write_laz(tmp_path / f"a.{ending}", near, UTM, "EPSG:32632")
+    found = read_cloud(tmp_path / f"a.{ending}")
+    assert np.abs(found.points - cloud.points).max() <= 0.5e-3 + 1e-9
+    assert np.array_equal(found.colors, cloud.colors)
+    assert np.array_equal(found.fields["intensity_"], near.fields["intensity"])
+    assert "32632" in las_crs(tmp_path / f"a.{ending}")
+
+
+def test_las_without_colours_has_none_and_degrees_are_refused(tmp_path, cloud):
+    write_laz(tmp_path / "a.las", Cloud(cloud.points - UTM), UTM, None)
+    assert read_cloud(tmp_path / "a.las").colors is None and las_crs(tmp_path / "a.las") is None
+    write_laz(tmp_path / "b.las", Cloud(cloud.points - UTM), np.zeros(3), "EPSG:4326")
+    with pytest.raises(StageError, match=r"b\.las is in degrees"):
+        read_cloud(tmp_path / "b.las")
+
+
+def test_las_of_eight_bit_colours_is_not_darkened(tmp_path):
+    las = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
+    las.x, las.y, las.z = np.random.default_rng(0).random((3, 5))
+    las.red = las.green = las.blue = np.array([0, 50, 100, 200, 255], np.uint16)
+    las.write(str(tmp_path / "a.las"))
+    assert read_cloud(tmp_path / "a.las").colors[:, 0].tolist() == [0, 50, 100, 200, 255]
+
+
+@pytest.mark.parametrize(
+    ("ending", "above", "columns", "mark"),
+    [
+        ("xyz", "", "p", " "),
+        ("xyz", "", "pc", " "),
+        ("txt", "", "pcn", "\t"),
+        ("asc", "", "pnc", " "),
+        ("csv", "X,Y,Z,Red,Green,Blue\n", "pc", ","),
+        ("csv", "exported by hand\nnx;ny;nz;x;y;z\n", "np", ";"),
+        ("txt", "//X Y Z R G B Nx Ny Nz\n", "pcn", " "),
+        ("pts", "40\n", "pic", " "),
+        ("xyz", "\n# a comment\n\n", "pc", "   "),
+    ],
+)
+def test_text_of_any_layout(tmp_path, cloud, ending, above, columns, mark):
+    parts = {"p": cloud.points, "c": cloud.colors, "n": cloud.normals, "i": np.arange(40)[:, None] - 20}
+    rows = zip(*[parts[c].tolist() for c in columns])
+    path = tmp_path / f"a.{ending}"
+    path.write_text(above + "\n".join(mark.join(repr(v) for part in row for v in part) for row in rows) + "\n")
+    found = read_cloud(path)
+    assert np.array_equal(found.points, cloud.points)
+    assert (found.colors is not None) == ("c" in columns) and (found.normals is not None) == ("n" in columns)
+    assert found.colors is None or np.array_equal(found.colors, cloud.colors)
+    assert found.normals is None or np.array_equal(found.normals, cloud.normals)
+
+
+def test_rows_that_are_not_finite_are_dropped_and_counted(tmp_path, capsys, cloud):
+    points = cloud.points.copy()
+    points[3, 1], points[7, 0] = np.nan, np.inf
+    write_cloud(tmp_path / "a.ply", Cloud(points, None, cloud.colors, {"views": np.arange(40)}))
+    found = read_cloud(tmp_path / "a.ply")
+    assert "2 of 40 rows" in capsys.readouterr().out
+    assert np.array_equal(found.fields["views"], np.delete(np.arange(40), [3, 7]))
+    (tmp_path / "b.xyz").write_text("1 2 nan\nnan nan nan\n")
+    with pytest.raises(StageError, match=r"b\.xyz holds no point with a finite position"):
+        read_cloud(tmp_path / "b.xyz")
+
+
+def test_colours_as_fractions_bytes_or_sixteen_bits():
+    assert bytes_of(np.array([[0.0, 0.5, 1.0]])).tolist() == [[0, 128, 255]]
+    assert bytes_of(np.array([[0, 1, 255]])).tolist() == [[0, 1, 255]]
+    assert bytes_of(np.array([[0, 257, 65535]], np.uint16)).tolist() == [[0, 1, 255]]
+
+
+@pytest.mark.parametrize("ending", ["ply", "las", "laz", "e57", "pcd", "xyz", "csv"])
+@pytest.mark.parametrize("content", [b"", b"no cloud at all\n" * 40, bytes(range(256)) * 8])
+def test_damaged_files_are_named_in_one_line(tmp_path, ending, content):
+    path = tmp_path / f"bad.{ending}"
+    path.write_bytes(content)
+    with pytest.raises(StageError) as caught:
+        read_cloud(path)
+    assert f"bad.{ending}" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_truncated_files_are_refused(tmp_path, cloud):
+    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM, None, cloud.colors), UTM, "EPSG:32632")
+    write_pcd(tmp_path / "a.pcd", cloud, "binary")
+    write_e57(tmp_path / "a.e57", [(cloud.points - UTM, cloud.colors, np.array([1.0, 0, 0, 0]), UTM)])
+    for path in sorted(tmp_path.iterdir()):
+        content = path.read_bytes()
+        path.write_bytes(content[: int(0.7 * len(content))])
+        with pytest.raises(StageError, match=path.name):
+            read_cloud(path)
+
+
+def test_an_unknown_ending_lists_the_known_ones(tmp_path):
+    with pytest.raises(StageError, match=r"\.obj.*\.ply, \.las, \.laz, \.e57, \.pcd, \.xyz"):
+        read_cloud(tmp_path / "a.obj")

@@ -1,0 +1,153 @@
+"""Registration on its own: two files in, a verdict, a transform in the files' own coordinates, an exit status."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from planted import errors, plant
+from test_formats import UTM, write_e57
+
+from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.formats import las_crs
+from scenefuse.registration.register import register_clouds, register_files
+from scenefuse.settings import shipped_with
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import Sim3
+
+ROOT = Path(__file__).resolve().parents[2]
+# Less work than shipped: fewer samples and steps.
+QUICK = {
+    "coarse": {
+        "voxel_fractions": [0.04],
+        "ransac_samples": 30000,
+        "feature_scale_steps": 3,
+        "candidates": 16,
+        "keep": 5,
+    }
+    | {"scale_steps": 9, "yaw_steps": 24, "sweep_voxel_fraction": 0.045},
+    "fine": {"fine_voxel_fraction": 0.012, "turn_steps": 18},
+}
+
+
+@pytest.fixture(scope="module")
+def house():
+    return plant("house", 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+
+
+@pytest.fixture
+def quick(tmp_path):
+    (tmp_path / "quick.yaml").write_text(yaml.safe_dump({"registration": QUICK}))
+    return tmp_path / "quick.yaml"
+
+
+def in_files(content, trial, shift):
+    """The errors of a transform.json against the truth of a trial whose scene was moved by `shift`."""
+    truth = Sim3(1.0, np.eye(3), shift) @ trial.scene_from_object
+    found = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
+    return errors(found, truth, trial.object.points.mean(0), trial.diagonal)
+
+
+def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, house, quick, capsys):
+    middle = house.object.points.mean(0)
+    still = np.array([1.0, 0, 0, 0])
+    write_e57(tmp_path / "house.e57", [(house.object.points - middle, house.object.colors, still, middle)])
+    write_laz(tmp_path / "scene.laz", house.scene, UTM, "EPSG:32632")
+    out = tmp_path / "out"
+    files = {"object": tmp_path / "house.e57", "scene": tmp_path / "scene.laz"}
+    assert register_files(**files, out=out, format="laz", config=quick) == 0
+    content = read_json(out / "transform.json")
+    scale, angle, shift = in_files(content, house, UTM)
+    assert abs(scale) < 2 and angle < 2 and shift < 0.01
+    assert value(content, "status") == "registered" and value(content["agreement"], "fitness_target") > 0.9
+    pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
+    placed = read_cloud(out / "object_in_scene.laz")
+    expected = pose.apply(read_cloud(tmp_path / "house.e57").points)
+    assert np.abs(placed.points - expected).max() <= 0.5e-3 + 1e-6
+    assert "32632" in las_crs(out / "object_in_scene.laz")
+    assert (out / "picture.png").stat().st_size > 1000
+    printed = capsys.readouterr().out.strip().splitlines()
+    assert len(printed) == 5 and printed[0].startswith("registered: ") and "whole scene" in printed[2]
+
+
+def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
+    trial = plant("house", 5, noise=0.005, object_points=6000, scene_points=4000)
+    write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
+    rows = np.hstack([trial.object.points, trial.object.colors])
+    np.savetxt(tmp_path / "house.xyz", rows, header="X Y Z R G B", comments="//", fmt=["%.9g"] * 3 + ["%d"] * 3)
+    np.savetxt(tmp_path / "marks.txt", trial.fiducials + UTM, fmt="%.4f")
+    out, true = tmp_path / "out", trial.scene_from_object.scale
+    files = {"object": tmp_path / "house.xyz", "scene": tmp_path / "scene.ply", "fiducials": tmp_path / "marks.txt"}
+    ups = {"up_object": tuple(trial.up_in_object), "up_scene": (0.0, 0.0, 1.0)}
+    assert register_files(**files, **ups, out=out, scale=true, config=quick) == 0
+    content = read_json(out / "transform.json")
+    scale, angle, shift = in_files(content, trial, UTM)
+    assert abs(scale) < 1e-6 and angle < 2 and shift < 0.01
+    assert "8 fiducials" in value(content, "searched") and "ground removed" in value(content, "searched")
+    assert value(content, "tilt_deg") < 5
+    placed = read_cloud(out / "object_in_scene.ply").points
+    pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
+    assert np.abs(placed - pose.apply(read_cloud(tmp_path / "house.xyz").points)).max() < 1e-8
+
+
+def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_path, house, quick):
+    write_cloud(tmp_path / "house.ply", house.object)
+    other = plant("sculpture", 7, ground=False, noise=0.005, scene_points=4000).scene
+    write_cloud(tmp_path / "scene.ply", other)
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "object_in_scene.laz").write_text("of an earlier run")
+    command = [sys.executable, ROOT / "scripts/register.py", "--object", "house.ply", "--scene", "scene.ply"]
+    command += ["--out", "out", "--config", quick, "--seed", "1"]
+    done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    assert done.stdout.startswith("unregistered: ")
+    content = read_json(out / "transform.json")
+    assert value(content, "status") == "unregistered" and value(content, "reason") in done.stdout
+    assert sorted(p.name for p in out.iterdir()) == ["picture.png", "transform.json"]
+
+
+def test_origins_far_away_change_nothing(house):
+    settings = shipped_with(None)
+    little = {"ransac_samples": 5000, "feature_scale_steps": 1, "candidates": 4, "keep": 2}
+    settings["registration"]["coarse"] |= QUICK["coarse"] | little
+    settings["registration"]["fine"] |= QUICK["fine"] | {"turn_steps": 4}
+    # Coordinates of few binary digits, so that moving them rounds nothing.
+    near = Cloud(np.round(house.scene.points * 2**16) / 2**16, house.scene.normals, house.scene.colors)
+    far = Cloud(near.points + UTM, near.normals, near.colors)
+    here, there = (register_clouds(house.object, scene, settings, 0) for scene in (near, far))
+    assert np.array_equal(here.outcome.ranked[0].pose.matrix, there.outcome.ranked[0].pose.matrix)
+    shift = there.scene_from_object.translation - here.scene_from_object.translation
+    assert np.abs(shift - UTM).max() < 1e-8
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"scale": -1.0}, "a scale has to be positive"),
+        ({"scale": 1.0, "scale_range": (1.0, 2.0)}, "give one"),
+        ({"up_object": (0.0, 0.0, 1.0)}, "--up-scene"),
+        ({"up_scene": (0.0, 0.0, 0.0)}, "needs a direction"),
+        ({"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)}, "crop box"),
+        ({"fiducials": Path("three.txt")}, "at least 4"),
+        ({"fiducials": Path("far.txt")}, "nearest scene point"),
+        ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
+        ({"config": Path("typo.yaml")}, "registration.fine: unknown key 'min_fscore'; did you mean 'min_f_score'"),
+        ({"config": Path("none.yaml")}, "cannot be read"),
+        ({"object": Path("few.ply")}, "the object has only 3"),
+        ({"out": Path("three.txt")}, "is a file"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words):
+    monkeypatch.chdir(tmp_path)
+    write_cloud(Path("scene.ply"), house.scene)
+    write_cloud(Path("few.ply"), Cloud(np.eye(3)))
+    Path("three.txt").write_text("0 0 0\n1 0 0\n0 1 0\n")
+    np.savetxt("far.txt", np.eye(4, 3) + 1000)
+    Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
+    Path("typo.yaml").write_text("registration: {fine: {min_fscore: 0.1}}")
+    with pytest.raises(StageError, match=words):
+        register_files(**({"object": Path("scene.ply"), "scene": Path("scene.ply")} | options))
+    assert not Path("registered").exists()
