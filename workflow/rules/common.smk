@@ -48,10 +48,6 @@ def table(path, schema):
             )
         check(row, schema, f"{path}, row {number}")
     names = [next(iter(row.values())) for row in rows]
-    if not names:
-        raise WorkflowError(
-            f"{path} has no rows; add one for each {Path(path).stem.rstrip('s')}"
-        )
     if len(set(names)) < len(names):
         raise WorkflowError(
             f"{path}: '{max(names, key=names.count)}' stands in two rows; names must differ"
@@ -62,6 +58,8 @@ def table(path, schema):
 check(config, "config.schema.yaml", "config")
 SCENES = table(config["scenes"], "scenes.schema.yaml")
 OBJECTS = table(config["objects"], "objects.schema.yaml")
+if not SCENES:
+    raise WorkflowError(f"{config['scenes']} has no rows; add one for each scene")
 ARMS = {
     name: merge(config["registration"], over) for name, over in config["arms"].items()
 }
