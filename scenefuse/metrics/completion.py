@@ -11,6 +11,9 @@ from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.stage import quantity, threads
 from scenefuse.transforms import Array
 
+# Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
+WIDE_SAMPLE = 1500
+
 
 @dataclass(frozen=True)
 class CompletionSettings:
@@ -27,7 +30,7 @@ class CompletionSettings:
 
 
 def completion_metrics(
-    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, settings: CompletionSettings, seed: int
+    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, unit: str, settings: CompletionSettings, seed: int
 ) -> dict[str, dict[str, Any]]:
     """The completion.* numbers of the added points P_new, and the same of a random cloud in their place.
 
@@ -38,6 +41,7 @@ def completion_metrics(
         scene: the scene's points on the object before completion: the incomplete cloud of NUE.
         added: P_new.
         diagonal: of the full arm's crop.
+        unit: of the scene's lengths.
         settings: see CompletionSettings.
         seed: of samples and of the null cloud.
     """
@@ -58,7 +62,7 @@ def completion_metrics(
     found["surface_variation_scene"] = quantity(
         surface_variation(scene.points, _sampled(scene.points, settings.sample, seed), radius), "1"
     )
-    found["surface_variation_radius"] = quantity(radius, "scene units")
+    found["surface_variation_radius"] = quantity(radius, unit)
     found["added_points"] = quantity(len(added), "points")
     return found
 
@@ -69,11 +73,12 @@ def _measure(
     """Every number for one set of added points."""
     complete = np.concatenate([around, added])
     few = _sampled(added, settings.sample, seed)
+    fewer = _sampled(added, min(settings.sample, WIDE_SAMPLE), seed)
     few_scene = _sampled(scene, settings.sample, seed)
     radius = settings.variation_spacings * spacing(scene)
     found: dict[str, float | None] = {"surface_variation": surface_variation(complete, few, radius)}
     for percent in (1, 2, 4):
-        found[f"surface_variation_{percent}pct"] = surface_variation(complete, few[:1500], percent / 100 * diagonal)
+        found[f"surface_variation_{percent}pct"] = surface_variation(complete, fewer, percent / 100 * diagonal)
     for k in (settings.density_neighbours, 8, 32):
         suffix = "" if k == settings.density_neighbours else f"_k{k}"
         new, old = local_density(complete, few, k), local_density(scene, few_scene, k)

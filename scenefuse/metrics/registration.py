@@ -53,7 +53,7 @@ def compute_metrics(
     Args:
         object: object cloud (PLY) in its own frame.
         crop: scene points on the object (PLY); the full arm's for every arm, so that arms can be compared.
-        reference: JSON of the full arm's crop stage: its diagonal sets all thresholds.
+        reference: JSON of the full arm's crop stage: its diagonal sets all thresholds, and the unit of lengths.
         fine: JSON of the fine registration of this arm.
         fused: the object's fused surroundings (PLY, with `source`); without it completion is left out.
         metrics: output JSON with `registration` and `completion`.
@@ -63,15 +63,16 @@ def compute_metrics(
     obj, scene = read_cloud(object), read_cloud(crop)
     registration = read_json(fine)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-    diagonal = float(value(read_json(reference), "diagonal"))
-    found = registration_metrics(obj, scene, pose, settings.tau_fraction * diagonal, diagonal, settings)
+    extent = read_json(reference)["diagonal"]
+    diagonal, unit = float(extent["value"]), str(extent["unit"])
+    found = registration_metrics(obj, scene, pose, settings.tau_fraction * diagonal, diagonal, unit, settings)
     found["status"] = quantity(value(registration, "status"), "")
     content: dict[str, Any] = {"registration": found}
     if fused is not None:
         completed = read_cloud(fused)
         added = completed.fields["source"] == 1
         content["completion"] = completion_metrics(
-            completed[~added], scene, completed[added], diagonal, _completion(settings), seed
+            completed[~added], scene, completed[added], diagonal, unit, _completion(settings), seed
         )
     for name, item in found.items():
         print(f"{name:28s} {item['value']} {item['unit']}", flush=True)
@@ -84,6 +85,7 @@ def registration_metrics(
     scene_from_object: Sim3,
     tau: float,
     diagonal: float,
+    unit: str,
     settings: MetricSettings,
 ) -> dict[str, dict[str, Any]]:
     """The registration.* numbers of one pose.
@@ -97,8 +99,9 @@ def registration_metrics(
         obj: the object in its own frame.
         scene: the scene's points on the object.
         scene_from_object: the pose.
-        tau: inlier distance, scene units.
-        diagonal: of the full arm's crop, scene units.
+        tau: inlier distance.
+        diagonal: of the full arm's crop.
+        unit: of the scene's lengths.
         settings: for the normals.
     """
     moved = scene_from_object.apply(obj.points)
@@ -118,7 +121,6 @@ def registration_metrics(
         1
     ]
     smooth = np.abs(np.einsum("nk,njk->nj", union, union[neighbours[:, 1:]])).mean()
-    unit = "scene units"
     return {
         "fitness_source": quantity(source, "1"),
         "fitness_target": quantity(target, "1"),

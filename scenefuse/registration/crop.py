@@ -15,6 +15,7 @@ from scenefuse.fiducials import locate
 from scenefuse.registration.ground import Ground, fit_ground
 from scenefuse.stage import StageError, quantity, threads, write_json
 from scenefuse.transforms import Array, rotation_between
+from scenefuse.units import length_unit
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ def crop_scene(
     *,
     scene: Path,
     model: Path,
+    georeference: Path | None = None,
     fiducials: Path,
     crop: Path,
     report: Path,
@@ -81,6 +83,7 @@ def crop_scene(
     Args:
         scene: dense scene cloud (PLY), z up as the georegister stage leaves it.
         model: COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it.
+        georeference: JSON of the scene, for the unit of its lengths, or nothing.
         fiducials: tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z), at least four
             different points on the object.
         crop: output PLY, the scene's points on the object.
@@ -91,17 +94,17 @@ def crop_scene(
     Raises:
         StageError: fewer than four fiducials, one far from every scene point, or too few points in the box.
     """
-    cloud = read_cloud(scene)
+    cloud, unit = read_cloud(scene), length_unit(georeference)
     up = np.array([0.0, 0.0, 1.0])
     if mode == "none":
         write_cloud(crop, cloud)
-        write_json(report, _report(cloud, cloud, None, None, up, mode))
+        write_json(report, _report(cloud, cloud, None, None, up, mode, unit))
         return
     names, points, _ = locate(fiducials, model, settings.max_residual_px)
     cut = crop_marked(cloud, names, points, up, settings, fiducials)
     part = cloud[cut.keep]
     write_cloud(crop, part)
-    write_json(report, _report(cloud, part, points, cut, up, mode))
+    write_json(report, _report(cloud, part, points, cut, up, mode, unit))
 
 
 def crop_marked(
@@ -152,7 +155,11 @@ def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings
     inside = np.flatnonzero(above)
     if len(inside):
         link = max(settings.link_fraction * diagonal, 3 * spacing(points[inside]))
-        keep[inside] = _parts_near(points[inside], marks, link, settings.reach_fraction * diagonal, settings.min_part)
+        near = _parts_near(points[inside], marks, link, settings.reach_fraction * diagonal, settings.min_part)
+        if near.any():
+            keep[inside] = near
+        else:
+            notes.append("no part in the box lies near a fiducial: all of them were kept")
     return Crop(keep, in_box, level, low, high, ground, notes)
 
 
@@ -172,7 +179,7 @@ def _parts_near(points: Array, marks: Array, link: float, reach: float, min_part
     low, high = marks.min(0)[:2], marks.max(0)[:2]
     between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
     wanted = (counts >= min_part * len(points)) & (touched | (between >= 0.5 * counts))
-    return wanted[part_of] if wanted.any() else np.ones(len(points), dtype=bool)
+    return wanted[part_of]
 
 
 def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> None:
@@ -182,16 +189,15 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
     worst = int(distance.argmax())
     if distance[worst] > max(0.5 * diagonal, 10 * spacing(cloud.points)):
         raise StageError(
-            f"fiducial {names[worst]} of {path} lies {distance[worst]:.3g} scene units from the nearest scene point;"
-            " check its clicks or coordinates"
+            f"fiducial {names[worst]} of {path} lies {distance[worst]:.3g} from the nearest scene point, and the"
+            f" fiducials span {diagonal:.3g}: check its clicks or coordinates"
         )
 
 
 def _report(
-    scene: Cloud, part: Cloud, fiducials: Array | None, cut: Crop | None, up: Array, mode: str
+    scene: Cloud, part: Cloud, fiducials: Array | None, cut: Crop | None, up: Array, mode: str, unit: str
 ) -> dict[str, object]:
     """The stage JSON of a crop."""
-    unit = "scene units"
     ground = None if cut is None else cut.ground
     return {
         "mode": quantity(mode, ""),

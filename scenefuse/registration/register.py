@@ -95,7 +95,7 @@ def register_clouds(
     outcome = refine_hypotheses(near_obj, near_scene, poses, scales, ups, fine, seed)
     pose, measures = outcome.ranked[0].pose, build(MetricSettings, settings["metrics"])
     tau = measures.tau_fraction * near_scene.diagonal
-    agreement = registration_metrics(near_obj, near_scene, pose, tau, near_scene.diagonal, measures)
+    agreement = registration_metrics(near_obj, near_scene, pose, tau, near_scene.diagonal, "scene units", measures)
     whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
     return Registration(outcome.verdict.registered, outcome.verdict.reason, whole, outcome, origins, scales, agreement)
 

@@ -9,7 +9,7 @@ from planted import plant
 from scenefuse.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.registration.crop import CropSettings, crop_cloud, crop_scene
 from scenefuse.registration.ground import fit_ground
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 Z = np.array([0.0, 0.0, 1.0])
 SETTINGS = CropSettings(
@@ -52,6 +52,14 @@ def test_without_ground_nothing_is_removed_and_that_is_said():
     assert "no ground" in cut.notes[0]
 
 
+def test_parts_far_from_every_fiducial_are_kept_and_that_is_said():
+    trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, scene_points=3000)
+    low, high = trial.scene.points.min(0), trial.scene.points.max(0)
+    far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
+    cut = crop_cloud(trial.scene, far, Z, replace(SETTINGS, reach_fraction=1e-6, min_part=1.1))
+    assert cut.keep.all() and "no part in the box lies near a fiducial" in cut.notes[1]
+
+
 def test_ground_is_a_height_field_with_the_planted_slope():
     rng = np.random.default_rng(0)
     points = rng.uniform(-10, 10, (5000, 3))
@@ -66,7 +74,10 @@ def test_stage_writes_the_crop_and_its_box(tmp_path):
     crop_scene(**files, mode="fiducials", settings=SETTINGS)
     report = read_json(files["report"])
     assert value(report, "crop_points") == len(read_cloud(files["crop"])) > 2500
-    assert value(report, "up_in_scene") == [0.0, 0.0, 1.0]
+    assert value(report, "up_in_scene") == [0.0, 0.0, 1.0] and report["diagonal"]["unit"] == "scene units"
+    write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
+    crop_scene(**files, georeference=tmp_path / "georeference.json", mode="fiducials", settings=SETTINGS)
+    assert read_json(files["report"])["diagonal"]["unit"] == "m"
     crop_scene(**files, mode="none", settings=SETTINGS)
     assert len(read_cloud(files["crop"])) == len(trial.scene)
 

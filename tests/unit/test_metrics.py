@@ -38,7 +38,7 @@ def ball(n, seed=0):
 def test_fitness_counts_both_ways_and_rmse_is_the_shift():
     scene = Cloud(grid(20))
     obj = Cloud(np.concatenate([grid(20)[:100] + [0, 0, 0.3], grid(20)[:100] + [0, 0, 50.0]]))
-    found = registration_metrics(obj, scene, Sim3.identity(), 0.5, 10.0, SETTINGS)
+    found = registration_metrics(obj, scene, Sim3.identity(), 0.5, 10.0, "m", SETTINGS)
     assert found["fitness_source"]["value"] == pytest.approx(0.5)
     assert found["fitness_target"]["value"] == pytest.approx(0.25)
     assert found["f_score"]["value"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)
@@ -50,13 +50,13 @@ def test_fitness_counts_both_ways_and_rmse_is_the_shift():
 def test_normals_of_unrelated_surfaces_agree_by_chance_only():
     rng = np.random.default_rng(0)
     found = registration_metrics(
-        Cloud(rng.uniform(size=(3000, 3))), Cloud(rng.uniform(size=(3000, 3))), Sim3.identity(), 0.2, 1.0, SETTINGS
+        Cloud(rng.uniform(size=(3000, 3))), Cloud(rng.uniform(size=(3000, 3))), Sim3.identity(), 0.2, 1.0, "m", SETTINGS
     )
     assert found["normal_consistency_cross"]["value"] == pytest.approx(0.5, abs=0.1)
 
 
 def test_no_inlier_gives_no_rmse():
-    found = registration_metrics(Cloud(grid(5)), Cloud(grid(5) + 100), Sim3.identity(), 0.1, 1.0, SETTINGS)
+    found = registration_metrics(Cloud(grid(5)), Cloud(grid(5) + 100), Sim3.identity(), 0.1, 1.0, "m", SETTINGS)
     assert found["inlier_rmse"]["value"] is None and found["fitness_source"]["value"] == 0
 
 
@@ -128,6 +128,7 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
     content = read_json(tmp_path / "metrics.json")
     completion = {name: item["value"] for name, item in content["completion"].items()}
     assert content["registration"]["fitness_target"]["value"] == 1.0
+    assert content["registration"]["tau"]["unit"] == content["completion"]["surface_variation_radius"]["unit"] == "m"
     assert completion["surface_variation"] < 1e-6
     assert completion["nue"] == pytest.approx(1.0, abs=0.15)
     assert completion["primitive_fitting_score"] > 0.95
@@ -142,6 +143,24 @@ def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_fo
     scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
     dense = rng.uniform(0, 4, (10000, 3)) * [1, 1, 0] + [4.2, 0, 0]
     settings = CompletionSettings(8.0, 16, 0.005, 0.01, 2, 25.0, 16, 2000)
-    found = completion_metrics(Cloud(scene), Cloud(scene), Cloud(dense), 6.0, settings, 0)
+    found = completion_metrics(Cloud(scene), Cloud(scene), Cloud(dense), 6.0, "m", settings, 0)
     assert found["nue"]["value"] == pytest.approx(5, rel=0.25)
     assert found["nue_density_invariant"]["value"] == pytest.approx(1, rel=0.2)
+
+
+def test_every_part_of_what_was_added_counts_in_the_variation_over_wide_radii():
+    """A smooth part that comes first in the file does not hide a rough part behind it."""
+    from scenefuse.metrics.completion import CompletionSettings, completion_metrics
+
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
+    smooth = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0] + [4.2, 0, 0]
+    rough = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0.1] + [8.4, 0, 0]
+    settings = CompletionSettings(8.0, 16, 0.005, 0.01, 2, 25.0, 16, 4000)
+    found = [
+        completion_metrics(Cloud(scene), Cloud(scene), Cloud(np.concatenate(parts)), 10.0, "m", settings, 0)
+        for parts in ([smooth, rough], [rough, smooth])
+    ]
+    for name in ("surface_variation_2pct", "surface_variation_4pct"):
+        first, second = (f[name]["value"] for f in found)
+        assert first == pytest.approx(second, rel=0.15) and first > 0.005
