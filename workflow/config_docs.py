@@ -18,9 +18,7 @@ def rows(schema: dict[str, Any], values: Any, prefix: str = "") -> list[str]:
         if "properties" in part:
             lines += rows(part, shipped, f"{name}.")
         else:
-            text = (
-                "per arm, see below" if isinstance(shipped, dict) else yaml.safe_dump(shipped, default_flow_style=True)
-            )
+            text = yaml.safe_dump(shipped, default_flow_style=True, sort_keys=False, width=float("inf"))
             text = text.strip().removesuffix("...").strip()
             lines.append(f"| `{name}` | `{text}` | {part.get('unit', '')} | {part['description']} |")
     return lines
