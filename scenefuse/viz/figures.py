@@ -65,7 +65,7 @@ def object_figures(
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
     registration.png (object over crop, with the verdict) and object.png (frames, masks, depth of the four stages,
-    held-out renders, the object's cloud).
+    renders, the object's cloud).
 
     Args:
         name: the object's name, for titles.
@@ -81,7 +81,7 @@ def object_figures(
         stage1: folder of stage 1 (depth_maps/).
         stage2: folder of stage 2 (depth_maps/).
         stage3: folder of stage 3 (depth_maps/).
-        stage4: folder of stage 4 (depth_maps/, renders/ of photos held out).
+        stage4: folder of stage 4 (depth_maps/, renders/).
         figures: output folder of PNG files, each below 1 MB.
 
     Raises:

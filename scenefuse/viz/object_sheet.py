@@ -1,4 +1,4 @@
-"""The sheet of one object by itself: frames, masks, depth of the four stages, held-out renders, cloud (Figure 3)."""
+"""The sheet of one object by itself: frames, masks, depth of the four stages, renders, cloud (Figure 3)."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 
 
 def object_sheet(name: str, cloud: Cloud, cameras: Path, masks: Path, stages: list[Path]) -> Image:
-    """Frames, masks, depth of each stage on one scale, held-out renders, the cloud from four sides (Figure 3)."""
+    """Frames, masks, depth of each stage on one scale, renders, the cloud from four sides (Figure 3)."""
     tile = (320, 240)
     photos = sorted(p for p in (cameras / "images").iterdir() if (masks / f"{p.stem}.png").is_file())
     if not photos:
@@ -29,14 +29,14 @@ def object_sheet(name: str, cloud: Cloud, cameras: Path, masks: Path, stages: li
     frames = [_read_rgb(p) for p in chosen]
     cut_out = [_dim_outside(f, _read_mask(masks / f"{p.stem}.png")) for f, p in zip(frames, chosen)]
     depths, shown = _depth_row(photos, masks, stages)
-    held_out, labels = _held_out_row(cameras, stages[-1])
+    renders, labels = _render_row(cameras, stages[-1])
     radii = point_radii(cloud.points)
     framed = inner(cloud.points)
     sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
     captions = {(2, i): f"stage {i + 1}, {shown}" for i in range(4)} | {(3, i): t for i, t in enumerate(labels)}
     captions |= {(0, i): p.name for i, p in enumerate(chosen)}
-    row_labels = ["frames", "masks", "depth", "held out", "cloud"]
-    rows: list[list[Image | None]] = [[*frames], [*cut_out], depths, held_out, sides]
+    row_labels = ["frames", "masks", "depth", "renders", "cloud"]
+    rows: list[list[Image | None]] = [[*frames], [*cut_out], depths, renders, sides]
     note = f"{len(photos)} frames with masks; cloud of {len(cloud):,} points; one depth scale, near bright, far dark"
     return draw_sheet(Sheet(f"{name}: the object by itself", note, rows, row_labels, [], captions, tile))
 
@@ -64,13 +64,13 @@ def _depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
     return picture
 
 
-def _held_out_row(cameras: Path, stage: Path) -> tuple[list[Image | None], list[str]]:
-    """Photo and render of two photos that no stage was trained on, and the captions."""
+def _render_row(cameras: Path, stage: Path) -> tuple[list[Image | None], list[str]]:
+    """Two of the photos that stage 4 was measured on and their renders, and the captions."""
     row: list[Image | None] = []
     labels = []
     by_stem = {p.stem: p for p in (cameras / "images").iterdir()} | {p.name: p for p in (cameras / "images").iterdir()}
-    renders = sorted(p for p in (stage / "renders").glob("*.png") if p.stem in by_stem)
-    for path in renders[:: max(1, len(renders) // 2)][:2]:
+    files = sorted(p for p in (stage / "renders").glob("*.png") if p.stem in by_stem)
+    for path in files[:: max(1, len(files) // 2)][:2]:
         photo = by_stem[path.stem]
         row += [_read_rgb(photo), _read_rgb(path)]
         labels += [f"photo {photo.name}", "its render, stage 4"]

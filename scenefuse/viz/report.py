@@ -23,13 +23,14 @@ _TABLES = {
 _NOTES = {
     "scenes": "How many photos the scene model holds, how well it fits them, and the cloud that came out. Lengths are "
     "in the unit named in the row: metres only where GPS made it so.",
-    "objects": "PSNR (dB) and SSIM compare renders with photos that training never saw: higher is better. Depth error, "
+    "objects": "PSNR (dB) and SSIM compare renders with photos: higher is better; `measured_on` says whether training "
+    "saw those photos. Depth error, "
     "accuracy, completeness and F-score exist only where the true surface is known.",
     "registration": "Fitness: share of object (source) or scene (target) points with a partner within the threshold. "
     "F-score: both at once, 1 is perfect; a wrong pose can have a high fitness, hardly a high F-score. Inlier RMSE is "
-    "in scene units, and as a share of the crop's diagonal. Normal consistency, cross: how parallel the two surfaces "
-    "are where they meet (0.5 is chance). Margin: lead over the second-best pose; near zero, two poses explain the "
-    "data equally well. Below its limits an object is refused and left out of the scene.",
+    "in the scene's unit, and as a share of the crop's diagonal. Normal consistency, cross: how parallel the two "
+    "surfaces are where they meet (0.5 is chance). Margin: lead over the second-best pose; near zero, two poses "
+    "explain the data equally well. Below its limits an object is refused and left out of the scene.",
     "completion": "Every measure stands beside its null, the same measure on a matched random cloud: only a clear "
     "distance from the null says something. Surface variation: 0 smooth to 1/3. NUE: evenness of the density after "
     "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
@@ -46,7 +47,7 @@ _OBJECT_FIGURES = {
     "before_after": "The scene around the object before and after fusion, same cameras.",
     "provenance": "Grey: measured in the scene. Orange: added from the object.",
     "registration": "The object (orange) over the scene's crop (blue dots).",
-    "object": "Frames, masks, depth of the four stages on one scale, held-out renders, the object's cloud.",
+    "object": "Frames, masks, depth of the four stages on one scale, renders beside their photos, the object's cloud.",
 }
 
 
@@ -75,7 +76,7 @@ def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], titl
         "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
         "<nav>" + "".join(f'<a href="#{escape(n)}">{escape(n.removeprefix("table-"))}</a>' for n in links) + "</nav>",
         *(_object_section(folder, tables["registration"]) for folder in objects),
-        *(_scene_section(folder) for folder in scenes),
+        *(_scene_section(folder, tables["scenes"]) for folder in scenes),
         *(_table_section(name, rows) for name, rows in tables.items() if rows),
         f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
     ]
@@ -90,11 +91,20 @@ def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], titl
     print(f"{report}: {len(page) / 1e6:.1f} MB", flush=True)
 
 
-def _scene_section(folder: Path) -> str:
-    """Heading and figure of a scene; nothing without a figure."""
+def _scene_section(folder: Path, scenes: list[dict[str, str]]) -> str:
+    """Heading, the completed scene's files, and the figure; nothing without a figure."""
     path = folder / "scene.png"
-    heading = f"<h2>Scene {escape(folder.name)}</h2>"
-    return heading + _picture(path, "From above and obliquely: cameras red, objects boxed.") if path.is_file() else ""
+    if not path.is_file():
+        return ""
+    row = next((r for r in scenes if r.get("scene") == folder.name), {})
+    parts = [f"<h2>Scene {escape(folder.name)}</h2>"]
+    if row.get("completed_points", "-") not in ("-", ""):
+        parts.append(
+            f"<p><code>{escape(str(folder))}/completed.ply</code> and <code>completed.laz</code>: the scene with all "
+            f"registered objects in it ({escape(row['completed_by'])}), {escape(row['completed_points'])} points; "
+            "<code>source</code> says where each is from, <code>completed.json</code> what its numbers mean.</p>"
+        )
+    return "\n".join([*parts, _picture(path, "From above and obliquely: cameras red, objects boxed.")])
 
 
 def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:

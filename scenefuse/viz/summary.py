@@ -10,10 +10,10 @@ import pandas as pd
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.viz.tables import (
     REGISTRATION,
-    SCENE_FILES,
     Collected,
     ablation_table,
     collect,
+    collect_scene,
     completion_table,
     number_in,
     objects_table,
@@ -37,28 +37,49 @@ _CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "
 
 
 def write_summary(
-    *, scenes: list[Path], objects: list[Path], arms: list[str], benchmarks: Path, logs: Path, summary: Path
+    *,
+    scenes: list[Path],
+    chunks: int,
+    objects: list[Path],
+    scene_of: list[str],
+    arms: list[str],
+    benchmarks: Path,
+    logs: Path,
+    summary: Path,
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
     Writes registration.tsv, completion.tsv, ablation.tsv, runtime.tsv, scenes.tsv, objects.tsv and, last, summary.txt.
-    A value that does not exist is '-'. An object without results is named with the last error of its logs.
+    A value that does not exist is '-'. An object without results is named with the last error of its logs. What an
+    earlier run left behind a step that failed since is not shown.
 
     Args:
         scenes: result folders of the scenes (results/scenes/{scene}).
+        chunks: jobs that a scene's depth maps are split into.
         objects: result folders of the objects (results/objects/{object}); they need not exist.
+        scene_of: name of the scene that each object lies in.
         arms: registration arms, the one that is fused first.
         benchmarks: folder of Snakemake's benchmark files, {rule}/{job}.tsv.
         logs: folder of the rules' logs, {rule}/{job}.log.
         summary: output folder; other files in it are left alone.
 
     Raises:
-        StageError: no arm is given.
+        StageError: no arm is given, or not one scene for each object.
     """
     if not arms:
         raise StageError("no registration arm is given; name at least one, the one that is fused first")
-    found = [collect(folder, arms, logs) for folder in objects]
-    scene_fields = {folder.name: read_fields(folder, SCENE_FILES) for folder in scenes}
+    if len(scene_of) != len(objects):
+        raise StageError(f"{len(objects)} objects but {len(scene_of)} scenes are given; name the scene of each object")
+    parts = {folder.name: collect_scene(folder, chunks) for folder in scenes}
+    found = [
+        collect(folder, arms, logs, scene, parts[scene][1] if scene in parts else "")
+        for folder, scene in zip(objects, scene_of)
+    ]
+    scene_fields = {name: fields for name, (fields, _) in parts.items()}
+    for folder in scenes:
+        verdicts = [status_of(item, arms[0]) for item, scene in zip(found, scene_of) if scene == folder.name]
+        if not parts[folder.name][1] and "missing" not in verdicts:
+            scene_fields[folder.name] |= read_fields(folder, ["completed.json"])
     tables = {
         "registration": registration_table(found, arms),
         "completion": completion_table(found, arms[0]),
@@ -111,11 +132,22 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame))
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
-    return lines + _truth_lines(fields) + _remarks(fields)
+    return lines + _completed_lines(fields) + _truth_lines(fields) + _remarks(fields)
+
+
+def _completed_lines(fields: Fields) -> list[str]:
+    """The scene with all its objects: what was added and what is not in it."""
+    added = find(fields, "completed.added_points")
+    if added is None:
+        return _line("completed", "not written: an object has no verdict, or the log of complete_scene says why")
+    parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
+    parts += [f"{name} adds {count}" for name, count in added.items()]
+    parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
+    return _line("completed", ", ".join(parts))
 
 
 def _object_lines(item: Collected, row: dict[str, Any], arms: list[str]) -> list[str]:
-    lines = _line("missing", _named(item.missing)) + _line("because", item.reason)
+    lines = _line("missing", item.missing) + _line("because", item.reason)
     fields = item.arms[arms[0]]
     lines += _line("reason", "" if status_of(item, arms[0]) == "missing" else str(reason_of(item, arms[0]) or ""))
     if row["registered"] is not None and row["registered"] == row["registered"]:
@@ -124,7 +156,7 @@ def _object_lines(item: Collected, row: dict[str, Any], arms: list[str]) -> list
     lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
     for stage in (1, 2, 3, 4):
         names = {
-            "psnr_db": ("held-out PSNR", "dB"),
+            "psnr_db": ("PSNR", f"dB on {row.get(f'stage{stage}_measured_on') or 'photos'}"),
             "ssim": ("SSIM", ""),
             "depth_error_over_diagonal": ("median depth error", "of the diagonal"),
             "depth_within_1pct": ("within 1 %", ""),
@@ -137,11 +169,6 @@ def _object_lines(item: Collected, row: dict[str, Any], arms: list[str]) -> list
     lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
     lines += _around_line(item.stages) + _completion_lines(item, arms[0])
     return lines + _remarks(item.stages | fields | item.fusion)
-
-
-def _named(missing: list[str]) -> str:
-    """The first of the missing files, and how many more."""
-    return f"{missing[0]}{f' and {len(missing) - 1} more' if len(missing) > 1 else ''}" if missing else ""
 
 
 def _arm_lines(item: Collected, arms: list[str]) -> list[str]:
@@ -177,8 +204,8 @@ def _arm_lines(item: Collected, arms: list[str]) -> list[str]:
 
 
 def _three(item: float | int | None) -> str:
-    """Three significant digits, or '-'."""
-    return "-" if item is None else f"{item:.3g}"
+    """Three significant digits, two of a very small number: at most seven characters; or '-'."""
+    return "-" if item is None else f"{item:.1e}" if 0 < abs(item) < 1e-4 else f"{item:.3g}"
 
 
 def _around_line(fields: Fields) -> list[str]:

@@ -3,18 +3,24 @@
 A run may be partial: a value that does not exist is empty, an object without results carries its last error.
 """
 
+import itertools
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from scenefuse.viz.values import Fields, find, find_like, load, number, unit_of
+from scenefuse.viz.values import Fields, find, load, number, unit_of
 
-_OBJECT_FILES = ("photos", "sfm", "cameras", "masks", "stage1", "stage2", "stage3", "stage4", "object")
-SCENE_FILES = ("photos", "matches", "sparse", "georeference", "dense", "dense_cloud", "truth")
-_JOIN_FILES = ("crop", "scale", "coarse", "fine", "metrics", "truth")
+# What each step leaves, in the order in which the steps run.
+_OBJECT_FILES = (
+    *("photos.json", "features.db", "matches.json", "sfm.json", "cameras.json", "masks.json"),
+    *("stage1.json", "stage2.json", "stage3.json", "stage4.json", "object.json"),
+)
+_SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "dense.json")
+_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
 # Columns of registration.tsv and rows of ablation.tsv: name, and where a value may stand, best first.
 REGISTRATION: dict[str, tuple[str, ...]] = {
     "scale": ("fine.scale",),
@@ -44,7 +50,7 @@ class Collected:
         stages: its own stages' quantities, `stage4.psnr` for instance.
         arms: arm -> quantities of its registration, `fine.scale` for instance.
         fusion: quantities of the fusion.
-        missing: files that should be there and are not.
+        missing: the first file that should be there and is not, or "".
         reason: the last error in its logs, when something is missing.
     """
 
@@ -52,7 +58,7 @@ class Collected:
     stages: Fields
     arms: dict[str, Fields]
     fusion: Fields
-    missing: list[str]
+    missing: str
     reason: str
 
 
@@ -128,6 +134,7 @@ def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, errors against truth."""
     rows = []
     for name, fields in scenes.items():
+        added = find(fields, "completed.added_points")
         row: dict[str, Any] = {
             "scene": name,
             "photos": number_in(fields, "sparse.total", "photos.count"),
@@ -138,6 +145,8 @@ def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
             "points": number_in(fields, "dense_cloud.points"),
             "spacing": number_in(fields, "dense_cloud.spacing"),
             "backend": plain(find(fields, "dense_cloud.backend")),
+            "completed_points": number_in(fields, "completed.points"),
+            "completed_by": None if added is None else ", ".join(added) or "none",
         }
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
         row["error"] = None if find(fields, "dense_cloud.points") is not None else last_error(logs, name)
@@ -159,8 +168,9 @@ def objects_table(objects: list[Collected]) -> pd.DataFrame:
             "mask_iou": number_in(fields, "truth.mask_iou_mean"),
         }
         for stage in (2, 4):
-            row[f"stage{stage}_psnr_db"] = _like(fields, f"stage{stage}", "psnr")
-            row[f"stage{stage}_ssim"] = _like(fields, f"stage{stage}", "ssim")
+            row[f"stage{stage}_psnr_db"] = number_in(fields, f"stage{stage}.psnr_held_out")
+            row[f"stage{stage}_ssim"] = number_in(fields, f"stage{stage}.ssim")
+            row[f"stage{stage}_measured_on"] = find(fields, f"stage{stage}.measured_on")
         for stage in (1, 2, 3, 4):
             row[f"stage{stage}_depth_error_over_diagonal"] = number_in(fields, f"truth.stage{stage}_depth_error")
             row[f"stage{stage}_depth_within_1pct"] = number_in(fields, f"truth.stage{stage}_depth_within_1pct")
@@ -168,7 +178,7 @@ def objects_table(objects: list[Collected]) -> pd.DataFrame:
         row["accuracy_pct_of_diagonal"] = number_in(fields, "truth.cloud_accuracy_median")
         for name in ("precision", "completeness", "f_score"):
             row[f"{name}_1pct"] = number_in(fields, f"truth.cloud_{name}_1pct")
-        row["missing"] = ", ".join(item.missing) or None
+        row["missing"] = item.missing or None
         row["error"] = item.reason or None
         rows.append(row)
     return pd.DataFrame(rows)
@@ -196,26 +206,74 @@ def truth_numbers(fields: Fields) -> Fields:
     return {k: v for k, v in fields.items() if k.startswith("truth.") and isinstance(v["value"], (int, float))}
 
 
-def collect(folder: Path, arms: list[str], logs: Path) -> Collected:
-    """Everything about one object; files that do not exist are simply absent."""
-    per_arm = {arm: read_fields(folder / "registration" / arm, _JOIN_FILES) for arm in arms}
-    per_arm[arms[0]] |= read_fields(folder, ("metrics",))
-    truth = read_fields(folder, ("truth",))
-    of_object = {key: item for key, item in truth.items() if not key.startswith("truth.arms.")}
+def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
+    """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
+
+    Args:
+        folder: the scene's results.
+        chunks: jobs that its depth maps are split into.
+    """
+    there, gap = unbroken(folder, (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)), "dense_cloud.json"))
+    found = read_fields(folder, [name for name in there if "/" not in name])
+    return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
+
+
+def collect(folder: Path, arms: list[str], logs: Path, scene: str = "", scene_gap: str = "") -> Collected:
+    """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
+
+    Args:
+        folder: the object's results.
+        arms: registration arms, the one that is fused first.
+        logs: folder of the rules' logs.
+        scene: name of the scene that the object lies in.
+        scene_gap: the first file that this scene lacks, or "".
+    """
+    there, gap = unbroken(folder, _OBJECT_FILES)
+    stages = read_fields(folder, there)
+    who = folder.name
+    if not gap and scene_gap:
+        gap, who = f"{scene_gap} of the scene {scene}", scene
+    per_arm: dict[str, Fields] = {arm: {} for arm in arms}
+    fusion: Fields = {}
+    for arm in [] if gap else arms:
+        there, lacking = unbroken(folder / "registration" / arm, _JOIN_FILES)
+        per_arm[arm] = read_fields(folder / "registration" / arm, there)
+        gap = gap or (lacking and f"registration/{arm}/{lacking}")
+    if "fine.status" in per_arm[arms[0]]:
+        there, lacking = unbroken(folder, ("fusion.json", "metrics.json"))
+        fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
+        per_arm[arms[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
+        gap = gap or lacking
+    judged = fusion and all("fine.status" in fields for fields in per_arm.values())
+    truth = read_fields(folder, ["truth.json"]) if judged else {}
     for arm in arms:
         prefix = f"truth.arms.{arm}."
         per_arm[arm] |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
-    wanted = [f"{name}.json" for name in (*_OBJECT_FILES, "fusion", "metrics")]
-    wanted += [f"registration/{arm}/{name}.json" for arm in arms for name in _JOIN_FILES if name != "truth"]
-    missing = [name for name in wanted if not (folder / name).is_file()][:1]  # what comes later misses it too
-    reason = (last_error(logs, folder.name) or "no error in its logs; it has not run yet") if missing else ""
-    stages = read_fields(folder, _OBJECT_FILES) | of_object
-    return Collected(folder.name, stages, per_arm, read_fields(folder, ("fusion",)), missing, reason)
+    stages |= {key: item for key, item in truth.items() if not key.startswith("truth.arms.")}
+    unit = per_arm[arms[0]].get("crop.diagonal", {}).get("unit", "scene units")
+    per_arm = {arm: _in_unit(fields, unit) for arm, fields in per_arm.items()}
+    reason = (last_error(logs, who) or "no error in its logs; it has not run yet") if gap else ""
+    return Collected(folder.name, stages, per_arm, fusion, gap, reason)
 
 
-def read_fields(folder: Path, names: tuple[str, ...]) -> Fields:
-    """The quantities of several JSONs of a folder, each prefixed by its file's name."""
-    return {f"{name}.{key}": item for name in names for key, item in load(folder / f"{name}.json").items()}
+def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
+    """The files of a chain before the first that is missing, and that one, or "".
+
+    Snakemake removes what a rule wrote before it runs the rule again: what is behind a gap is from an earlier run.
+    """
+    there = list(itertools.takewhile(lambda name: (folder / name).is_file(), names))
+    return there, names[len(there)] if len(there) < len(names) else ""
+
+
+def read_fields(folder: Path, names: Sequence[str]) -> Fields:
+    """The quantities of the JSONs among some files of a folder, each prefixed by its file's name."""
+    stems = [name.removesuffix(".json") for name in names if name.endswith(".json")]
+    return {f"{stem}.{key}": item for stem in stems for key, item in load(folder / f"{stem}.json").items()}
+
+
+def _in_unit(fields: Fields, unit: str) -> Fields:
+    """The quantities with the scene's own unit of length where a stage knows it as "scene units" only."""
+    return {k: {**item, "unit": item["unit"].replace("scene units", unit)} for k, item in fields.items()}
 
 
 def status_of(item: Collected, arm: str) -> str:
@@ -238,11 +296,6 @@ def _six(item: float | int | None) -> str | None:
 def number_in(fields: Fields, *names: str) -> float | int | None:
     """The first of the named values when it is a number."""
     found = find(fields, *names)
-    return found if isinstance(found, (int, float)) else None
-
-
-def _like(fields: Fields, *parts: str) -> float | int | None:
-    found = find_like(fields, *parts)
     return found if isinstance(found, (int, float)) else None
 
 

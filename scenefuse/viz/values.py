@@ -54,12 +54,6 @@ def number(item: Any) -> str:
     return "-" if item is None or item == "" else str(item)
 
 
-def find_like(fields: Fields, *parts: str) -> Any:
-    """The value whose full name holds all of `parts`, the shortest name first; else None."""
-    names = [key for key in fields if all(part in key for part in parts)]
-    return fields[min(names, key=lambda key: (len(key), key))]["value"] if names else None
-
-
 def unit_of(fields: Fields, *names: str) -> str | None:
     """The unit of what `find` finds; None when there is nothing."""
     for name in names:

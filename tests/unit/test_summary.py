@@ -20,19 +20,33 @@ HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load
 def results(tmp_path):
     """A scene, a registered house, a refused balloon, and a sculpture whose masks failed."""
     scene = tmp_path / "scenes/demo"
+    for name in ("photos.json", "features.db", "matches.json", "dense.json", "depth/0.json", "depth/1.json"):
+        write_json(scene / name, {})
     write_json(scene / "sparse.json", {"total": quantity(60, "1"), "registered": quantity(59, "1")})
+    write_json(scene / "georeference.json", {"length_unit": quantity("m", "")})
     write_json(scene / "dense_cloud.json", {"points": quantity(5000, "1"), "fallback": quantity("CPU used", "")})
+    completed = {"added_points": quantity({"house": 30}, "points"), "unregistered": quantity({"balloon": "weak"}, "")}
+    write_json(scene / "completed.json", {"points": quantity(5030, "points"), **completed})
     for name, status in (("house", "registered"), ("balloon", "unregistered")):
         folder = tmp_path / "objects" / name
-        write_json(folder / "stage4.json", {"held_out_psnr": quantity(27.5, "dB")})
+        for stage in ("photos", "matches", "sfm", "cameras", "masks", "stage1", "stage2", "stage3"):
+            write_json(folder / f"{stage}.json", {})
+        (folder / "features.db").touch()
+        quality = {"psnr_held_out": quantity(27.5, "dB"), "measured_on": quantity("training photos", "")}
+        write_json(folder / "stage4.json", quality)
         write_json(folder / "object.json", {"points": quantity(1000, "1")})
         for k, arm in enumerate(("full", "paper")):
             fine = {"status": quantity(status, ""), "reason": quantity("" if status == "registered" else "weak", "")}
-            write_json(folder / f"registration/{arm}/fine.json", fine | {"scale": quantity(2.0 + k, "m")})
+            write_json(folder / f"registration/{arm}/crop.json", {"diagonal": quantity(15.0, "m")})
+            for stage in ("scale", "coarse"):
+                write_json(folder / f"registration/{arm}/{stage}.json", {})
+            scale = {"scale": quantity(2.0 + k, "scene units per object unit")}
+            write_json(folder / f"registration/{arm}/fine.json", fine | scale)
             scores = {"fitness_source": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
             write_json(folder / f"registration/{arm}/metrics.json", {"registration": scores})
         completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1"), "nue_scene": quantity(None, "1")}
         write_json(folder / "metrics.json", {"completion": completion})
+        write_json(folder / "fusion.json", {"added_points": quantity(30, "points")})
         arms = {arm: {"scale_error_pct": quantity(0.5 + k, "%")} for k, arm in enumerate(("full", "paper"))}
         scene_scores = {f"scene_f_score_{w}": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
         write_json(folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "arms": arms, **scene_scores})
@@ -50,10 +64,12 @@ def results(tmp_path):
     return tmp_path
 
 
-def summarise(results):
+def summarise(results, names=("house", "balloon", "sculpture")):
     write_summary(
         scenes=[results / "scenes/demo"],
-        objects=[results / "objects" / name for name in ("house", "balloon", "sculpture")],
+        chunks=2,
+        objects=[results / "objects" / name for name in names],
+        scene_of=["demo"] * len(names),
         arms=["full", "paper"],
         benchmarks=results / "benchmarks",
         logs=results / "logs",
@@ -79,7 +95,7 @@ def test_registration_holds_every_object_and_arm(results):
 
 def test_ablation_sets_the_arms_side_by_side(results):
     table = read(summarise(results), "ablation").set_index(["object", "measure"])
-    assert table.loc[("house", "scale"), "unit"] == "m"
+    assert table.loc[("house", "scale"), "unit"] == "m per object unit"
     assert [float(table.loc[("house", "scale"), arm]) for arm in ("full", "paper")] == [2.0, 3.0]
     assert table.loc[("sculpture", "status"), "full"] == "missing"
 
@@ -124,10 +140,48 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "1 of 3 objects registered" in text
 
 
+def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
+    text = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
+    assert "PSNR 27.5 dB on training photos" in text and "held-out" not in text
+    assert "completed.ply, completed.laz, points 5030, house adds 30, without balloon" in text
+    assert "completed.ply" not in (summarise(results) / "summary.txt").read_text()
+
+
+@pytest.mark.parametrize("gone", ["features.db", "depth/1.json", "dense_cloud.json"])
+def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gone):
+    (results / "scenes/demo" / gone).unlink()
+    (results / "logs/scene_sparse").mkdir()
+    (results / "logs/scene_sparse/demo.log").write_text("error: only 3 photos\n")
+    summary = summarise(results)
+    text = (summary / "summary.txt").read_text()
+    assert "no dense cloud: only 3 photos [scene_sparse/demo.log]" in text and "5000" not in text
+    assert "completed.ply" not in text
+    table = read(summary, "registration").set_index(["object", "arm"])
+    assert table.loc[("house", "full"), "status"] == "missing" and np.isnan(table.loc[("house", "full"), "scale"])
+    assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
+
+
+def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
+    (results / "objects/house/masks.json").unlink()
+    summary = summarise(results)
+    assert read(summary, "registration").set_index(["object", "arm"]).loc[("house", "full"), "status"] == "missing"
+    assert np.isnan(read(summary, "objects").set_index("object").loc["house", "stage4_psnr_db"])
+    assert "F-score 0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
+
+
+def test_a_failed_arm_leaves_the_verdict_of_the_full_one(results):
+    (results / "objects/house/registration/paper/coarse.json").unlink()
+    table = read(summarise(results), "registration").set_index(["object", "arm"])
+    assert table.loc[("house", "full"), "status"] == "registered"
+    assert table.loc[("house", "paper"), "status"] == "missing"
+
+
 def test_an_empty_run_is_a_summary_too(tmp_path):
     write_summary(
         scenes=[tmp_path / "scenes/demo"],
+        chunks=2,
         objects=[tmp_path / "objects/house"],
+        scene_of=["demo"],
         arms=["full"],
         benchmarks=tmp_path / "benchmarks",
         logs=tmp_path / "logs",
@@ -137,7 +191,8 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
     assert "it has not run yet" in text and "no benchmark files yet" in text
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
     with pytest.raises(StageError, match="no registration arm"):
-        write_summary(scenes=[], objects=[], arms=[], benchmarks=tmp_path, logs=tmp_path, summary=tmp_path)
+        nothing = {"benchmarks": tmp_path, "logs": tmp_path, "summary": tmp_path}
+        write_summary(scenes=[], chunks=1, objects=[], scene_of=[], arms=[], **nothing)
 
 
 def test_the_last_error_is_that_of_the_named_object(tmp_path):
@@ -168,14 +223,14 @@ def test_a_damaged_json_counts_as_absent(tmp_path):
     assert load(tmp_path / "x.json") == {} and load(tmp_path / "none.json") == {}
 
 
-def report(results):
+def report(results, names=("house", "balloon", "sculpture")):
     figures = results / "objects/house/figures"
     figures.mkdir(parents=True)
     for name in ("before", "after", "provenance"):
         Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures / f"{name}.png")
     page = results / "report.html"
     write_report(
-        summary=summarise(results),
+        summary=summarise(results, names),
         scenes=[results / "scenes/demo"],
         objects=[results / "objects" / name for name in ("house", "sculpture")],
         title="Run <1>",
@@ -191,6 +246,12 @@ def test_the_page_is_offline_and_escapes_text(results):
     assert not re.search(r"https?://|<link|src=\"(?!data:)|url\(", page)
     assert page.count("data:image/webp;base64,") == 3
     assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<h2")[0]
+
+
+def test_the_page_names_the_completed_scene_once_every_object_has_a_verdict(results):
+    Image.fromarray(np.zeros((3, 4, 3), dtype=np.uint8)).save(results / "scenes/demo/scene.png")
+    page = report(results, ["house", "balloon"])
+    assert "completed.ply" in page and "registered objects in it (house), 5030 points" in page
 
 
 def test_the_page_names_objects_without_figures(results):

@@ -253,6 +253,7 @@ def summary_command(log):
     """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
     return (
         f"python {script('summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
-        f" --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)} --arms {' '.join(ARMS)}"
+        f" --chunks {len(CHUNKS)} --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)}"
+        f" --scene-of {' '.join(row['scene'] for row in OBJECTS.values())} --arms {' '.join(ARMS)}"
         f" --benchmarks results/benchmarks --logs results/logs --summary results/summary &> {log}"
     )
