@@ -28,5 +28,7 @@ include: "workflow/rules/summary.smk"
 rule all:
     default_target: True
     input:
+        expand("results/scenes/{scene}/completed.ply", scene=SCENES),
+        expand("results/scenes/{scene}/completed.laz", scene=SCENES),
         "results/summary/summary.txt",
         "results/summary/report.html",

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from scenefuse.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
+from scenefuse.units import length_unit
 
 FROM_SCENE, FROM_OBJECT = 0, 1
 
@@ -89,31 +90,23 @@ def fuse(
         settings: see FusionSettings.
     """
     start = time.perf_counter()
-    whole = _with_provenance(read_cloud(scene), FROM_SCENE)
+    whole = with_provenance(read_cloud(scene), FROM_SCENE)
     box = read_json(crop_report)
     registration = read_json(fine)
     status, reason = value(registration, "status"), value(registration, "reason")
     part, obj = read_cloud(crop), read_cloud(object)
     step = spacing(part.points)
-    if status == "registered":
-        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-        fusion = fuse_clouds(obj, whole, part, pose, mode, settings)
-    else:
+    fusion = fuse_registered(obj, whole, part, registration, mode, settings)
+    if status != "registered":
         print(f"the object is not fused: {reason}", flush=True)
-        nothing = _with_provenance(obj, FROM_OBJECT)[np.zeros(len(obj), dtype=bool)]
-        fusion = Fusion(np.ones(len(whole), dtype=bool), nothing, np.ones(3), np.zeros(3), 0.0)
     kept, added = whole[fusion.kept], fusion.added
     level = np.array(value(box, "level_from_scene"))
     low, high = np.array(value(box, "box_low")), np.array(value(box, "box_high"))
     levelled = kept.points @ level.T
     around = kept[((levelled >= low) & (levelled <= high)).all(1)]
-    complete = concatenate([kept, added]) if len(added) else kept
     write_cloud(fused, concatenate([around, added]) if len(added) else around)
-    write_cloud(fused_scene, complete)
-    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
-    about_origin = replace(crs_from_scene, translation=np.zeros(3))
-    write_laz(fused_laz, complete.transformed(about_origin), crs_from_scene.translation, crs)
-    unit = "scene units"
+    crs = write_scene(fused_scene, fused_laz, concatenate([kept, added]) if len(added) else kept, georeference)
+    unit = length_unit(georeference)
     write_json(
         report,
         {
@@ -136,6 +129,17 @@ def fuse(
     )
 
 
+def fuse_registered(
+    obj: Cloud, scene: Cloud, part: Cloud, registration: dict[str, Any], mode: str, settings: FusionSettings
+) -> Fusion:
+    """`fuse_clouds` at the pose of a fine registration's JSON; an unregistered object leaves the scene as it is."""
+    if value(registration, "status") == "registered":
+        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
+        return fuse_clouds(obj, scene, part, pose, mode, settings)
+    nothing = with_provenance(obj, FROM_OBJECT)[np.zeros(len(obj), dtype=bool)]
+    return Fusion(np.ones(len(scene), dtype=bool), nothing, np.ones(3), np.zeros(3), 0.0)
+
+
 def fuse_clouds(
     obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, mode: str, settings: FusionSettings
 ) -> Fusion:
@@ -149,7 +153,7 @@ def fuse_clouds(
         mode: fill, append or replace.
         settings: see FusionSettings.
     """
-    moved = _with_provenance(obj, FROM_OBJECT).transformed(scene_from_object)
+    moved = with_provenance(obj, FROM_OBJECT).transformed(scene_from_object)
     moved = moved[moved.fields["confidence"] >= settings.min_confidence]
     step = spacing(part.points)
     low, high = moved.points.min(0), moved.points.max(0)
@@ -191,6 +195,26 @@ def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Arr
     return gain, middle_b - gain * middle_a
 
 
+def with_provenance(cloud: Cloud, source: int) -> Cloud:
+    """The cloud with `source` (uint8), `confidence` (float32) and `views` (int32), measured ones where it has them."""
+    n, had = len(cloud), cloud.fields
+    fields: dict[str, NDArray[Any]] = {
+        "source": had.get("source", np.full(n, source)).astype(np.uint8),
+        "confidence": had.get("confidence", np.ones(n)).astype(np.float32),
+        "views": had.get("views", np.zeros(n)).astype(np.int32),
+    }
+    return replace(cloud, fields=fields)
+
+
+def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
+    """Write a cloud in the scene's frame as PLY, and as LAZ in the scene's CRS; returns that CRS, None without one."""
+    write_cloud(ply, cloud)
+    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
+    about_origin = replace(crs_from_scene, translation=np.zeros(3))
+    write_laz(laz, cloud.transformed(about_origin), crs_from_scene.translation, crs)
+    return crs
+
+
 def _thin(cloud: Cloud, wanted: float) -> Cloud:
     """Thin a cloud to a median spacing of `wanted`; one that is sparser already stays as it is."""
     if spacing(cloud.points) >= wanted:
@@ -226,17 +250,6 @@ def _feather(added: Cloud, kept: Cloud, width: float, move: bool, fill: float) -
         height = np.clip((offset * normal).sum(1, keepdims=True), -fill, fill)
         added = replace(added, points=added.points + share * height * normal)
     return added
-
-
-def _with_provenance(cloud: Cloud, source: int) -> Cloud:
-    """The cloud with `source` (uint8), `confidence` (float32) and `views` (int32), measured ones where it has them."""
-    n, had = len(cloud), cloud.fields
-    fields: dict[str, NDArray[Any]] = {
-        "source": had.get("source", np.full(n, source)).astype(np.uint8),
-        "confidence": had.get("confidence", np.ones(n)).astype(np.float32),
-        "views": had.get("views", np.zeros(n)).astype(np.int32),
-    }
-    return replace(cloud, fields=fields)
 
 
 def _crs_from_scene(georeference: Path | None) -> tuple[Sim3, str] | None:

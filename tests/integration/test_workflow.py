@@ -66,6 +66,17 @@ def test_fusion_completes_what_is_registered_and_keeps_the_provenance_of_every_p
         assert added.sum() == 0
 
 
+def test_the_completed_scene_holds_what_the_object_adds(finished):
+    scene = finished / "results/scenes/demo"
+    completed, alone = (
+        read_cloud(path) for path in (scene / "completed.ply", finished / "results/objects/house/fused_scene.ply")
+    )
+    assert np.allclose(completed.points, alone.points)
+    assert np.array_equal(completed.fields["source"], alone.fields["source"])
+    assert json.loads((scene / "completed.json").read_text())["sources"]["value"] == {"0": "scene", "1": "house"}
+    assert (scene / "completed.laz").stat().st_size > 0
+
+
 def test_transforms_in_the_ledger_agree_with_the_registration(finished):
     house = finished / "results/objects/house"
     ledger = json.loads((house / "frames.json").read_text())
@@ -86,7 +97,10 @@ def test_a_second_run_does_nothing(finished, snakemake):
         ),
         (
             {"fusion": {"fill_spacings": 2.0}},
-            {"fuse", "metrics", "evaluate_object", "object_figures", "summary", "report_page", "all"},
+            {
+                *("fuse", "complete_scene", "metrics", "evaluate_object"),
+                *("object_figures", "summary", "report_page", "all"),
+            },
         ),
     ],
     ids=["metrics", "fusion"],

@@ -107,7 +107,11 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     crs_from_scene = Sim3(1.0, np.eye(3), np.array([4e5, 5e6, 100.0]))
     write_json(
         tmp_path / "georeference.json",
-        {"crs": quantity("EPSG:32632", ""), "crs_from_scene": quantity(crs_from_scene.matrix, "m")},
+        {
+            "length_unit": quantity("m", ""),
+            "crs": quantity("EPSG:32632", ""),
+            "crs_from_scene": quantity(crs_from_scene.matrix, "m"),
+        },
     )
     fuse(
         object=tmp_path / "object.ply",
@@ -128,6 +132,7 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
         read_cloud(tmp_path / "fused.ply"),
         read_json(tmp_path / "fusion.json"),
     )
+    assert report["scene_spacing"]["unit"] == "m"
     added = value(report, "added_points")
     assert (added > 0) == (status == "registered")
     assert len(whole) == len(scene) + added and (whole.fields["source"] == 1).sum() == added

@@ -225,7 +225,8 @@ def results_of(wildcards):
         "frames.json",
         *(f"registration/{arm}/metrics.json" for arm in ARMS),
     ]
-    files = [f"results/scenes/{name}/dense_cloud.json" for name in SCENES]
+    scene_ends = ["dense_cloud.json", "completed.json"]
+    files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
     files += [f"results/objects/{name}/{end}" for name in OBJECTS for end in ends]
     files += [
         f"results/scenes/{name}/truth.json"
@@ -240,12 +241,15 @@ def results_of(wildcards):
     return files
 
 
-def crops_of(wildcards):
-    """The crops of all objects of a scene."""
-    return [
-        f"results/objects/{name}/registration/full/crop.ply"
-        for name, row in OBJECTS.items()
-        if row["scene"] == wildcards.scene
+def objects_in(wildcards):
+    """The names of the objects of a scene."""
+    return [name for name, row in OBJECTS.items() if row["scene"] == wildcards.scene]
+
+
+def of_objects(path):
+    """Input function: a file of every object of the scene."""
+    return lambda wildcards: [
+        f"results/objects/{name}/{path}" for name in objects_in(wildcards)
     ]
 
 

@@ -1,9 +1,10 @@
-# The join: crop, scale, coarse and fine registration, fusion, metrics.
+# The join: crop, scale, coarse and fine registration, fusion, metrics; and each scene with all its objects.
 #
 # INPUTS    config/objects.tsv: fiducials; the scene's cloud and model; the object's cloud; config: registration, arms, fusion, metrics
 # OUTPUTS   results/objects/{object}/registration/{arm}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png, metrics.json
 #           results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, fusion.json     of the `full` arm
 #           results/objects/{object}/frames.json, metrics.json
+#           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 #
 # An arm is a registration recipe: `full` is the one that is fused, the others (`paper`, `no_scale`, `no_crop`) are run beside it
 # by the same scripts, with the settings that config `arms` lays over config `registration`, and measured at the same thresholds.
@@ -35,7 +36,7 @@ rule crop:
     message:
         "{wildcards.object}, arm {wildcards.arm}: crop"
     shell:
-        "exec python {params.script} --scene {input.scene} --model {input.model} --fiducials {input.fiducials:q}"
+        "exec python {params.script} --scene {input.scene} --model {input.model} --georeference {input.model_json} --fiducials {input.fiducials:q}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
@@ -177,6 +178,40 @@ rule fuse:
         "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-report {input.crop_json}"
         " --fine {input.fine} --georeference {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
         " --fused-laz {output.laz} --report {output.report} {params.options} &> {log}"
+
+
+rule complete_scene:
+    """The scene with all its registered objects in it; `source` says where each point is from (F3)."""
+    input:
+        scene="results/scenes/{scene}/dense.ply",
+        georeference="results/scenes/{scene}/georeference.json",
+        objects=of_objects("object.ply"),
+        crops=of_objects("registration/full/crop.ply"),
+        fines=of_objects("registration/full/fine.json"),
+    output:
+        cloud="results/scenes/{scene}/completed.ply",
+        laz="results/scenes/{scene}/completed.laz",
+        report="results/scenes/{scene}/completed.json",
+    log:
+        "results/logs/complete_scene/{scene}.log",
+    benchmark:
+        "results/benchmarks/complete_scene/{scene}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        options=flags(config["fusion"]),
+        names=objects_in,
+        script=script("complete_scene.py"),
+        code=code("complete_scene.py"),
+    message:
+        "Scene {wildcards.scene}: all objects in it"
+    shell:
+        "exec python {params.script} --scene {input.scene} --names {params.names} --objects {input.objects}"
+        " --crops {input.crops} --fines {input.fines} --georeference {input.georeference} --completed {output.cloud}"
+        " --completed-laz {output.laz} --report {output.report} {params.options} &> {log}"
 
 
 rule frame_ledger:

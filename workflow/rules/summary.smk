@@ -88,7 +88,7 @@ rule scene_figure:
     input:
         cloud="results/scenes/{scene}/dense.ply",
         model="results/scenes/{scene}/georeferenced",
-        crops=crops_of,
+        crops=of_objects("registration/full/crop.ply"),
     output:
         report(
             "results/scenes/{scene}/scene.png",
@@ -105,9 +105,7 @@ rule scene_figure:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        objects=lambda wildcards: [
-            name for name, row in OBJECTS.items() if row["scene"] == wildcards.scene
-        ],
+        objects=objects_in,
         script=script("scene_figure.py"),
         code=code("scene_figure.py"),
     message:

@@ -1,0 +1,98 @@
+"""The completed scene on hand-made clouds: what each object adds, what is taken away, who is named."""
+
+import laspy
+import numpy as np
+import pytest
+
+from scenefuse.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.completed_scene import complete_scene
+from scenefuse.fusion import FusionSettings, fuse_clouds
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3
+
+SETTINGS = FusionSettings(
+    fill_spacings=1.5, fill_residuals=2.5, density=0.0, feather_spacings=4.0, match_colors=True, min_confidence=0.0
+)
+POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
+
+
+def strip(low, high, y=0.0, color=(200, 100, 50)):
+    """A flat grid, x from low to high, 2 wide from y on, 0.1 apart."""
+    x, y = np.meshgrid(np.arange(low, high, 0.1), np.arange(y, y + 2, 0.1))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    normals = np.tile(np.array([0, 0, 1], np.float32), (len(points), 1))
+    return Cloud(points, normals, (np.array(color) * (0.6 + 0.4 * np.sin(points[:, :1]))).astype(np.uint8))
+
+
+def run(folder, scene, objects, mode="fill", refused=()):
+    """The stage on objects given in the scene's frame; each one's crop is the scene itself."""
+    write_cloud(folder / "scene.ply", scene)
+    for name, cloud in objects.items():
+        write_cloud(folder / f"{name}.ply", cloud.transformed(POSE.inverse()))
+        status = "unregistered" if name in refused else "registered"
+        fine = {"status": quantity(status, ""), "reason": quantity("weak", "")}
+        write_json(folder / f"{name}.json", fine | {"scene_from_object": quantity(POSE.matrix, "")})
+    complete_scene(
+        scene=folder / "scene.ply",
+        names=list(objects),
+        objects=[folder / f"{name}.ply" for name in objects],
+        crops=[folder / "scene.ply"] * len(objects),
+        fines=[folder / f"{name}.json" for name in objects],
+        completed=folder / "completed.ply",
+        completed_laz=folder / "completed.laz",
+        report=folder / "completed.json",
+        mode=mode,
+        settings=SETTINGS,
+    )
+    return read_cloud(folder / "completed.ply"), read_json(folder / "completed.json")
+
+
+def test_objects_apart_add_what_each_adds_alone(tmp_path):
+    scene, objects = strip(0, 20), {"left": strip(0.03, 3, 1.54), "right": strip(10.03, 13, 1.54, (90, 90, 90))}
+    whole, report = run(tmp_path, scene, objects)
+    assert value(report, "sources") == {"0": "scene", "1": "left", "2": "right"}
+    assert np.array_equal(whole.points[whole.fields["source"] == 0], scene.points)
+    for number, (name, cloud) in enumerate(objects.items(), 1):
+        alone = fuse_clouds(cloud.transformed(POSE.inverse()), scene, scene, POSE, "fill", SETTINGS).added
+        mine = whole[whole.fields["source"] == number]
+        assert len(mine) == value(report, "added_points")[name] > 100
+        assert np.allclose(mine.points, alone.points)
+        assert np.abs(mine.colors.astype(int) - alone.colors).max() <= 1
+
+
+def test_what_two_objects_share_is_added_once(tmp_path):
+    scene, shared = strip(0, 20), strip(0.03, 3, 1.54)
+    whole, report = run(tmp_path, scene, {"first": shared, "second": shared})
+    assert value(report, "added_points")["first"] > 100 and value(report, "added_points")["second"] == 0
+
+
+def test_replace_takes_the_scene_away_and_counts_it(tmp_path):
+    scene = strip(0, 20)
+    whole, report = run(tmp_path, scene, {"left": strip(0, 3), "right": strip(10, 13)}, mode="replace")
+    left = whole.points[whole.fields["source"] == 0]
+    assert value(report, "removed_points") == len(scene) - len(left) > 0
+    for low, high in ((0, 2.5), (10.5, 12.5)):
+        assert not ((left[:, 0] > low) & (left[:, 0] < high)).any()
+
+
+def test_an_unregistered_object_is_named_and_changes_nothing(tmp_path):
+    scene = strip(0, 20)
+    objects = {"weak": strip(0.03, 3, 1.54), "good": strip(10, 13, 1.5)}
+    whole, report = run(tmp_path, scene, objects, "replace", ["weak"])
+    assert value(report, "unregistered") == {"weak": "weak"} and list(value(report, "added_points")) == ["good"]
+    assert set(whole.fields["source"]) == {0, 2}
+    alone, _ = run(tmp_path, scene, {"weak": strip(0.03, 3, 1.54)}, "replace", ["weak"])
+    assert np.array_equal(alone.points, scene.points)
+
+
+def test_the_laz_file_holds_the_same_points_with_their_sources(tmp_path):
+    whole, _ = run(tmp_path, strip(0, 20), {"left": strip(0.03, 3, 1.54)})
+    las = laspy.read(tmp_path / "completed.laz")
+    assert np.array_equal(np.asarray(las["source"]), whole.fields["source"]) and whole.fields["source"].max() == 1
+
+
+def test_lists_of_different_length_are_refused(tmp_path):
+    lists = {"names": ["a"], "objects": [], "crops": [], "fines": []}
+    outputs = {k: tmp_path / k for k in ("scene", "completed", "completed_laz", "report")}
+    with pytest.raises(StageError, match="one of each for every object"):
+        complete_scene(**lists, **outputs, mode="fill", settings=SETTINGS)
