@@ -155,7 +155,8 @@ def train_nerf(
     write_json(report, content)
     checkpoint.unlink(missing_ok=True)
     print(
-        f"held-out PSNR {content['psnr_held_out']['value']:.2f} dB, SSIM {content['ssim']['value']:.3f}, "
+        f"{content['measured_on']['value']}: PSNR {content['psnr_held_out']['value']:.2f} dB, "
+        f"SSIM {content['ssim']['value']:.3f}, "
         f"confident {content['confident_share']['value']:.1%}, {content['seconds']['value']} s",
         flush=True,
     )

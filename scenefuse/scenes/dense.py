@@ -21,6 +21,7 @@ from scenefuse.maps import read_depth, write_depth, write_normals
 from scenefuse.scenes.plane_sweep import DepthSettings, Photo, estimate_depth
 from scenefuse.scenes.sfm import cancellable
 from scenefuse.stage import StageError, atomic_directory, manifest, quantity, read_json, threads, value, write_json
+from scenefuse.units import length_unit
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,7 @@ def fuse_depth_maps(
     workspace: Path,
     depth: list[Path],
     depth_reports: list[Path],
+    georeference: Path | None = None,
     settings: FusionSettings,
     cloud: Path,
     report: Path,
@@ -149,6 +151,7 @@ def fuse_depth_maps(
         workspace: the undistorted COLMAP workspace that the maps belong to.
         depth: the chunks' folders, each with depth_maps/ and normal_maps/. Maps may be smaller than the photos.
         depth_reports: the chunks' JSON reports, in the same order.
+        georeference: JSON of the scene, for the unit of its lengths, or nothing.
         settings: see FusionSettings.
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
@@ -189,7 +192,7 @@ def fuse_depth_maps(
         {
             "points": quantity(len(kept), "1"),
             "dropped_outliers": quantity(len(agreed) - len(kept), "1"),
-            "spacing": quantity(spacing(kept.points), "scene units"),
+            "spacing": quantity(spacing(kept.points), length_unit(georeference)),
             "median_views": quantity(float(np.median(kept.fields["views"])), "1"),
             "depth_maps": quantity(len(maps), "1"),
             "backend": quantity(", ".join(backends), ""),

@@ -9,7 +9,7 @@ from scenefuse.clouds import read_cloud
 from scenefuse.maps import read_depth, read_normals
 from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
 from scenefuse.scenes.plane_sweep import DepthSettings
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 DEPTH = DepthSettings(160, 4, 2, 48, 2, 7, 0.1, 0.5, 1.0, True)
@@ -111,17 +111,19 @@ def test_chunks_share_out_the_photos(maps):
 
 def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, maps, tmp_path):
     cloud_path, report_path = tmp_path / "dense.ply", tmp_path / "dense.json"
+    write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
     fuse_depth_maps(
         workspace=workspace,
         depth=[maps / "0", maps / "1"],
         depth_reports=[maps / "0.json", maps / "1.json"],
+        georeference=tmp_path / "georeference.json",
         settings=FUSION,
         cloud=cloud_path,
         report=report_path,
     )
     cloud = read_cloud(cloud_path)
     report = read_json(report_path)
-    assert len(cloud) == value(report, "points") > 3000
+    assert len(cloud) == value(report, "points") > 3000 and report["spacing"]["unit"] == "m"
     assert cloud.fields["views"].min() >= 3
     x, y, z = cloud.points.T
     signed = (z - surface(x, y)) / np.sqrt(1 + 0.3**2 + 0.2**2)

@@ -224,6 +224,7 @@ rule dense_cloud:
     """Fuse the depth maps into one cloud by COLMAP's stereo fusion."""
     input:
         workspace="results/scenes/{scene}/dense",
+        georeference="results/scenes/{scene}/georeference.json",
         depth=expand(
             "results/scenes/{scene}/depth/{chunk}", chunk=CHUNKS, allow_missing=True
         ),
@@ -253,4 +254,4 @@ rule dense_cloud:
         "Scene {wildcards.scene}: dense cloud"
     shell:
         "exec python {params.script} --workspace {input.workspace} --depth {input.depth} --depth-reports {input.reports}"
-        " --cloud {output.cloud} --report {output.report} {params.options} &> {log}"
+        " --georeference {input.georeference} --cloud {output.cloud} --report {output.report} {params.options} &> {log}"
