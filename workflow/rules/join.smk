@@ -1,13 +1,48 @@
-# The join: crop, scale, coarse and fine registration, fusion, metrics; and each scene with all its objects.
+# The join: witness, crop, scale, coarse and fine registration, fusion, metrics; and each scene with all its objects.
 #
 # INPUTS    config/objects.tsv: fiducials; the scene's cloud and model; the object's cloud; config: registration, arms, fusion, metrics
-# OUTPUTS   results/objects/{object}/registration/{arm}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png, metrics.json
+# OUTPUTS   results/objects/{object}/witness.json                where photographs alone put the object
+#           results/objects/{object}/registration/{arm}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png, metrics.json
 #           results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, fusion.json     of the `full` arm
 #           results/objects/{object}/frames.json, metrics.json
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 #
 # An arm is a registration recipe: `full` is the one that is fused, the others (`paper`, `no_scale`, `no_crop`) are run beside it
 # by the same scripts, with the settings that config `arms` lays over config `registration`, and measured at the same thresholds.
+
+
+rule witness:
+    """Find the object in the scene by features that their photos share (R14)."""
+    input:
+        object_model="results/objects/{object}/sfm",
+        object_json="results/objects/{object}/sfm.json",
+        object_features="results/objects/{object}/features.db",
+        scene_model=in_scene("georeferenced"),
+        scene_json=in_scene("georeference.json"),
+        scene_features=in_scene("features.db"),
+    output:
+        "results/objects/{object}/witness.json",
+    log:
+        "results/logs/witness/{object}.log",
+    benchmark:
+        "results/benchmarks/witness/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["registration"]["witness"]),
+        seed=config["seed"],
+        script=script("witness.py"),
+        code=code("witness.py"),
+    message:
+        "{wildcards.object}: second witness"
+    shell:
+        "exec python {params.script} --object-model {input.object_model} --object-features {input.object_features}"
+        " --scene-model {input.scene_model} --scene-features {input.scene_features} --witness {output}"
+        " --seed {params.seed} {params.options} &> {log}"
 
 
 rule crop:
