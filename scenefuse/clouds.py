@@ -68,15 +68,42 @@ def concatenate(clouds: list[Cloud]) -> Cloud:
 
 def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
     """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value."""
-    cells = np.floor((cloud.points - cloud.points.min(0)) / voxel).astype(np.int64)
-    size = cells.max(0) + 1
-    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
-    _, group, counts = np.unique(keys, return_inverse=True, return_counts=True)
-    means = np.stack([np.bincount(group, cloud.points[:, k]) / counts for k in range(3)], axis=1)
+    group, counts = _voxels(cloud.points, voxel)
+    means = _group_means(cloud.points, group, counts)
     distance = ((cloud.points - means[group]) ** 2).sum(1)
     order = np.lexsort((distance, group))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
     return cloud[np.sort(order[first])]
+
+
+def voxel_average(cloud: Cloud, voxel: float) -> Cloud:
+    """One point per occupied voxel: the mean of its points, normals and colours, less noisy than any of them.
+
+    Normals whose mean vanishes (two sides of a thin sheet) are those of one of the points. Fields are left out.
+    """
+    group, counts = _voxels(cloud.points, voxel)
+    normals, colors = cloud.normals, cloud.colors
+    if normals is not None:
+        mean = _group_means(normals, group, counts)
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        anyone = normals[np.unique(group, return_index=True)[1]]
+        normals = np.where(length > 0.2, mean / np.maximum(length, 1e-12), anyone).astype(np.float32)
+    if colors is not None:
+        colors = np.rint(_group_means(colors, group, counts)).astype(np.uint8)
+    return Cloud(_group_means(cloud.points, group, counts), normals, colors)
+
+
+def _voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The occupied voxel of every point (N,), numbered from 0, and the points in each."""
+    cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)
+    size = cells.max(0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, group, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return group, counts
+
+
+def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.stack([np.bincount(group, rows[:, k]) / counts for k in range(rows.shape[1])], axis=1)
 
 
 def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> float:

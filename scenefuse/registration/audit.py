@@ -1,11 +1,13 @@
-"""Is the best pose the only one? Turned copies of it, the margin to the best rival, and the gate."""
+"""May a pose be used? Turned copies of it, the margin to the best rival, free space, spread, and the gate."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.coarse import Hypothesis, distinct
-from scenefuse.registration.refine import ScaleRange
+from scenefuse.registration.evidence import Evidence
+from scenefuse.registration.refine import ScaleRange, Uncertainty
 from scenefuse.registration.score import color_agreement, pair
 from scenefuse.registration.surface import Surface
 from scenefuse.transforms import Array, Sim3
@@ -25,6 +27,17 @@ class Gate:
     """Smallest relative lead of the score over the best pose that differs."""
     max_final_tilt_deg: float
     """Largest angle in degrees between the two up directions of an accepted pose."""
+    max_blocked: float
+    """Largest share of the object that stands where the scene's cameras saw through."""
+    max_scale_sd_log: float
+    """Largest standard deviation of the scale, natural logarithm."""
+    max_rotation_sd_deg: float
+    """Largest standard deviation of the rotation about any axis, degrees; about a free axis it may be more."""
+    max_translation_sd_fraction: float
+    """Largest standard deviation of the object's centre, as a share of the diagonal."""
+    min_f_with_photos: float
+    """Smallest two-way F-score where photos link object and scene: they decide the pose, the clouds only must not deny
+    it."""
 
 
 @dataclass(frozen=True)
@@ -34,16 +47,18 @@ class Verdict:
     Attributes:
         registered: whether the pose may be used.
         reason: one sentence why.
+        decided_by: `geometry`, `photos` (they overruled geometry) or `both` (they agree).
         margin: relative lead over the best rival, 0..1.
         rival: the best pose that differs and would leave the object elsewhere, or None.
-        free_axis: a pose as good that only maps the object onto itself exists.
+        free_axis: unit vector (3,) in the scene about which the object can turn and stay the same, or None.
     """
 
     registered: bool
     reason: str
+    decided_by: str
     margin: float
     rival: Hypothesis | None
-    free_axis: bool
+    free_axis: Array | None
 
 
 def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:
@@ -57,7 +72,7 @@ def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: in
     copies = []
     for axis in axes:
         for angle in np.arange(1, steps) * 2 * np.pi / steps:
-            rotation = _about(axis, angle)
+            rotation = Rotation.from_rotvec(angle * axis).as_matrix()
             copies.append(Sim3(1.0, rotation, centre - rotation @ centre) @ pose)
     return copies
 
@@ -69,52 +84,116 @@ def judge(
     tau: float,
     gate: Gate,
     scales: ScaleRange,
-    up: tuple[Array, Array] | None,
+    evidence: Evidence,
+    spread: Uncertainty | None,
 ) -> Verdict:
-    """Weigh the best hypothesis against its rivals and the gate.
+    """Weigh the best hypothesis against its rivals, the photos and the gate.
 
     A rival that maps the object onto itself, in shape and colour, is no rival: fused, both give the same points.
+    Photos that link object and scene settle which pose is meant, so that rivals, colours and recall no longer matter:
+    the scene may lack most of the object, or show much beside it.
 
     Args:
-        ranked: refined hypotheses, best first.
+        ranked: refined hypotheses, best first; the photos' own pose first where they overrule geometry.
         obj: the object in its own frame.
         diagonal: of the scene crop.
         tau: scoring distance, scene units.
         gate: thresholds.
         scales: the scale prior; a scale at its edge is refused.
-        up: up in the object's and in the scene's frame, or None.
+        evidence: gravity and the photos' similarity.
+        spread: of the best pose, over halves of the surface.
     """
     best, centre = ranked[0], obj.points.mean(0)
-    rival, free_axis = None, False
+    rival, free_axis = None, None
     for other in ranked[1:]:
         if not distinct(best.pose, other.pose, centre, diagonal):
             continue
         if _maps_onto_itself(obj, best.pose.inverse() @ other.pose, tau / best.pose.scale):
-            free_axis |= other.score.total > (1 - gate.min_margin) * best.score.total
+            if free_axis is None and other.score.total > (1 - gate.min_margin) * best.score.total:
+                free_axis = rotation_axis(other.pose.rotation @ best.pose.rotation.T)
             continue
         if rival is None:
             rival = other
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    tilt = tilt_deg(best.pose, up)
+    linked = evidence.witness is not None
+    decided_by = "geometry" if not linked else "photos" if best.source == "photos" else "both"
+    problem = _blocked(best, gate)
+    if problem is None:
+        problem = _poor_with_photos(best, gate) if linked else _poor(best, margin, diagonal, gate, scales, spread, free_axis)
+    tilt = tilt_deg(best.pose, evidence.ups)
+    if problem is None and tilt is not None and tilt > gate.max_final_tilt_deg:
+        problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
+    if problem is not None:
+        return Verdict(False, problem, decided_by, margin, rival, free_axis)
+    words = {
+        "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
+        "both": f"shared photos and geometry agree, F-score {best.score.f_score:.2f}",
+        "photos": f"shared photos decide against geometry, F-score {best.score.f_score:.2f}",
+    }[decided_by]
+    return Verdict(True, words, decided_by, margin, rival, free_axis)
+
+
+def _blocked(best: Hypothesis, gate: Gate) -> str | None:
+    if best.score.blocked is None or best.score.blocked <= gate.max_blocked:
+        return None
+    return f"{best.score.blocked:.0%} of the object would stand where the scene's photos saw through, more than {gate.max_blocked:.0%}"
+
+
+def _poor_with_photos(best: Hypothesis, gate: Gate) -> str | None:
+    if best.score.f_score >= gate.min_f_with_photos:
+        return None
+    return (
+        f"shared photos give a pose where the clouds hardly meet: the two-way F-score is {best.score.f_score:.2f},"
+        f" below {gate.min_f_with_photos:.2f}"
+    )
+
+
+def _poor(
+    best: Hypothesis,
+    margin: float,
+    diagonal: float,
+    gate: Gate,
+    scales: ScaleRange,
+    spread: Uncertainty | None,
+    free_axis: Array | None,
+) -> str | None:
+    """What is wrong with a pose that only geometry and colours speak for."""
     if best.score.f_score < gate.min_f_score:
-        problem = f"the two-way F-score is {best.score.f_score:.2f}, below {gate.min_f_score:.2f}"
-    elif best.score.recall < gate.min_recall:
-        problem = f"the object explains only {best.score.recall:.2f} of the scene crop, below {gate.min_recall:.2f}"
-    elif best.score.color is not None and best.score.color < gate.min_color:
-        problem = f"the colours agree by {best.score.color:.2f} only, below {gate.min_color:.2f}"
-    elif margin < gate.min_margin:
-        problem = f"another pose is nearly as good: the margin is {margin:.3f}, below {gate.min_margin:.3f}"
-    elif scales.at_edge(best.pose.scale):
-        problem = (
+        return f"the two-way F-score is {best.score.f_score:.2f}, below {gate.min_f_score:.2f}"
+    if best.score.recall < gate.min_recall:
+        return f"the object explains only {best.score.recall:.2f} of the scene crop, below {gate.min_recall:.2f}"
+    if best.score.color is not None and best.score.color < gate.min_color:
+        return f"the colours agree by {best.score.color:.2f} only, below {gate.min_color:.2f}"
+    if margin < gate.min_margin:
+        return f"another pose is nearly as good: the margin is {margin:.3f}, below {gate.min_margin:.3f}"
+    if scales.at_edge(best.pose.scale):
+        return (
             f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
             f" {np.exp(scales.width):.2f}; widen the prior"
         )
-    elif tilt is not None and tilt > gate.max_final_tilt_deg:
-        problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
-    else:
-        words = f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose"
-        return Verdict(True, words, margin, rival, free_axis)
-    return Verdict(False, problem, margin, rival, free_axis)
+    if spread is None:
+        return "too little of the object meets the scene to tell how certain the pose is"
+    if spread.scale_sd_log > gate.max_scale_sd_log:
+        return f"the scale is uncertain by {spread.scale_sd_log:.1%}, more than {gate.max_scale_sd_log:.1%}"
+    turns_freely = free_axis is not None and abs(free_axis @ spread.rotation_axis) > 0.9
+    if spread.rotation_sd_deg > gate.max_rotation_sd_deg and not turns_freely:
+        return (
+            f"the rotation is uncertain by {spread.rotation_sd_deg:.1f} degrees, more than"
+            f" {gate.max_rotation_sd_deg:.1f}"
+        )
+    share = spread.translation_sd / diagonal
+    if share > gate.max_translation_sd_fraction:
+        return (
+            f"the position is uncertain by {share:.1%} of the diagonal, more than"
+            f" {gate.max_translation_sd_fraction:.1%}"
+        )
+    return None
+
+
+def rotation_axis(rotation: Array) -> Array:
+    """Unit axis (3,) of a rotation; its sign is that of a turn of less than half a circle."""
+    vector = Rotation.from_matrix(rotation).as_rotvec()
+    return vector / max(float(np.linalg.norm(vector)), 1e-12)
 
 
 def tilt_deg(pose: Sim3, up: tuple[Array, Array] | None) -> float | None:
@@ -133,9 +212,3 @@ def _maps_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
     ahead, back = pairs.forward / len(obj.probe), (len(pairs.distance) - pairs.forward) / len(obj.probe)
     color = color_agreement(obj, obj, pairs)
     return min(ahead, back) > 0.95 and (color is None or color > 0.9)
-
-
-def _about(axis: Array, angle: float) -> Array:
-    x, y, z = axis / np.linalg.norm(axis)
-    k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k

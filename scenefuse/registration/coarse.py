@@ -8,11 +8,12 @@ from typing import Any, Literal
 import numpy as np
 
 from scenefuse.clouds import Cloud, read_cloud
+from scenefuse.registration.evidence import known_ups
 from scenefuse.registration.features import fpfh, match, ransac_similarities
 from scenefuse.registration.paper import paper_coarse
 from scenefuse.registration.refine import ScaleRange, refine_points
 from scenefuse.registration.score import Score, score
-from scenefuse.registration.surface import Surface, prepare, probing
+from scenefuse.registration.surface import Surface, prepare, probing, with_grid
 from scenefuse.registration.upright import upright_hypotheses
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg, rotation_between
@@ -68,6 +69,7 @@ class Hypothesis:
             "precision": self.score.precision,
             "recall": self.score.recall,
             "color_agreement": self.score.color,
+            "blocked": self.score.blocked,
         }
 
 
@@ -114,7 +116,7 @@ def register_coarsely(
         )
         obj, target = prepare_both(cloud, scene, scales.centre, settings.score_fraction / 2, seed)
         tau = settings.score_fraction * scene.diagonal
-        found = [Hypothesis(pose, "fpfh", score(obj, target, pose, tau, settings.recall_weight))]
+        found = [Hypothesis(pose, "fpfh", score(obj, target, pose, tau, settings.recall_weight, scales.centre))]
     else:
         found = find_hypotheses(cloud, scene, scales, ups, settings, seed)
     if not found:
@@ -139,16 +141,6 @@ def register_coarsely(
     )
 
 
-def known_ups(cameras: Path | None, crop_report: Path) -> tuple[Array, Array] | None:
-    """Unit up directions in the object's and in the scene's frame, or None when either is unknown."""
-    up_in_object = None if cameras is None else read_json(cameras).get("up_in_camera_frame")
-    up_in_scene = read_json(crop_report).get("up_in_scene")
-    if not up_in_object or not up_in_scene or up_in_object["value"] is None or up_in_scene["value"] is None:
-        return None
-    a, b = np.array(up_in_object["value"], float), np.array(up_in_scene["value"], float)
-    return a / np.linalg.norm(a), b / np.linalg.norm(b)
-
-
 def _centred(
     cloud: Cloud,
     scene: Cloud,
@@ -166,10 +158,12 @@ def _centred(
     return Hypothesis(pose, "centres", score(obj, target, pose, tau, settings.recall_weight))
 
 
-def prepare_both(cloud: Cloud, scene: Cloud, scale: float, fraction: float, seed: int) -> tuple[Surface, Surface]:
+def prepare_both(
+    cloud: Cloud, scene: Cloud, scale: float, fraction: float, seed: int, most: int = MOST_POINTS
+) -> tuple[Surface, Surface]:
     """Object and scene thinned alike: `fraction` of the scene's diagonal is one voxel on both sides."""
     voxel = fraction * scene.diagonal
-    return prepare(cloud, voxel / scale, seed, MOST_POINTS), prepare(scene, voxel, seed, MOST_POINTS)
+    return prepare(cloud, voxel / scale, seed, most), prepare(scene, voxel, seed, most)
 
 
 def find_hypotheses(
@@ -184,10 +178,12 @@ def find_hypotheses(
     diagonal = scene.diagonal
     tau = settings.score_fraction * diagonal
     obj, target = prepare_both(cloud, scene, scales.centre, settings.score_fraction / 2, seed)
-    obj_few, target_few = probing(obj, SCORE_POINTS, seed), probing(target, SCORE_POINTS, seed)
+    cell, reach = settings.score_fraction / 2 * diagonal, 0.1 * diagonal
+    obj_few = probing(with_grid(obj, cell / scales.centre, reach / scales.centre), SCORE_POINTS, seed)
+    target_few = probing(with_grid(target, cell, reach), SCORE_POINTS, seed)
 
     def rate(pose: Sim3, distance: float) -> Score:
-        return score(obj_few, target_few, pose, distance, settings.recall_weight)
+        return score(obj_few, target_few, pose, distance, settings.recall_weight, scales.centre)
 
     proposed = [(p, "features") for p in _from_features(cloud, scene, scales, ups, settings, seed)]
     if ups is not None:

@@ -1,25 +1,30 @@
 """Fine registration: every hypothesis refined, turned copies tried, the winner polished, audited and gated."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from scenefuse.clouds import Cloud, read_cloud
 from scenefuse.registration.audit import Gate, Verdict, judge, tilt_deg, turned_copies
-from scenefuse.registration.coarse import Hypothesis, keep_distinct, known_ups, prepare_both
+from scenefuse.registration.coarse import Hypothesis, keep_distinct, prepare_both
+from scenefuse.registration.evidence import Evidence, Witness, known_ups, read_witness
+from scenefuse.registration.free_space import read_free_space
 from scenefuse.registration.paper import paper_fine
 from scenefuse.registration.picture import draw_alignment
-from scenefuse.registration.refine import ScaleRange, refine_planes, refine_points
+from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
 from scenefuse.registration.score import Score, score
-from scenefuse.registration.surface import Surface, probing
+from scenefuse.registration.surface import Surface, probing, with_grid
 from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Sim3
 
-LOOK_POINTS = 1500
-REFINE_POINTS = 3000
+MOST_POINTS = 12000
+LOOK_POINTS = 1200
+REFINE_POINTS = 4000
+POLISHED = 4
+OFF_SCALE = 1.06
 BEYOND_PRIOR = 0.15
 
 
@@ -51,14 +56,31 @@ class FineSettings:
     """Gate: smallest relative lead over the best pose that differs."""
     max_final_tilt_deg: float
     """Gate: largest angle in degrees between the up directions."""
+    free_space_photos: int
+    """Photos of the scene whose depth maps are asked what they saw through; 0 leaves the test out."""
+    free_space_fraction: float
+    """A measurement this far beyond a point of the object, as a share of the diagonal, proves it is not there."""
+    max_blocked: float
+    """Gate: largest share of the object that stands where the scene's photos saw through."""
+    resamplings: int
+    """Halves of the surface that are registered again for the spread of the pose."""
+    max_translation_sd_fraction: float
+    """Gate: largest standard deviation of the object's centre, as a share of the diagonal."""
+    max_scale_sd_log: float
+    """Gate: largest standard deviation of the scale, natural logarithm."""
+    max_rotation_sd_deg: float
+    """Gate: largest standard deviation of the rotation, degrees, but about a free axis."""
+    min_f_with_photos: float
+    """Gate: smallest two-way F-score of a pose that shared photos decide."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The refined hypotheses, best first, and the verdict on the first."""
+    """The refined hypotheses, best first, the verdict on the first, and its spread."""
 
     ranked: list[Hypothesis]
     verdict: Verdict
+    spread: Uncertainty | None
 
 
 def register_finely(
@@ -69,6 +91,9 @@ def register_finely(
     scale: Path,
     coarse: Path,
     cameras: Path | None = None,
+    witness: Path | None = None,
+    workspace: Path | None = None,
+    depth: list[Path] | None = None,
     fine: Path,
     picture: Path | None = None,
     recipe: Literal["default", "paper"],
@@ -79,7 +104,8 @@ def register_finely(
     """Refine the coarse hypotheses into one pose, or refuse it with a reason (method R8, R9, R12).
 
     Default: two-way Tukey-weighted similarity ICP of every hypothesis; turned copies of the leaders; point-to-plane
-    and colour polish; ranking by the two-way F-score times the agreement of colours; the gate.
+    and colour polish; ranking by the two-way F-score, the agreement of colours and the free space; comparison with
+    the photos' similarity, which overrules geometry where they differ; the spread over halves of the surface; the gate.
     Paper: point-to-point ICP within 0.4 voxel, 35 iterations, scale held; nothing is refused.
 
     Args:
@@ -89,7 +115,10 @@ def register_finely(
         scale: JSON of the scale stage.
         coarse: JSON of the coarse stage.
         cameras: JSON with `up_in_camera_frame`, or nothing.
-        fine: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, every hypothesis.
+        witness: JSON of the witness stage, or nothing.
+        workspace: undistorted COLMAP workspace of the scene, or nothing; with `depth` it gives the free space.
+        depth: folders of the scene's depth maps.
+        fine: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.
         picture: output PNG, the object on the scene crop from three sides.
         recipe: default or paper.
         voxel_fraction: the paper's voxel as a share of the diagonal, for its ICP distance.
@@ -100,7 +129,11 @@ def register_finely(
     cloud, scene = read_cloud(object), read_cloud(crop)
     prior = read_json(scale)
     scales = ScaleRange(value(prior, "scale"), value(prior, "width_log"))
-    ups = known_ups(cameras, crop_report)
+    free_space = None
+    if recipe == "default" and workspace is not None and settings.free_space_photos > 0:
+        tolerance = settings.free_space_fraction * scene.diagonal
+        free_space = read_free_space(workspace, depth or [], scene.points, settings.free_space_photos, tolerance)
+    evidence = Evidence(known_ups(cameras, crop_report), free_space, read_witness(witness))
     poses = [
         (Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"])
         for h in value(read_json(coarse), "hypotheses")
@@ -108,7 +141,7 @@ def register_finely(
     if recipe == "paper":
         outcome = _paper(cloud, scene, poses[0][0], scales, voxel_fraction, settings, seed)
     else:
-        outcome = refine_hypotheses(cloud, scene, poses, scales, ups, settings, seed)
+        outcome = refine_hypotheses(cloud, scene, poses, scales, evidence, settings, seed)
     best, verdict = outcome.ranked[0], outcome.verdict
     seconds = time.perf_counter() - start
     status = "registered" if verdict.registered else "unregistered"
@@ -130,9 +163,13 @@ def register_finely(
             "recall": quantity(best.score.recall, "1"),
             "color_agreement": quantity(best.score.color, "1"),
             "score": quantity(best.score.total, "1"),
+            "decided_by": quantity(verdict.decided_by, ""),
             "margin": quantity(verdict.margin, "1"),
             "free_axis": quantity(verdict.free_axis, ""),
-            "tilt_deg": quantity(tilt_deg(best.pose, ups), "degrees"),
+            "blocked": quantity(best.score.blocked, "1"),
+            "tilt_deg": quantity(tilt_deg(best.pose, evidence.ups), "degrees"),
+            **spread_quantities(outcome.spread, "scene units"),
+            "scale_ledger": quantity(scale_ledger(prior, evidence.witness, best, outcome.spread, verdict), ""),
             "tau": quantity(settings.score_fraction * scene.diagonal, "scene units"),
             "source": quantity(best.source, ""),
             "rival": quantity(None if rival is None else rival.as_json(), ""),
@@ -148,22 +185,26 @@ def refine_hypotheses(
     scene: Cloud,
     poses: list[tuple[Sim3, str]],
     scales: ScaleRange,
-    ups: tuple[Array, Array] | None,
+    evidence: Evidence,
     settings: FineSettings,
     seed: int,
 ) -> Outcome:
-    """Refine, turn, polish, rank and judge; see `register_finely`."""
+    """Refine, turn, polish, rank, compare with the photos and judge; see `register_finely`."""
     diagonal = scene.diagonal
     tau = settings.score_fraction * diagonal
     wide, narrow = settings.start_fraction * diagonal, settings.end_fraction * diagonal
-    obj, target = prepare_both(cloud, scene, poses[0][0].scale, settings.fine_voxel_fraction, seed)
-    looking = probing(obj, LOOK_POINTS, seed), probing(target, LOOK_POINTS, seed)
+    obj, target = prepare_both(cloud, scene, poses[0][0].scale, settings.fine_voxel_fraction, seed, MOST_POINTS)
+    scale, cell, reach = poses[0][0].scale, 2 * settings.fine_voxel_fraction * diagonal, 2 * wide
+    looking = (
+        probing(with_grid(obj, cell / scale, reach / scale), LOOK_POINTS, seed),
+        probing(with_grid(target, cell, reach), LOOK_POINTS, seed),
+    )
     # The coarse search stays inside the prior; what it found at a bound may go on beyond it.
     scales = scales.widened(BEYOND_PRIOR)
     asking = probing(obj, REFINE_POINTS, seed), probing(target, REFINE_POINTS, seed)
 
     def rate(pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
-        return score(*surfaces, pose, tau, settings.recall_weight)
+        return score(*surfaces, pose, tau, settings.recall_weight, scales.centre, evidence.free_space)
 
     def settle(pose: Sim3, source: str, first: float) -> Hypothesis:
         pose = refine_points(*looking, pose, scales, (first, narrow), 25)
@@ -174,19 +215,73 @@ def refine_hypotheses(
         return keep_distinct(ranked, obj.points.mean(0), diagonal, len(ranked), angle_deg)
 
     def polish(h: Hypothesis) -> Hypothesis:
-        planes = refine_planes(*asking, h.pose, scales, narrow, 15, settings.color_weight)
-        both = [Hypothesis(pose, h.source, rate(pose, asking)) for pose in (planes, h.pose)]
-        return max(both, key=lambda x: x.score.total)
+        planes = refine_planes(*asking, h.pose, scales, narrow, 20, settings.color_weight)
+        polished, before = (Hypothesis(pose, h.source, rate(pose, asking)) for pose in (planes, h.pose))
+        # The score is too coarse to choose between two poses in one valley; it only tells that a polish went astray.
+        return polished if polished.score.total > 0.9 * before.score.total else before
+
+    def resized(h: Hypothesis, factor: float) -> Hypothesis:
+        fixed = h.pose.apply(obj.points.mean(0))
+        grown = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
+        return Hypothesis(grown, h.source, rate(grown, asking))
 
     ranked = in_order([settle(pose, source, wide) for pose, source in poses])
-    up_in_scene = None if ups is None else ups[1]
+    up_in_scene = None if evidence.ups is None else evidence.ups[1]
     turned = [c for h in ranked[:2] for c in turned_copies(h.pose, obj, up_in_scene, settings.turn_steps)]
     # A copy counts only as the best of its surroundings: those near a leader would only slide back to it.
     leaders = in_order(ranked[:2] + [Hypothesis(c, "turned", rate(c, looking)) for c in turned], angle_deg=25)
     ranked += [settle(h.pose, "turned", 0.7 * wide) for h in leaders if h.source == "turned"][:6]
-    ranked = in_order(ranked)[:8]
-    ranked = in_order([polish(h) for h in ranked])
-    return Outcome(ranked, judge(ranked, looking[0], diagonal, tau, _gate(settings), scales, ups))
+    ranked = in_order([polish(h) for h in in_order(ranked)[:POLISHED]])
+    # A valley that is flat in scale has several ends; start from both sides.
+    ranked = in_order([*ranked, *(polish(resized(ranked[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE))])
+    witness = evidence.witness
+    if witness is not None and not witness.agrees(ranked[0].pose, obj.points.mean(0), diagonal):
+        # Clouds may polish what the photos say, not carry it off.
+        nearby = polish(settle(witness.pose, "photos", narrow))
+        stays = witness.agrees(nearby.pose, obj.points.mean(0), diagonal)
+        ranked.insert(0, nearby if stays else Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
+    spread = uncertainty(
+        *asking, ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed
+    )
+    gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
+    return Outcome(ranked, judge(ranked, looking[0], diagonal, tau, gate, scales, evidence, spread), spread)
+
+
+def spread_quantities(spread: Uncertainty | None, unit: str) -> dict[str, Any]:
+    """A pose's spread as a stage JSON holds it; null where it is not known."""
+    return {
+        "scale_sd_log": quantity(None if spread is None else spread.scale_sd_log, "1"),
+        "rotation_sd_deg": quantity(None if spread is None else spread.rotation_sd_deg, "degrees"),
+        "translation_sd": quantity(None if spread is None else spread.translation_sd, unit),
+        "covariance": quantity(None if spread is None else spread.covariance, f"radians, {unit}, log scale"),
+    }
+
+
+def scale_ledger(
+    prior: dict[str, Any], witness: Witness | None, best: Hypothesis, spread: Uncertainty | None, verdict: Verdict
+) -> list[dict[str, Any]]:
+    """Every estimate of the scale with its spread (log), what it was used for, which one won and why.
+
+    The estimates of extent have no spread of their own: what one side lacks biases them, so they only centre a prior.
+    """
+    rows = [
+        {"name": e["name"], "scale": e["scale"], "sd_log": None, "use": "centres the prior" if e["used"] else "none"}
+        for e in value(prior, "ledger")
+    ]
+    if witness is not None:
+        rows.append(
+            {"name": "shared points", "scale": witness.pose.scale, "sd_log": witness.scale_sd_log, "use": "photos"}
+        )
+        if witness.scale_from_centres is not None:
+            rows.append({"name": "camera centres", "scale": witness.scale_from_centres, "sd_log": None, "use": "none"})
+    why = {
+        "geometry": "no photos link object and scene: the clouds' best fit inside the prior",
+        "both": "the clouds' best fit, which the shared points confirm",
+        "photos": "the shared points: the clouds' best fit is another pose",
+    }[verdict.decided_by]
+    sd = None if spread is None else spread.scale_sd_log
+    rows.append({"name": "registration", "scale": best.pose.scale, "sd_log": sd, "use": f"won: {why}"})
+    return rows
 
 
 def _paper(
@@ -201,16 +296,6 @@ def _paper(
     """The paper's ICP; the score is recorded and nothing is refused."""
     pose = paper_fine(cloud, scene, start, voxel_fraction)
     obj, target = prepare_both(cloud, scene, scales.centre, settings.fine_voxel_fraction, seed)
-    rated = score(obj, target, pose, settings.score_fraction * scene.diagonal, settings.recall_weight)
-    verdict = Verdict(True, "the paper's recipe has no gate", 0.0, None, False)
-    return Outcome([Hypothesis(pose, "fpfh", rated)], verdict)
-
-
-def _gate(settings: FineSettings) -> Gate:
-    return Gate(
-        settings.min_f_score,
-        settings.min_recall,
-        settings.min_color,
-        settings.min_margin,
-        settings.max_final_tilt_deg,
-    )
+    rated = score(obj, target, pose, settings.score_fraction * scene.diagonal, settings.recall_weight, scales.centre)
+    verdict = Verdict(True, "the paper's recipe has no gate", "geometry", 0.0, None, None)
+    return Outcome([Hypothesis(pose, "fpfh", rated)], verdict, None)

@@ -1,13 +1,16 @@
 """Similarity refinement on two-way pairs: Tukey-weighted points first, then planes and colours."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.score import Pairs, color_gain, pair
 from scenefuse.registration.surface import Surface
 from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3, fit_sim3
+
+POINT_WEIGHT = 0.1
 
 
 @dataclass(frozen=True)
@@ -61,7 +64,7 @@ def refine_planes(
     rounds: int,
     color_weight: float,
 ) -> Sim3:
-    """Gauss-Newton over the seven parameters: point-to-plane both ways, and colours along the scene's surface.
+    """Gauss-Newton over the seven parameters: planes and points both ways, and colours along the scene's surface.
 
     A colour row compares the object's colour (after a gain and bias) with the scene's colour carried to the same
     place along its tangent plane (Park, Zhou, Koltun 2017). Both kinds of rows are divided by their own robust spread.
@@ -75,43 +78,144 @@ def refine_planes(
         rounds: iterations.
         color_weight: weight of the colour rows; 0 for geometry alone.
     """
-    use_colors = color_weight > 0 and obj.colors is not None and scene.colors is not None
-    gradients = _color_gradients(scene) if use_colors else None
-    pose, fixed = start, scales.width == 0
+    gradients = _gradients(obj, scene, color_weight)
+    pose = start
     for _ in range(rounds):
-        pairs = pair(obj, scene, pose, tau)
-        if min(pairs.forward, len(pairs.distance) - pairs.forward) < 10:
+        rows = _rows(obj, scene, pose, tau, color_weight, gradients)
+        if rows is None:
             return pose
-        p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
-        centre = p.mean(0)
-        n_scene = scene.normals[pairs.scene_index]
-        n_object = pose.rotate(obj.normals[pairs.object_index])
-        sign = np.sign((n_scene * n_object).sum(1))
-        normals = n_scene + np.where(sign == 0, 1, sign)[:, None] * n_object
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        weights = _two_way_weights(pairs, tau) * np.abs((n_scene * n_object).sum(1))
-        residuals = ((p - q) * normals).sum(1)
-        system, right = _normal_equations(p - centre, normals, residuals, weights)
-        if gradients is not None:
-            assert obj.colors is not None and scene.colors is not None
-            gain, bias = color_gain(obj, scene, pairs)
-            ahead = slice(0, pairs.forward)
-            slopes = gradients[pairs.scene_index[ahead]]
-            mine = gain * obj.colors[pairs.object_index[ahead]] + bias
-            theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, (p - q)[ahead])
-            for channel in range(3):
-                more, less = _normal_equations(
-                    (p - centre)[ahead],
-                    slopes[:, channel],
-                    (theirs - mine)[:, channel],
-                    color_weight / 3 * weights[ahead],
-                )
-                system, right = system + more, right + less
-        if fixed:
+        system, right = rows.normal_equations()
+        if scales.width == 0:
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
-        pose = _apply_step(pose, step, centre, scales)
+        pose = _apply_step(pose, step, rows.centre, scales)
     return pose
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Spread of a pose over resampled surfaces.
+
+    Attributes:
+        scale_sd_log: standard deviation of the scale, natural logarithm.
+        rotation_sd_deg: standard deviation of the rotation about its least certain axis, degrees.
+        rotation_axis: (3,) that axis, in the scene.
+        translation_sd: standard deviation of the object's centre along its least certain direction, scene units.
+        covariance: (7, 7) of rotation vector (radians), translation (scene units) and log scale, about that centre.
+    """
+
+    scale_sd_log: float
+    rotation_sd_deg: float
+    rotation_axis: Array
+    translation_sd: float
+    covariance: Array
+
+
+def uncertainty(
+    obj: Surface,
+    scene: Surface,
+    pose: Sim3,
+    scales: ScaleRange,
+    tau: float,
+    color_weight: float,
+    resamplings: int,
+    seed: int,
+) -> Uncertainty | None:
+    """Half-sampling (Politis, Romano 1994): refine again and again with half of the surface's pieces, drawn at random.
+
+    Pieces are a sixth of the scene crop's diagonal wide, so that what is correlated stays together. The deviation of a
+    half's pose from the whole's has the spread that the whole's has from the truth. New pairs are made each time; a
+    bootstrap of fixed pairs is some five times too sure of itself.
+
+    Returns:
+        The spread, or None with fewer than eight pieces to draw from.
+    """
+    centre = obj.points.mean(0)
+    edge = float(np.linalg.norm(np.ptp(scene.points, axis=0))) / 6
+    places = np.concatenate([scene.points, pose.apply(obj.points)])
+    piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+    in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
+    pieces = np.unique(in_scene)
+    if len(pieces) < 8:
+        return None
+    rng = np.random.default_rng(seed)
+    deviations = np.zeros((resamplings, 7))
+    for k in range(resamplings):
+        chosen = np.zeros(piece.max() + 1, dtype=bool)
+        chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
+        half_object = replace(obj, probe=obj.probe[chosen[in_object[obj.probe]]])
+        half_scene = replace(scene, probe=scene.probe[chosen[in_scene[scene.probe]]])
+        other = refine_planes(half_object, half_scene, pose, scales, tau, 10, color_weight)
+        deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
+        deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
+        deviations[k, 6] = np.log(other.scale / pose.scale)
+    covariance = deviations.T @ deviations / resamplings
+    turn, axes = np.linalg.eigh(covariance[:3, :3])
+    return Uncertainty(
+        float(np.sqrt(covariance[6, 6])),
+        float(np.degrees(np.sqrt(max(turn[-1], 0)))),
+        axes[:, -1],
+        float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1], 0))),
+        covariance,
+    )
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The linearised fit at one pose: `jacobian` step + `residual` = 0, over rotation, translation and log scale.
+
+    Attributes:
+        jacobian: (M, 7).
+        residual: (M,).
+        weight: (M,).
+        centre: (3,) that the step turns and grows about.
+    """
+
+    jacobian: Array
+    residual: Array
+    weight: Array
+    centre: Array
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        return self.jacobian.T @ (self.weight[:, None] * self.jacobian), self.jacobian.T @ (self.weight * self.residual)
+
+
+def _rows(
+    obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float, gradients: Array | None
+) -> _Rows | None:
+    """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
+    planes leave free, and colours where there are gradients."""
+    pairs = pair(obj, scene, pose, tau)
+    if min(pairs.forward, len(pairs.distance) - pairs.forward) < 10:
+        return None
+    p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
+    centre = p.mean(0)
+    # The object's normals: its cloud is the denser and the cleaner one.
+    normals = pose.rotate(obj.normals[pairs.object_index])
+    facing = np.abs((normals * scene.normals[pairs.scene_index]).sum(1))
+    weights = _two_way_weights(pairs, tau) * np.sqrt(facing)
+    parts = [_weighted(p - centre, normals, ((p - q) * normals).sum(1), weights)]
+    for axis in np.eye(3):
+        along = np.broadcast_to(axis, p.shape)
+        parts.append(_weighted(p - centre, along, (p - q) @ axis, POINT_WEIGHT * weights))
+    if gradients is not None:
+        assert obj.colors is not None and scene.colors is not None
+        gain, bias = color_gain(obj, scene, pairs)
+        ahead = slice(0, pairs.forward)
+        slopes = gradients[pairs.scene_index[ahead]]
+        mine = gain * obj.colors[pairs.object_index[ahead]] + bias
+        theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, (p - q)[ahead])
+        for channel in range(3):
+            off = (theirs - mine)[:, channel]
+            parts.append(_weighted((p - centre)[ahead], slopes[:, channel], off, color_weight / 3 * weights[ahead]))
+    jacobian, residual, weight = (np.concatenate(kind) for kind in zip(*parts))
+    return _Rows(jacobian, residual, weight, centre)
+
+
+def _gradients(obj: Surface, scene: Surface, color_weight: float) -> Array | None:
+    """Slopes of the scene's colours, where both sides have colours and they are wanted."""
+    wanted = color_weight > 0 and obj.colors is not None and scene.colors is not None
+    return _color_gradients(scene) if wanted else None
 
 
 def _two_way_weights(pairs: Pairs, tau: float) -> Array:
@@ -122,15 +226,15 @@ def _two_way_weights(pairs: Pairs, tau: float) -> Array:
     return 0.5 * weights * share
 
 
-def _normal_equations(arm: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array]:
-    """J^T W J (7, 7) and J^T W r (7,) of rows direction . (rotation x arm + translation + growth arm) + residual.
+def _weighted(arm: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Rows direction . (rotation x arm + translation + growth arm) + residual, and their Huber weights.
 
-    Residuals are divided by their robust spread and get Huber weights.
+    Residuals are divided by their robust spread, so that kinds of rows can be added.
     """
     spread = 1.4826 * np.median(np.abs(residual - np.median(residual))) + 1e-12
     weight = weight * np.minimum(1, 2 * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
-    rows = np.concatenate([np.cross(arm, direction), direction, (arm * direction).sum(1, keepdims=True)], axis=1)
-    return rows.T @ (weight[:, None] * rows), rows.T @ (weight * residual)
+    jacobian = np.concatenate([np.cross(arm, direction), direction, (arm * direction).sum(1, keepdims=True)], axis=1)
+    return jacobian, residual, weight
 
 
 def _apply_step(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:

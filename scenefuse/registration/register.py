@@ -15,7 +15,8 @@ from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.registration.audit import tilt_deg
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop import CropSettings, crop_marked
-from scenefuse.registration.fine import FineSettings, Outcome, refine_hypotheses
+from scenefuse.registration.evidence import Evidence
+from scenefuse.registration.fine import FineSettings, Outcome, refine_hypotheses, spread_quantities
 from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.refine import ScaleRange
 from scenefuse.registration.scale import estimates, prior
@@ -92,7 +93,7 @@ def register_clouds(
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
     poses = [(hypothesis.pose, hypothesis.source) for hypothesis in found]
     fine = build(FineSettings, wanted["fine"])
-    outcome = refine_hypotheses(near_obj, near_scene, poses, scales, ups, fine, seed)
+    outcome = refine_hypotheses(near_obj, near_scene, poses, scales, Evidence(ups), fine, seed)
     pose, measures = outcome.ranked[0].pose, build(MetricSettings, settings["metrics"])
     tau = measures.tau_fraction * near_scene.diagonal
     agreement = registration_metrics(near_obj, near_scene, pose, tau, near_scene.diagonal, "scene units", measures)
@@ -235,6 +236,8 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
             "color_agreement": quantity(best.score.color, "1"),
             "score": quantity(best.score.total, "1"),
             "margin": quantity(verdict.margin, "1"),
+            "free_axis": quantity(verdict.free_axis, ""),
+            **spread_quantities(outcome.spread, "scene units"),
             "tilt_deg": quantity(tilt_deg(best.pose, ups), "degrees"),
             "gravity_used": quantity(ups is not None, ""),
             "agreement": found.agreement,

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.clouds import Cloud, read_cloud, voxel_downsample
-from scenefuse.registration.coarse import known_ups
+from scenefuse.registration.evidence import known_ups
 from scenefuse.registration.refine import ScaleRange
 from scenefuse.stage import quantity, write_json
 from scenefuse.transforms import Array, rotation_between

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.registration.free_space import FreeSpace
 from scenefuse.registration.surface import Surface
-from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3
 
 LEAST_CONTRAST = 0.02
@@ -39,27 +39,28 @@ class Score:
         precision: share of the object that the scene confirms.
         recall: share of the scene crop that the object explains.
         color: correlation of the colours over the pairs after one gain and bias per channel; None without colours.
-        total: the number hypotheses are ranked by.
+        blocked: share of the object that stands where the scene's cameras saw through; None where it is not known.
+        total: the number hypotheses are ranked by: F, with the object's area at the usual scale, times the agreement
+            of colours, times what is not blocked.
     """
 
     f_score: float
     precision: float
     recall: float
     color: float | None
+    blocked: float | None
     total: float
 
 
 def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> Pairs:
     """Nearest neighbours within `tau` (scene units), from the object to the scene and back.
 
-    The object's own tree serves at every pose: a similarity keeps the order of distances.
+    The object's own search serves at every pose: a similarity keeps the order of distances.
     """
     s = scene_from_object.scale
     asking, questioning = obj.points[obj.probe], scene.points[scene.probe]
-    ahead, there = scene.tree.query(scene_from_object.apply(asking), distance_upper_bound=tau, workers=threads())
-    back, here = obj.tree.query(
-        scene_from_object.inverse().apply(questioning), distance_upper_bound=tau / s, workers=threads()
-    )
+    ahead, there = scene.nearest(scene_from_object.apply(asking), tau)
+    back, here = obj.nearest(scene_from_object.inverse().apply(questioning), tau / s)
     found, met = np.isfinite(ahead), np.isfinite(back)
     return Pairs(
         np.concatenate([obj.probe[found], here[met]]),
@@ -69,8 +70,26 @@ def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> P
     )
 
 
-def score(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float, recall_weight: float) -> Score:
-    """Score a pose at the distance `tau`; `recall_weight` is the beta of the F-beta measure."""
+def score(
+    obj: Surface,
+    scene: Surface,
+    scene_from_object: Sim3,
+    tau: float,
+    recall_weight: float,
+    usual_scale: float,
+    free_space: FreeSpace | None = None,
+) -> Score:
+    """Score a pose.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        scene_from_object: the pose.
+        tau: distance within which points agree, scene units.
+        recall_weight: beta of the F-beta measure.
+        usual_scale: centre of the scale prior; in the total, an object's area counts as it would be at that scale.
+        free_space: what the scene's cameras saw through, or None.
+    """
     pairs = pair(obj, scene, scene_from_object, tau)
     turned = scene_from_object.rotate(obj.normals)
     facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
@@ -80,8 +99,15 @@ def score(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float, rec
     b = recall_weight**2
     f_score = (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
     color = color_agreement(obj, scene, pairs)
-    total = f_score if color is None else f_score * (0.5 + 0.5 * color)
-    return Score(f_score, precision, recall, color, total)
+    # A smaller object sticks out less: as a share of its own area, precision would always reward shrinking.
+    level = min(1.0, precision * (scene_from_object.scale / usual_scale) ** 2)
+    total = (1 + b) * level * recall / (b * level + recall) if level + recall > 0 else 0.0
+    total *= 1.0 if color is None else 0.5 + 0.5 * color
+    blocked = None
+    if free_space is not None:
+        blocked = free_space.blocked_share(scene_from_object.apply(obj.points[obj.probe]))
+        total *= 1 - (blocked or 0.0)
+    return Score(f_score, precision, recall, color, blocked, total)
 
 
 def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
