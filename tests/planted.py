@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 import open3d as o3d
@@ -145,7 +145,7 @@ def _seen_by(rays, points, camera):
     return ~np.isfinite(rays.cast_rays(o3d.core.Tensor(ray))["t_hit"].numpy())
 
 
-@lru_cache(maxsize=None)
+@cache
 def _outer(name):
     """The part of a shape (z up) that photos from around it see: mesh, points, normals, colours, centre, diagonal."""
     part = join([p for p in SHAPES[name].parts()])

@@ -119,7 +119,9 @@ def judge(
     decided_by = "geometry" if not linked else "photos" if best.source == "photos" else "both"
     problem = _blocked(best, gate)
     if problem is None:
-        problem = _poor_with_photos(best, gate) if linked else _poor(best, margin, diagonal, gate, scales, spread, free_axis)
+        problem = (
+            _poor_with_photos(best, gate) if linked else _poor(best, margin, diagonal, gate, scales, spread, free_axis)
+        )
     tilt = tilt_deg(best.pose, evidence.ups)
     if problem is None and tilt is not None and tilt > gate.max_final_tilt_deg:
         problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
@@ -136,7 +138,10 @@ def judge(
 def _blocked(best: Hypothesis, gate: Gate) -> str | None:
     if best.score.blocked is None or best.score.blocked <= gate.max_blocked:
         return None
-    return f"{best.score.blocked:.0%} of the object would stand where the scene's photos saw through, more than {gate.max_blocked:.0%}"
+    return (
+        f"{best.score.blocked:.0%} of the object would stand where the scene's photos saw through, more than"
+        f" {gate.max_blocked:.0%}"
+    )
 
 
 def _poor_with_photos(best: Hypothesis, gate: Gate) -> str | None:

@@ -155,7 +155,7 @@ def _centred(
     pose = Sim3(scales.centre, rotation, centre)
     obj, target = prepare_both(cloud, scene, scales.centre, settings.score_fraction / 2, seed)
     tau = settings.score_fraction * scene.diagonal
-    return Hypothesis(pose, "centres", score(obj, target, pose, tau, settings.recall_weight))
+    return Hypothesis(pose, "centres", score(obj, target, pose, tau, settings.recall_weight, scales.centre))
 
 
 def prepare_both(

@@ -56,6 +56,8 @@ class FineSettings:
     """Gate: smallest relative lead over the best pose that differs."""
     max_final_tilt_deg: float
     """Gate: largest angle in degrees between the up directions."""
+    use_witness: bool
+    """Whether the photos' similarity (the witness) is compared with the clouds' and overrules it."""
     free_space_photos: int
     """Photos of the scene whose depth maps are asked what they saw through; 0 leaves the test out."""
     free_space_fraction: float
@@ -133,7 +135,8 @@ def register_finely(
     if recipe == "default" and workspace is not None and settings.free_space_photos > 0:
         tolerance = settings.free_space_fraction * scene.diagonal
         free_space = read_free_space(workspace, depth or [], scene.points, settings.free_space_photos, tolerance)
-    evidence = Evidence(known_ups(cameras, crop_report), free_space, read_witness(witness))
+    photos = read_witness(witness) if settings.use_witness else None
+    evidence = Evidence(known_ups(cameras, crop_report), free_space, photos)
     poses = [
         (Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"])
         for h in value(read_json(coarse), "hypotheses")
@@ -240,9 +243,7 @@ def refine_hypotheses(
         nearby = polish(settle(witness.pose, "photos", narrow))
         stays = witness.agrees(nearby.pose, obj.points.mean(0), diagonal)
         ranked.insert(0, nearby if stays else Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
-    spread = uncertainty(
-        *asking, ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed
-    )
+    spread = uncertainty(*asking, ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed)
     gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
     return Outcome(ranked, judge(ranked, looking[0], diagonal, tau, gate, scales, evidence, spread), spread)
 

@@ -34,7 +34,7 @@ class DepthView:
         return -self.rotation.T @ self.translation
 
     def look_at(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Indices (K,) of the points (N, 3) in the picture, their pixels (K, 2) as column and row, their depths (K,)."""
+        """Indices (K,) of the points (N, 3) that it shows, their pixels (K, 2; column, row) and depths (K,)."""
         local = points @ self.rotation.T + self.translation
         depth = local[:, 2]
         index = np.flatnonzero(depth > 0)

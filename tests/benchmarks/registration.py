@@ -194,11 +194,11 @@ def summary(table: pd.DataFrame) -> str:
         for group in [*groups, "all"]:
             for method, part in table.groupby("method", sort=False):
                 part = part if group == "all" else part[part[column] == group]
-                good = part[part.right]
-                wrong = (part.accepted & ~part.right).mean()
+                good, wrong = part[part.right], (part.accepted & ~part.right).mean()
                 lines.append(
-                    f"{group!s:14s}{method:15s} {len(part):6d} {part.right.mean():6.1%} {wrong:15.1%} {(~part.accepted).mean():8.1%}"
-                    f" {part.seconds.median():9.2f} {good.scale_pct.abs().median():8.2f} {good.rotation_deg.median():8.2f}"
+                    f"{group!s:14s}{method:15s} {len(part):6d} {part.right.mean():6.1%} {wrong:15.1%}"
+                    f" {(~part.accepted).mean():8.1%} {part.seconds.median():9.2f}"
+                    f" {good.scale_pct.abs().median():8.2f} {good.rotation_deg.median():8.2f}"
                 )
         lines.append("")
     return "\n".join(lines)

@@ -28,7 +28,7 @@ SETTINGS = CropSettings(
 
 @pytest.mark.parametrize("slope", [0.0, 0.15])
 def test_ground_goes_and_the_object_stays(slope):
-    trial = plant("house", 2, noise=0.002, slope=slope, object_points=4000, scene_points=3000)
+    trial = plant("house", 2, noise=0.002, slope=slope, object_points=4000, density_ratio=1.0)
     own = np.arange(len(trial.scene)) < 3000
     keep = crop_cloud(trial.scene, trial.fiducials, Z, SETTINGS).keep
     above = trial.scene.points[:, 2] > slope * trial.scene.points[:, 0] + 1.0
@@ -37,7 +37,7 @@ def test_ground_goes_and_the_object_stays(slope):
 
 
 def test_a_tree_inside_the_box_is_left_out():
-    trial = plant("house", 2, noise=0.002, object_points=4000, scene_points=3000)
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
     rng = np.random.default_rng(0)
     tree = trial.fiducials.max(0) * [1, 1, 0] + [0.9, 0.9, 3.0] + rng.normal(0, 0.15, (60, 3))
     scene = concatenate([Cloud(trial.scene.points), Cloud(tree)])
@@ -46,14 +46,14 @@ def test_a_tree_inside_the_box_is_left_out():
 
 
 def test_without_ground_nothing_is_removed_and_that_is_said():
-    trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, scene_points=3000)
+    trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     cut = crop_cloud(trial.scene, trial.fiducials, Z, SETTINGS)
     assert cut.ground is None and cut.keep.mean() > 0.97
     assert "no ground" in cut.notes[0]
 
 
 def test_parts_far_from_every_fiducial_are_kept_and_that_is_said():
-    trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, scene_points=3000)
+    trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     low, high = trial.scene.points.min(0), trial.scene.points.max(0)
     far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
     cut = crop_cloud(trial.scene, far, Z, replace(SETTINGS, reach_fraction=1e-6, min_part=1.1))
@@ -69,7 +69,7 @@ def test_ground_is_a_height_field_with_the_planted_slope():
 
 
 def test_stage_writes_the_crop_and_its_box(tmp_path):
-    trial = plant("house", 2, noise=0.002, object_points=4000, scene_points=3000)
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
     files = stage_files(tmp_path, trial, trial.fiducials)
     crop_scene(**files, mode="fiducials", settings=SETTINGS)
     report = read_json(files["report"])
@@ -83,7 +83,7 @@ def test_stage_writes_the_crop_and_its_box(tmp_path):
 
 
 def test_bad_fiducials_end_in_one_sentence(tmp_path):
-    trial = plant("house", 2, noise=0.002, object_points=4000, scene_points=3000)
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
     cases = [
         (trial.fiducials[:3], "at least 4"),
         (trial.fiducials + [500, 0, 0], "nearest scene point"),

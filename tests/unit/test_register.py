@@ -34,7 +34,7 @@ QUICK = {
 
 @pytest.fixture(scope="module")
 def house():
-    return plant("house", 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+    return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
 
 
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
-    trial = plant("house", 5, noise=0.005, object_points=6000, scene_points=4000)
+    trial = plant("house", 5, noise=0.005, object_points=6000, density_ratio=1.0)
     write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
     rows = np.hstack([trial.object.points, trial.object.colors])
     np.savetxt(tmp_path / "house.xyz", rows, header="X Y Z R G B", comments="//", fmt=["%.9g"] * 3 + ["%d"] * 3)
@@ -94,7 +94,7 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
 
 def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_path, house, quick):
     write_cloud(tmp_path / "house.ply", house.object)
-    other = plant("sculpture", 7, ground=False, noise=0.005, scene_points=4000).scene
+    other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
     write_cloud(tmp_path / "scene.ply", other)
     out = tmp_path / "out"
     out.mkdir()

@@ -10,45 +10,22 @@ from scipy.spatial.transform import Rotation
 from scenefuse.clouds import Cloud, write_cloud
 from scenefuse.registration.audit import tilt_deg
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
+from scenefuse.registration.evidence import Evidence, Witness
 from scenefuse.registration.features import match, ransac_similarities
-from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely
+from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely, scale_ledger
 from scenefuse.registration.ledger import round_trip, write_frame_ledger
-from scenefuse.registration.refine import ScaleRange, refine_planes, refine_points
+from scenefuse.registration.refine import ScaleRange, refine_planes, refine_points, uncertainty
 from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
 from scenefuse.registration.upright import upright_hypotheses
+from scenefuse.settings import build, shipped_with
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
-COARSE = CoarseSettings(
-    voxel_fractions=(0.04,),
-    ransac_samples=30000,
-    feature_scale_steps=3,
-    scale_steps=11,
-    yaw_steps=24,
-    sweep_voxel_fraction=0.045,
-    max_tilt_deg=10.0,
-    recall_weight=2.0,
-    score_fraction=0.02,
-    candidates=16,
-    keep=5,
-)
-FINE = FineSettings(
-    fine_voxel_fraction=0.012,
-    start_fraction=0.05,
-    end_fraction=0.02,
-    color_weight=0.3,
-    turn_steps=18,
-    recall_weight=2.0,
-    score_fraction=0.02,
-    min_f_score=0.35,
-    min_recall=0.4,
-    min_color=0.5,
-    min_margin=0.04,
-    max_final_tilt_deg=8.0,
-)
+SHIPPED = shipped_with(None)["registration"]
+COARSE, FINE = build(CoarseSettings, SHIPPED["coarse"]), build(FineSettings, SHIPPED["fine"])
 
 
 # Little work, where only the course of the computation matters.
@@ -60,7 +37,7 @@ LITTLE = (
 
 @pytest.fixture(scope="module")
 def house():
-    return plant("house", 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+    return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
 
 
 def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
@@ -68,12 +45,20 @@ def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
     ups = (trial.up_in_object, Z)
     prior = ScaleRange(prior_centre(estimates(trial.object, scene, ups)), 0.5)
     found = find_hypotheses(trial.object, scene, prior, ups, settings[0], seed)
-    return refine_hypotheses(trial.object, scene, [(h.pose, h.source) for h in found], prior, ups, settings[1], seed)
+    return refine_hypotheses(
+        trial.object,
+        scene,
+        [(h.pose, h.source) for h in found],
+        prior,
+        Evidence(ups, trial.free_space),
+        settings[1],
+        seed,
+    )
 
 
 @pytest.mark.parametrize("name", ["house", "balloon"])
 def test_a_planted_pose_is_found_and_accepted(name):
-    trial = plant(name, 5, ground=False, noise=0.005, object_points=6000, scene_points=4000)
+    trial = plant(name, 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
     outcome = register(trial)
     scale, angle, shift = errors(
         outcome.ranked[0].pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal
@@ -83,7 +68,7 @@ def test_a_planted_pose_is_found_and_accepted(name):
 
 
 def test_another_object_is_refused(house):
-    other = plant("sculpture", 7, ground=False, noise=0.005, scene_points=4000).scene
+    other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
     verdict = register(house, other, LITTLE).verdict
     assert not verdict.registered
     assert "F-score" in verdict.reason or "explains" in verdict.reason
@@ -118,7 +103,7 @@ def test_the_true_pose_scores_higher_than_a_turned_one(house):
     centre = truth.apply(house.object.points.mean(0))
     half_turn = np.diag([-1.0, -1.0, 1.0])
     turned = Sim3(1.0, half_turn, centre - half_turn @ centre) @ truth
-    right, wrong = (score(obj, scene, p, 0.3, 2.0) for p in (truth, turned))
+    right, wrong = (score(obj, scene, p, 0.3, 2.0, truth.scale) for p in (truth, turned))
     assert right.f_score > wrong.f_score and right.total > wrong.total
     assert right.color > 0.9 > wrong.color
 
@@ -237,7 +222,13 @@ def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
     truth = house.scene_from_object
     prior = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
     outcome = refine_hypotheses(
-        house.object, house.scene, [(truth, "planted")], prior, None, replace(FINE, turn_steps=2, min_f_score=0.0), 0
+        house.object,
+        house.scene,
+        [(truth, "planted")],
+        prior,
+        Evidence(),
+        replace(FINE, turn_steps=2, min_f_score=0.0),
+        0,
     )
     assert not outcome.verdict.registered
 
@@ -250,5 +241,68 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
     turned = Sim3(1.0, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.zeros(3))
     poses = [(Sim3.identity(), "one"), (turned, "other")]
     settings = replace(FINE, turn_steps=6, fine_voxel_fraction=0.02, score_fraction=0.04)
-    outcome = refine_hypotheses(egg(0), egg(1), poses, ScaleRange(1.0, 0.2), (Z, Z), settings, 0)
-    assert outcome.verdict.registered and outcome.verdict.free_axis
+    outcome = refine_hypotheses(egg(0), egg(1), poses, ScaleRange(1.0, 0.2), Evidence((Z, Z)), settings, 0)
+    assert outcome.verdict.registered, outcome.verdict.reason
+    assert abs(outcome.verdict.free_axis @ Z) > 0.99
+
+
+def shared(pose: Sim3) -> Witness:
+    return Witness(pose, 0.005, 0.3, 0.02, 40, None)
+
+
+def test_photos_that_agree_settle_the_pose(house):
+    truth = house.scene_from_object
+    prior = ScaleRange(truth.scale, 0.3)
+    settings = replace(LITTLE[1], min_margin=1.0)
+    alone, linked = (
+        refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, settings, 0).verdict
+        for evidence in (Evidence(), Evidence(witness=shared(truth)))
+    )
+    assert not alone.registered and "margin" in alone.reason
+    assert linked.registered and linked.decided_by == "both"
+
+
+def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
+    truth, centre = house.scene_from_object, house.object.points.mean(0)
+    half_turn, middle = np.diag([-1.0, -1.0, 1.0]), truth.apply(centre)
+    turned = Sim3(1.0, half_turn, middle - half_turn @ middle) @ truth
+    prior = ScaleRange(truth.scale, 0.3)
+    evidence = Evidence((house.up_in_object, Z), None, shared(truth))
+    outcome = refine_hypotheses(
+        house.object, house.scene, [(turned, "planted")], prior, evidence, replace(LITTLE[1], turn_steps=1), 0
+    )
+    assert outcome.verdict.registered and outcome.verdict.decided_by == "photos"
+    scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
+    assert abs(scale) < 2 and angle < 2 and shift < 0.01
+
+
+def test_an_object_where_the_cameras_saw_through_is_refused(house):
+    truth = house.scene_from_object
+    assert house.free_space.blocked_share(truth.apply(house.object.points)) < 0.05
+    lifted = Sim3(truth.scale, truth.rotation, truth.translation + [0, 0, 0.5 * house.diagonal])
+    assert house.free_space.blocked_share(lifted.apply(house.object.points)) > 0.5
+    evidence = Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
+    prior = ScaleRange(truth.scale, 0.3)
+    outcome = refine_hypotheses(house.object, house.scene, [(lifted, "planted")], prior, evidence, LITTLE[1], 0)
+    assert not outcome.verdict.registered and "saw through" in outcome.verdict.reason
+
+
+def test_spread_of_a_pose_grows_with_noise():
+    def spread(noise):
+        trial = plant("urn", 3, ground=False, noise=noise, object_points=6000, density_ratio=1.0)
+        obj, scene = surfaces(trial, 0.01 * trial.diagonal)
+        truth = trial.scene_from_object
+        return uncertainty(obj, scene, truth, ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal, 0.0, 10, 0)
+
+    fine, rough = spread(0.002), spread(0.01)
+    assert fine.scale_sd_log < rough.scale_sd_log
+    assert fine.covariance.shape == (7, 7) and np.allclose(fine.covariance, fine.covariance.T)
+
+
+def test_scale_ledger_names_every_estimate_and_the_winner(house):
+    outcome = register(house, settings=LITTLE)
+    prior = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
+    witness = shared(house.scene_from_object)
+    rows = scale_ledger(prior, witness, outcome.ranked[0], outcome.spread, outcome.verdict)
+    assert [r["name"] for r in rows] == ["rms", "shared points", "registration"]
+    assert rows[-1]["use"].startswith("won") and rows[-1]["scale"] == outcome.ranked[0].pose.scale

@@ -148,6 +148,10 @@ rule fine:
         cameras="results/objects/{object}/cameras.json",
         scale="results/objects/{object}/registration/{arm}/scale.json",
         coarse="results/objects/{object}/registration/{arm}/coarse.json",
+        witness="results/objects/{object}/witness.json",
+        workspace=in_scene("dense"),
+        depth=[in_scene(f"depth/{chunk}") for chunk in CHUNKS],
+        depth_json=[in_scene(f"depth/{chunk}.json") for chunk in CHUNKS],
     output:
         fine="results/objects/{object}/registration/{arm}/fine.json",
         picture=report(
@@ -175,7 +179,7 @@ rule fine:
         "{wildcards.object}, arm {wildcards.arm}: fine registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
-        " --scale {input.scale} --coarse {input.coarse} --fine {output.fine} --picture {output.picture}"
+        " --scale {input.scale} --coarse {input.coarse} --witness {input.witness} --workspace {input.workspace} --depth {input.depth} --fine {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
