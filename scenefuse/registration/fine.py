@@ -22,7 +22,7 @@ from scenefuse.transforms import Sim3
 
 MOST_POINTS = 12000
 LOOK_POINTS = 1200
-REFINE_POINTS = 4000
+REFINE_POINTS = 3000
 POLISHED = 4
 OFF_SCALE = 1.06
 BEYOND_PRIOR = 0.15
@@ -243,9 +243,14 @@ def refine_hypotheses(
         nearby = polish(settle(witness.pose, "photos", narrow))
         stays = witness.agrees(nearby.pose, obj.points.mean(0), diagonal)
         ranked.insert(0, nearby if stays else Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
-    spread = uncertainty(*asking, ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed)
+    coarser = prepare_both(cloud, scene, scale, 2 * settings.fine_voxel_fraction, seed, MOST_POINTS)
+    spread = uncertainty(
+        [asking, coarser], ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed
+    )
     gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
-    return Outcome(ranked, judge(ranked, looking[0], diagonal, tau, gate, scales, evidence, spread), spread)
+    return Outcome(
+        ranked, judge(ranked, probing(obj, LOOK_POINTS, seed), diagonal, tau, gate, scales, evidence, spread), spread
+    )
 
 
 def spread_quantities(spread: Uncertainty | None, unit: str) -> dict[str, Any]:
@@ -296,7 +301,7 @@ def _paper(
 ) -> Outcome:
     """The paper's ICP; the score is recorded and nothing is refused."""
     pose = paper_fine(cloud, scene, start, voxel_fraction)
-    obj, target = prepare_both(cloud, scene, scales.centre, settings.fine_voxel_fraction, seed)
+    obj, target = prepare_both(cloud, scene, scales.centre, settings.fine_voxel_fraction, seed, MOST_POINTS)
     rated = score(obj, target, pose, settings.score_fraction * scene.diagonal, settings.recall_weight, scales.centre)
     verdict = Verdict(True, "the paper's recipe has no gate", "geometry", 0.0, None, None)
     return Outcome([Hypothesis(pose, "fpfh", rated)], verdict, None)

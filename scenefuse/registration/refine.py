@@ -112,8 +112,7 @@ class Uncertainty:
 
 
 def uncertainty(
-    obj: Surface,
-    scene: Surface,
+    surfaces: list[tuple[Surface, Surface]],
     pose: Sim3,
     scales: ScaleRange,
     tau: float,
@@ -125,22 +124,33 @@ def uncertainty(
 
     Pieces are a sixth of the scene crop's diagonal wide, so that what is correlated stays together. The deviation of a
     half's pose from the whole's has the spread that the whole's has from the truth. New pairs are made each time; a
-    bootstrap of fixed pairs is some five times too sure of itself.
+    bootstrap of fixed pairs is some five times too sure of itself. Taking turns with differently thinned clouds lets
+    a pose that hangs on the thinning show it.
+
+    Args:
+        surfaces: object and scene at one or more spacings, in turn.
+        pose: scene_from_object of the whole.
+        scales: bounds of the scale.
+        tau: see `refine_planes`.
+        color_weight: see `refine_planes`.
+        resamplings: halves drawn.
+        seed: of the halves.
 
     Returns:
         The spread, or None with fewer than eight pieces to draw from.
     """
-    centre = obj.points.mean(0)
-    edge = float(np.linalg.norm(np.ptp(scene.points, axis=0))) / 6
-    places = np.concatenate([scene.points, pose.apply(obj.points)])
-    piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
-    in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
-    pieces = np.unique(in_scene)
-    if len(pieces) < 8:
-        return None
+    centre = surfaces[0][0].points.mean(0)
+    edge = float(np.linalg.norm(np.ptp(surfaces[0][1].points, axis=0))) / 6
     rng = np.random.default_rng(seed)
     deviations = np.zeros((resamplings, 7))
     for k in range(resamplings):
+        obj, scene = surfaces[k % len(surfaces)]
+        places = np.concatenate([scene.points, pose.apply(obj.points)])
+        piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
+        in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
+        pieces = np.unique(in_scene)
+        if len(pieces) < 8:
+            return None
         chosen = np.zeros(piece.max() + 1, dtype=bool)
         chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
         half_object = replace(obj, probe=obj.probe[chosen[in_object[obj.probe]]])

@@ -54,6 +54,7 @@ def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
         return Found(None, False, "no hypothesis")
     poses = [(h.pose, h.source) for h in found]
     outcome = refine_hypotheses(cloud, scene, poses, scales, evidence, build(FineSettings, CONFIG["fine"]), 0)
+
     return Found(outcome.ranked[0].pose, outcome.verdict.registered, outcome.verdict.reason)
 
 

@@ -292,7 +292,7 @@ def test_spread_of_a_pose_grows_with_noise():
         trial = plant("urn", 3, ground=False, noise=noise, object_points=6000, density_ratio=1.0)
         obj, scene = surfaces(trial, 0.01 * trial.diagonal)
         truth = trial.scene_from_object
-        return uncertainty(obj, scene, truth, ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal, 0.0, 10, 0)
+        return uncertainty([(obj, scene)], truth, ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal, 0.0, 10, 0)
 
     fine, rough = spread(0.002), spread(0.01)
     assert fine.scale_sd_log < rough.scale_sd_log
