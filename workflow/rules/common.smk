@@ -104,11 +104,14 @@ def object_row(name):
     return OBJECTS[name]
 
 
-def in_scene(path):
-    """Input function: a file of the scene that the object lies in."""
-    return (
-        lambda wildcards: f"results/scenes/{object_row(wildcards.object)['scene']}/{path}"
-    )
+def in_scene(*paths):
+    """Input function: files of the scene that the object lies in."""
+
+    def files(wildcards):
+        scene = object_row(wildcards.object)["scene"]
+        return [f"results/scenes/{scene}/{path}" for path in paths]
+
+    return files
 
 
 def photos_in(path, where):

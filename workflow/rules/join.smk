@@ -150,8 +150,8 @@ rule fine:
         coarse="results/objects/{object}/registration/{arm}/coarse.json",
         witness="results/objects/{object}/witness.json",
         workspace=in_scene("dense"),
-        depth=[in_scene(f"depth/{chunk}") for chunk in CHUNKS],
-        depth_json=[in_scene(f"depth/{chunk}.json") for chunk in CHUNKS],
+        depth=in_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
+        depth_json=in_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
     output:
         fine="results/objects/{object}/registration/{arm}/fine.json",
         picture=report(
