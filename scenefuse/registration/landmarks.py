@@ -1,5 +1,9 @@
 """The triangulated points of a COLMAP model with their SIFT descriptors, and matches between two models' points."""
 
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -81,7 +85,7 @@ def read_landmarks(model: Path, database: Path, most_points: int, descriptors_pe
     chosen = _spread_evenly(start, descriptors_per_point)
     rays = np.zeros((len(elements), 2))
     descriptors = np.zeros((len(ids) * descriptors_per_point, 128), dtype=np.float32)
-    with pycolmap.Database.open(database) as opened:
+    with _untouched(database) as copy, pycolmap.Database.open(copy) as opened:
         for image_id, image in images.items():
             found = opened.read_descriptors(image_id).data if opened.exists_image(image_id) else np.zeros((0, 128))
             if len(found) != len(image.points2D):
@@ -106,6 +110,13 @@ def read_landmarks(model: Path, database: Path, most_points: int, descriptors_pe
         np.array([view_of[i] for i in elements[:, 0]], dtype=np.int64),
         rays,
     )
+
+
+@contextmanager
+def _untouched(database: Path) -> Iterator[Path]:
+    """A temporary copy: COLMAP writes to every database that it opens, and a changed input reruns the workflow."""
+    with tempfile.TemporaryDirectory(prefix="scenefuse-") as folder:
+        yield Path(shutil.copyfile(database, Path(folder) / database.name))
 
 
 def match_landmarks(a: Landmarks, b: Landmarks, max_ratio: float) -> NDArray[np.int64]:

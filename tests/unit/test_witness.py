@@ -1,5 +1,6 @@
 """The second witness finds a planted similarity, says how sure it is, and says no where nothing is shared."""
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -241,3 +242,11 @@ def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
 def test_a_database_of_other_photos_is_refused(pair, tmp_path):
     with pytest.raises(StageError, match="rerun the matching"):
         ask(tmp_path, (pair[0][0], pair[1][1]), pair[1])
+
+
+def test_inputs_are_not_written_to(pair, tmp_path):
+    databases = [side[1] for side in pair]
+    for database in databases:
+        os.utime(database, (1e9, 1e9))
+    ask(tmp_path, *pair)
+    assert [database.stat().st_mtime for database in databases] == [1e9, 1e9]

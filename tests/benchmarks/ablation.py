@@ -1,0 +1,107 @@
+"""The paper's Table 4 on the demo: every registration arm over several seeds, at the full arm's thresholds.
+
+make demo, then make bench-ablation; or python tests/benchmarks/ablation.py --results results --seeds 3
+"""
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from scenefuse.clouds import Cloud, read_cloud
+from scenefuse.demo.cameras import read_cameras
+from scenefuse.metrics.registration import MetricSettings, registration_metrics
+from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
+from scenefuse.registration.coarse import CoarseSettings, register_coarsely
+from scenefuse.registration.fine import FineSettings, register_finely
+from scenefuse.settings import build, merge, shipped_with
+from scenefuse.stage import read_json, run, value
+from scenefuse.transforms import Sim3
+
+OBJECTS = ("house", "balloon", "sculpture")
+
+
+def one(results: Path, name: str, arm: str, seed: int, settings: dict[str, Any], true: Sim3) -> dict[str, Any]:
+    """Register one object again with another seed, from the workflow's crop and scale, and measure it."""
+    folder, scene = results / "objects" / name, results / "scenes/demo"
+    own = merge(settings["registration"], settings["arms"][arm])
+    files = {
+        "object": folder / "object.ply",
+        "crop": folder / f"registration/{arm}/crop.ply",
+        "crop_report": folder / f"registration/{arm}/crop.json",
+        "scale": folder / f"registration/{arm}/scale.json",
+        "cameras": folder / "cameras.json",
+    }
+    with tempfile.TemporaryDirectory() as temporary:
+        coarse, fine = Path(temporary) / "coarse.json", Path(temporary) / "fine.json"
+        register_coarsely(
+            **files, report=coarse, recipe=own["coarse"]["recipe"], seed=seed,
+            settings=build(CoarseSettings, own["coarse"]),
+        )  # fmt: skip
+        register_finely(
+            **files, coarse=coarse, witness=folder / "witness.json", workspace=scene / "dense",
+            depth=sorted(p for p in (scene / "depth").iterdir() if p.is_dir()), fine=fine,
+            recipe=own["fine"]["recipe"], voxel_fraction=own["fine"]["voxel_fraction"], seed=seed,
+            settings=build(FineSettings, own["fine"]),
+        )  # fmt: skip
+        found = read_json(fine)
+    reference = read_json(folder / "registration/full/crop.json")
+    obj, crop = read_cloud(folder / "object.ply"), read_cloud(folder / "registration/full/crop.ply")
+    diagonal, measures = value(reference, "diagonal"), build(MetricSettings, settings["metrics"])
+    pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
+    measured = registration_metrics(obj, crop, pose, measures.tau_fraction * diagonal, diagonal, "m", measures)
+    error = registration_error(pose, true, *_size(obj, true))
+    rmse = value(measured, "inlier_rmse")
+    return {
+        "object": name,
+        "arm": arm,
+        "seed": seed,
+        "registered": value(found, "status") == "registered",
+        "fitness": value(measured, "fitness_target"),
+        "rmse_pct": np.nan if rmse is None else 100 * rmse / diagonal,
+        "normals": value(measured, "normal_consistency_cross"),
+        "scale_pct": error.scale_pct,
+        "rotation_deg": error.rotation_deg,
+        "shift_pct": 100 * error.translation_over_diagonal,
+    }
+
+
+def _size(obj: Cloud, true: Sim3) -> tuple[np.ndarray, float]:
+    """The object's middle in its own frame, and its diagonal in the scene's unit."""
+    low, high = np.percentile(obj.points, [1, 99], axis=0)
+    return obj.points.mean(0), true.scale * float(np.linalg.norm(high - low))
+
+
+def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
+    """Print mean and spread of every arm over seeds; all trials go to bench/ablation.tsv in the results.
+
+    Args:
+        results: folder of a finished demo.
+        seeds: 0 to this.
+    """
+    settings, rows = shipped_with(None), []
+    truth = results / "demo/demo/truth"
+    scene_cameras = read_cameras(truth / "scene/cameras.json")
+    scene = fit_cameras(read_posed(results / "scenes/demo/georeferenced", scene_cameras), scene_cameras)
+    for name in OBJECTS:
+        cameras = read_cameras(truth / name / "cameras.json")
+        orbit = fit_cameras(read_posed(results / f"objects/{name}/cameras/sparse", cameras), cameras)
+        true = scene.truth_from_model.inverse() @ orbit.truth_from_model
+        rows += [one(results, name, arm, seed, settings, true) for arm in settings["arms"] for seed in range(seeds)]
+    table = pd.DataFrame(rows)
+    out = results / "bench/ablation.tsv"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out, sep="\t", index=False, float_format="%.5g")
+    columns = ["registered", "fitness", "rmse_pct", "normals", "scale_pct", "rotation_deg", "shift_pct"]
+    groups = table.groupby(["object", "arm"], sort=False)[columns]
+    means, spreads = groups.mean(), groups.std()
+    print(f"{'object':10s} {'arm':11s}" + "".join(f"{c:>18s}" for c in columns) + f"   (mean ± sd over {seeds} seeds)")
+    for key in means.index:
+        cells = "".join(f"{means.loc[key, c]:10.3g} ± {spreads.loc[key, c]:5.2g}" for c in columns[1:])
+        print(f"{key[0]:10s} {key[1]:11s}{means.loc[key, 'registered']:18.2f}{cells}")
+
+
+if __name__ == "__main__":
+    run(ablation)
