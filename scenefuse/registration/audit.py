@@ -6,7 +6,6 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.coarse import Hypothesis, distinct
-from scenefuse.registration.evidence import Evidence
 from scenefuse.registration.refine import ScaleRange, Uncertainty
 from scenefuse.registration.score import color_agreement, pair
 from scenefuse.registration.surface import Surface
@@ -84,8 +83,9 @@ def judge(
     tau: float,
     gate: Gate,
     scales: ScaleRange,
-    evidence: Evidence,
+    ups: tuple[Array, Array] | None,
     spread: Uncertainty | None,
+    decided_by: str,
 ) -> Verdict:
     """Weigh the best hypothesis against its rivals, the photos and the gate.
 
@@ -100,8 +100,9 @@ def judge(
         tau: scoring distance, scene units.
         gate: thresholds.
         scales: the scale prior; a scale at its edge is refused.
-        evidence: gravity and the photos' similarity.
-        spread: of the best pose, over halves of the surface.
+        ups: up in the object's and in the scene's frame, or None.
+        spread: of the best pose.
+        decided_by: see Verdict.
     """
     best, centre = ranked[0], obj.points.mean(0)
     rival, free_axis = None, None
@@ -114,15 +115,15 @@ def judge(
             continue
         if rival is None:
             rival = other
+    # The photos' pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    linked = evidence.witness is not None
-    decided_by = "geometry" if not linked else "photos" if best.source == "photos" else "both"
+    linked = decided_by != "geometry"
     problem = _blocked(best, gate)
     if problem is None:
         problem = (
             _poor_with_photos(best, gate) if linked else _poor(best, margin, diagonal, gate, scales, spread, free_axis)
         )
-    tilt = tilt_deg(best.pose, evidence.ups)
+    tilt = tilt_deg(best.pose, ups)
     if problem is None and tilt is not None and tilt > gate.max_final_tilt_deg:
         problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
     if problem is not None:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.registration.free_space import FreeSpace
+from scenefuse.registration.refine import Uncertainty
 from scenefuse.stage import read_json, value
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
@@ -16,17 +17,13 @@ class Witness:
 
     Attributes:
         pose: scene_from_object.
-        scale_sd_log: standard deviation of its scale, natural logarithm.
-        rotation_sd_deg: of its rotation, degrees.
-        translation_sd: of the object's centre, scene units.
+        spread: of the pose.
         shared_points: points seen by photos of both sides that support it.
         scale_from_centres: scale from the camera centres alone, or None.
     """
 
     pose: Sim3
-    scale_sd_log: float
-    rotation_sd_deg: float
-    translation_sd: float
+    spread: Uncertainty
     shared_points: int
     scale_from_centres: float | None
 
@@ -36,9 +33,9 @@ class Witness:
         angle = rotation_angle_deg(pose.rotation @ self.pose.rotation.T)
         shift = float(np.linalg.norm(pose.apply(centre) - self.pose.apply(centre)))
         return bool(
-            scale <= max(0.03, 3 * self.scale_sd_log)
-            and angle <= max(3.0, 3 * self.rotation_sd_deg)
-            and shift <= max(0.03 * diagonal, 3 * self.translation_sd)
+            scale <= max(0.03, 3 * self.spread.scale_sd_log)
+            and angle <= max(3.0, 3 * self.spread.rotation_sd_deg)
+            and shift <= max(0.03 * diagonal, 3 * self.spread.translation_sd)
         )
 
 
@@ -76,9 +73,7 @@ def read_witness(path: Path | None) -> Witness | None:
         return None
     return Witness(
         Sim3.from_matrix(np.array(value(content, "scene_from_object"))),
-        value(content, "scale_sd_log"),
-        value(content, "rotation_sd_deg"),
-        value(content, "translation_sd"),
+        Uncertainty.even(*(value(content, name) for name in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))),
         value(content, "shared_points"),
         value(content, "scale_from_centres"),
     )

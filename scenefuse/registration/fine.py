@@ -237,20 +237,28 @@ def refine_hypotheses(
     ranked = in_order([polish(h) for h in in_order(ranked)[:POLISHED]])
     # A valley that is flat in scale has several ends; start from both sides.
     ranked = in_order([*ranked, *(polish(resized(ranked[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE))])
-    witness = evidence.witness
-    if witness is not None and not witness.agrees(ranked[0].pose, obj.points.mean(0), diagonal):
-        # Clouds may polish what the photos say, not carry it off.
-        nearby = polish(settle(witness.pose, "photos", narrow))
-        stays = witness.agrees(nearby.pose, obj.points.mean(0), diagonal)
-        ranked.insert(0, nearby if stays else Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
     coarser = prepare_both(cloud, scene, scale, 2 * settings.fine_voxel_fraction, seed, MOST_POINTS)
-    spread = uncertainty(
-        [asking, coarser], ranked[0].pose, scales, narrow, settings.color_weight, settings.resamplings, seed
-    )
+
+    def spread_of(h: Hypothesis) -> Uncertainty | None:
+        both = [asking, coarser]
+        return uncertainty(both, h.pose, scales, narrow, settings.color_weight, settings.resamplings, seed)
+
+    witness, centre, decided_by = evidence.witness, obj.points.mean(0), "geometry"
+    if witness is not None:
+        decided_by = "both" if witness.agrees(ranked[0].pose, centre, diagonal) else "photos"
+        if decided_by == "photos":
+            ranked.insert(0, polish(settle(witness.pose, "photos", narrow)))
+    spread = spread_of(ranked[0])
+    if witness is not None:
+        # Where clouds and photos are in one valley, the surer of them has the last word; clouds cannot leave it.
+        strays = not witness.agrees(ranked[0].pose, centre, diagonal)
+        if strays or spread is None or witness.spread.size(diagonal) < spread.size(diagonal):
+            ranked.insert(0, Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
+            spread = witness.spread
     gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
-    return Outcome(
-        ranked, judge(ranked, probing(obj, LOOK_POINTS, seed), diagonal, tau, gate, scales, evidence, spread), spread
-    )
+    looks = probing(obj, LOOK_POINTS, seed)
+    verdict = judge(ranked, looks, diagonal, tau, gate, scales, evidence.ups, spread, decided_by)
+    return Outcome(ranked, verdict, spread)
 
 
 def spread_quantities(spread: Uncertainty | None, unit: str) -> dict[str, Any]:
@@ -274,19 +282,18 @@ def scale_ledger(
         {"name": e["name"], "scale": e["scale"], "sd_log": None, "use": "centres the prior" if e["used"] else "none"}
         for e in value(prior, "ledger")
     ]
+    agree = {"both": ", and the clouds agree", "photos": "; the clouds' best fit is another pose"}
+    why = "the clouds' best fit inside the prior" + {"both": ", and the photos agree"}.get(verdict.decided_by, "")
+    by_photos = witness is not None and best.pose is witness.pose
     if witness is not None:
-        rows.append(
-            {"name": "shared points", "scale": witness.pose.scale, "sd_log": witness.scale_sd_log, "use": "photos"}
-        )
+        use = f"won: surer than the clouds{agree[verdict.decided_by]}" if by_photos else "confirms"
+        sd = witness.spread.scale_sd_log
+        rows.append({"name": "shared points", "scale": witness.pose.scale, "sd_log": sd, "use": use})
         if witness.scale_from_centres is not None:
             rows.append({"name": "camera centres", "scale": witness.scale_from_centres, "sd_log": None, "use": "none"})
-    why = {
-        "geometry": "no photos link object and scene: the clouds' best fit inside the prior",
-        "both": "the clouds' best fit, which the shared points confirm",
-        "photos": "the shared points: the clouds' best fit is another pose",
-    }[verdict.decided_by]
-    sd = None if spread is None else spread.scale_sd_log
-    rows.append({"name": "registration", "scale": best.pose.scale, "sd_log": sd, "use": f"won: {why}"})
+    if not by_photos:
+        own = None if spread is None else spread.scale_sd_log
+        rows.append({"name": "clouds", "scale": best.pose.scale, "sd_log": own, "use": f"won: {why}"})
     return rows
 
 

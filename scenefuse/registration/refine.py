@@ -110,6 +110,17 @@ class Uncertainty:
     translation_sd: float
     covariance: Array
 
+    @classmethod
+    def even(cls, scale_sd_log: float, rotation_sd_deg: float, translation_sd: float) -> "Uncertainty":
+        """The same spread in all directions."""
+        variances = np.array([np.radians(rotation_sd_deg)] * 3 + [translation_sd] * 3 + [scale_sd_log]) ** 2
+        return cls(scale_sd_log, rotation_sd_deg, np.array([0.0, 0.0, 1.0]), translation_sd, np.diag(variances))
+
+    def size(self, diagonal: float) -> float:
+        """One number to compare spreads by: how far it moves a point half a diagonal off the centre, over it."""
+        turn, shift = np.radians(self.rotation_sd_deg) / 2, self.translation_sd / diagonal
+        return float(np.sqrt((self.scale_sd_log / 2) ** 2 + turn**2 + shift**2))
+
 
 def uncertainty(
     surfaces: list[tuple[Surface, Surface]],

@@ -14,7 +14,7 @@ from scenefuse.registration.evidence import Evidence, Witness
 from scenefuse.registration.features import match, ransac_similarities
 from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely, scale_ledger
 from scenefuse.registration.ledger import round_trip, write_frame_ledger
-from scenefuse.registration.refine import ScaleRange, refine_planes, refine_points, uncertainty
+from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
 from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
@@ -247,7 +247,7 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
 
 
 def shared(pose: Sim3) -> Witness:
-    return Witness(pose, 0.005, 0.3, 0.02, 40, None)
+    return Witness(pose, Uncertainty.even(0.005, 0.3, 0.02), 40, None)
 
 
 def test_photos_that_agree_settle_the_pose(house):
@@ -260,6 +260,18 @@ def test_photos_that_agree_settle_the_pose(house):
     )
     assert not alone.registered and "margin" in alone.reason
     assert linked.registered and linked.decided_by == "both"
+
+
+def test_the_surer_of_photos_and_clouds_has_the_last_word(house):
+    truth = house.scene_from_object
+    prior = ScaleRange(truth.scale, 0.3)
+    near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
+    for sd, won in ((1e-4, True), (0.02, False)):
+        witness = Witness(near, Uncertainty.even(sd, 100 * sd, 10 * sd), 40, None)
+        evidence = Evidence((house.up_in_object, Z), None, witness)
+        outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
+        assert outcome.verdict.decided_by == "both"
+        assert (outcome.ranked[0].pose.scale == near.scale) == won
 
 
 def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
@@ -304,5 +316,5 @@ def test_scale_ledger_names_every_estimate_and_the_winner(house):
     prior = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
     witness = shared(house.scene_from_object)
     rows = scale_ledger(prior, witness, outcome.ranked[0], outcome.spread, outcome.verdict)
-    assert [r["name"] for r in rows] == ["rms", "shared points", "registration"]
+    assert [r["name"] for r in rows] == ["rms", "shared points", "clouds"]
     assert rows[-1]["use"].startswith("won") and rows[-1]["scale"] == outcome.ranked[0].pose.scale
