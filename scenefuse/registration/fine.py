@@ -113,7 +113,7 @@ def register_finely(
     Args:
         object: object cloud (PLY) in its own frame and unit.
         crop: scene crop (PLY).
-        crop_report: JSON of the crop stage, for `up_in_scene`.
+        crop_report: JSON of the crop stage, for `up_in_scene` and the unit of lengths.
         scale: JSON of the scale stage.
         coarse: JSON of the coarse stage.
         cameras: JSON with `up_in_camera_frame`, or nothing.
@@ -151,6 +151,7 @@ def register_finely(
     print(f"{status}: {verdict.reason}", flush=True)
     if picture is not None:
         draw_alignment(picture, cloud, scene, best.pose, seed)
+    length = read_json(crop_report)["diagonal"]["unit"]
     unit = "scene units per object unit"
     rival = verdict.rival
     write_json(
@@ -171,9 +172,9 @@ def register_finely(
             "free_axis": quantity(verdict.free_axis, ""),
             "blocked": quantity(best.score.blocked, "1"),
             "tilt_deg": quantity(tilt_deg(best.pose, evidence.ups), "degrees"),
-            **spread_quantities(outcome.spread, "scene units"),
+            **spread_quantities(outcome.spread, length),
             "scale_ledger": quantity(scale_ledger(prior, evidence.witness, best, outcome.spread, verdict), ""),
-            "tau": quantity(settings.score_fraction * scene.diagonal, "scene units"),
+            "tau": quantity(settings.score_fraction * scene.diagonal, length),
             "source": quantity(best.source, ""),
             "rival": quantity(None if rival is None else rival.as_json(), ""),
             "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),

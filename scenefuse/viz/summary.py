@@ -171,6 +171,13 @@ def _object_lines(item: Collected, row: dict[str, Any], arms: list[str]) -> list
     return lines + _remarks(item.stages | fields | item.fusion)
 
 
+_DECIDED = {
+    "geometry": "by the clouds alone: no photos link object and scene",
+    "both": "clouds and shared photos agree",
+    "photos": "by shared photos, against the clouds",
+}
+
+
 def _arm_lines(item: Collected, arms: list[str]) -> list[str]:
     """One line an arm; errors against truth only where it is known."""
     shown = {
@@ -200,7 +207,19 @@ def _arm_lines(item: Collected, arms: list[str]) -> list[str]:
         found = item.arms[arms[0]]
         units = [(n, number_in(found, *REGISTRATION[k]), _short(unit_of(found, *REGISTRATION[k]))) for n, k in cells_of]
         lines += _line("", f"{arms[0]}: {_pairs(units)}")
+    decided = find(item.arms[arms[0]], "fine.decided_by")
+    if decided is not None:
+        lines += _line("pose", _DECIDED[decided] + _spread(item.arms[arms[0]]))
     return [line.rstrip() for line in lines]
+
+
+def _spread(found: Fields) -> str:
+    """Standard deviations of the pose, where they are known."""
+    scale, turn, shift = (number_in(found, f"fine.{k}") for k in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))
+    if scale is None or turn is None or shift is None:
+        return ""
+    unit = _short(unit_of(found, "fine.translation_sd"))
+    return f"; one sd {_three(100 * scale)} % of scale, {_three(turn)} degrees, {_three(shift)} {unit}"
 
 
 def _three(item: float | int | None) -> str:

@@ -174,7 +174,7 @@ def test_tilt_is_the_angle_between_the_ups():
 def test_stages_write_their_files_and_refuse_honestly(tmp_path, house):
     write_cloud(tmp_path / "object.ply", house.object)
     write_cloud(tmp_path / "crop.ply", house.scene)
-    write_json(tmp_path / "crop.json", {"up_in_scene": quantity(Z, "")})
+    write_json(tmp_path / "crop.json", {"up_in_scene": quantity(Z, ""), "diagonal": quantity(1.0, "m")})
     write_json(tmp_path / "cameras.json", {"up_in_camera_frame": quantity(house.up_in_object, "")})
     files = {"object": tmp_path / "object.ply", "crop": tmp_path / "crop.ply", "crop_report": tmp_path / "crop.json"}
     scale, coarse, fine = (tmp_path / f"{n}.json" for n in ("scale", "coarse", "fine"))
