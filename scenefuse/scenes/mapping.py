@@ -55,7 +55,7 @@ def map_incremental(
     pycolmap.set_random_seed(seed)
     with tempfile.TemporaryDirectory(dir=sparse.parent, prefix=".mapping-") as work:
         models = cancellable(
-            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(settings, seed)
+            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(settings, len(names), seed)
         )
     ranked = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     _check_registered(ranked, names, settings.min_registered_share)
@@ -125,7 +125,7 @@ def describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]
     }
 
 
-def _mapper_options(settings: MapSettings, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _mapper_options(settings: MapSettings, photos: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = threads()
     options.random_seed = seed
@@ -135,6 +135,9 @@ def _mapper_options(settings: MapSettings, seed: int) -> pycolmap.IncrementalPip
     options.mapper.init_min_num_inliers = settings.init_min_inliers
     options.mapper.filter_max_reproj_error = settings.max_reprojection_error_px
     options.min_model_size = 3
+    # A second attempt from another pair stops, by default, once it shares twenty photos with the first, however small
+    # that one stayed; here every attempt goes on as far as it can, and the largest is taken.
+    options.max_model_overlap = photos
     return options
 
 
