@@ -36,7 +36,7 @@ _NOTES = {
     "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
     "cloud is denser. Primitive fitting: share of added points on planes, spheres or cylinders.",
     "ablation": "All arms at the same thresholds. `full` is the default that is fused, `paper` follows the published "
-    "recipe, `no_scale` leaves out scale rectification, `no_crop` the crop.",
+    "recipe, `no_witness` looks at the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the crop.",
     "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
     "largest resident size of one job.",
 }

@@ -7,7 +7,7 @@
 #           results/objects/{object}/frames.json, metrics.json
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 #
-# An arm is a registration recipe: `full` is the one that is fused, the others (`paper`, `no_scale`, `no_crop`) are run beside it
+# An arm is a registration recipe: `full` is the one that is fused, the others (`paper`, `no_witness`, `no_scale`, `no_crop`) are run beside it
 # by the same scripts, with the settings that config `arms` lays over config `registration`, and measured at the same thresholds.
 
 
