@@ -100,6 +100,7 @@ def evaluate_object(
     stages: list[Path],
     cloud: Path,
     arms: list[Path],
+    witness: Path | None,
     before: Path | None,
     after: Path | None,
     scene_evaluation: Path,
@@ -124,6 +125,7 @@ def evaluate_object(
         stages: folders that hold depth_maps/, in order; empty for none.
         cloud: the object's cloud in its own frame.
         arms: fine.json of every arm, each in a folder named for the arm; `full` first gives the main results.
+        witness: JSON of the second witness, judged like an arm, or nothing.
         before: scene cloud before fusion, scene frame; the whole scene or the object's surroundings.
         after: the same after fusion; absent when nothing was fused.
         scene_evaluation: what `evaluate_scene` wrote.
@@ -167,13 +169,17 @@ def evaluate_object(
     true = truth_from_scene.inverse() @ truth_from_object
     middle_in_object = truth_from_object.inverse().apply(middle)
     scene_diagonal = diagonal / truth_from_scene.scale
-    arm_results = {}
-    for path in arms:
-        arm_results[path.parent.name] = _arm_results(
+
+    def judged(path: Path) -> dict[str, Any]:
+        return _arm_results(
             read_json(path), true, middle_in_object, scene_diagonal, truth_from_scene, object_points, mesh,
             surface[by_orbit], diagonal, samples, seed,
         )  # fmt: skip
+
+    arm_results = {path.parent.name: judged(path) for path in arms}
     result |= next(iter(arm_results.values()), {})
+    if witness is not None:
+        result |= {f"witness_{name}": entry for name, entry in judged(witness).items() if name != "status"}
     result |= _scene_results(before, after, truth_from_scene, mesh, rest, surface[by_any], diagonal)
     result |= {"tau": quantity(0.01 * diagonal, "m"), "arms": arm_results}
     write_json(evaluation, result)

@@ -1,6 +1,6 @@
-"""The scene around an object: a box from fiducials, upright to gravity, with the ground and loose parts removed."""
+"""The scene around an object: a box or hull upright to gravity, with the ground and loose parts removed."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -8,13 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 
 from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.fiducials import locate
 from scenefuse.registration.ground import Ground, fit_ground
-from scenefuse.stage import StageError, quantity, threads, write_json
-from scenefuse.transforms import Array, rotation_between
+from scenefuse.registration.shapes import in_wide_hull, least_footprint
+from scenefuse.registration.vote import read_silhouettes, vote
+from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
+from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.units import length_unit
 
 
@@ -22,6 +24,8 @@ from scenefuse.units import length_unit
 class CropSettings:
     """Settings of the crop. Shares are of the diagonal of the fiducials' box."""
 
+    shape: Literal["box", "oriented", "hull"]
+    """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float
     """Widening of the box on every side, as a share of its own extent."""
     margin_fraction: float
@@ -42,6 +46,8 @@ class CropSettings:
     """Fewest points a crop may have."""
     max_residual_px: float
     """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
+    min_votes: float
+    """Share of the object's photos showing a scene point that must have it inside their mask; mode masks only."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +56,10 @@ class Crop:
 
     Attributes:
         keep: (N,) bool over the scene's points, True on the object.
-        in_box: (N,) bool, True for all points in the box, ground included.
-        level_from_scene: (3, 3) rotation that turns the scene's up into z.
-        low: (3,) least corner of the box in the level frame.
+        in_box: (N,) bool, True for all points in the box or hull, ground included.
+        shape: box, oriented or hull: what was cut out.
+        level_from_scene: (3, 3) rotation that turns the scene's up into z, and the box's sides into x and y.
+        low: (3,) least corner of the box (around the hull) in the level frame.
         high: (3,) greatest corner.
         ground: the fitted ground, or None.
         notes: what was not done and why.
@@ -60,6 +67,7 @@ class Crop:
 
     keep: NDArray[np.bool_]
     in_box: NDArray[np.bool_]
+    shape: str
     level_from_scene: Array
     low: Array
     high: Array
@@ -72,27 +80,35 @@ def crop_scene(
     scene: Path,
     model: Path,
     georeference: Path | None = None,
-    fiducials: Path,
+    fiducials: Path | None = None,
+    witness: Path | None = None,
+    cameras: Path | None = None,
+    masks: Path | None = None,
     crop: Path,
     report: Path,
-    mode: Literal["fiducials", "none"],
+    mode: Literal["fiducials", "masks", "none"],
     settings: CropSettings,
 ) -> None:
-    """Cut an object's surroundings out of the scene by its fiducials (method C1, C2).
+    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C3).
 
     Args:
         scene: dense scene cloud (PLY), z up as the georegister stage leaves it.
         model: COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it.
         georeference: JSON of the scene, for the unit of its lengths, or nothing.
         fiducials: tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z), at least four
-            different points on the object.
+            different points on the object; mode fiducials.
+        witness: JSON of the witness stage, with `scene_from_object`; mode masks.
+        cameras: undistorted COLMAP workspace of the object; mode masks.
+        masks: folder of the object's masks; mode masks.
         crop: output PLY, the scene's points on the object.
         report: output JSON: box, gravity, ground, counts.
-        mode: fiducials; or none, which keeps the whole scene (the ablation without cropping).
+        mode: fiducials; masks, by whose votes the scene's points are picked; or none, which keeps the whole scene (the
+            ablation without cropping).
         settings: see CropSettings.
 
     Raises:
-        StageError: fewer than four fiducials, one far from every scene point, or too few points in the box.
+        StageError: fewer than four fiducials, one far from every scene point, too few points in the box, or neither
+            fiducials nor a pose of the object from the witness.
     """
     cloud, unit = read_cloud(scene), length_unit(georeference)
     up = np.array([0.0, 0.0, 1.0])
@@ -100,11 +116,50 @@ def crop_scene(
         write_cloud(crop, cloud)
         write_json(report, _report(cloud, cloud, None, None, up, mode, unit))
         return
-    names, points, _ = locate(fiducials, model, settings.max_residual_px)
-    cut = crop_marked(cloud, names, points, up, settings, fiducials)
+    if mode == "masks":
+        if witness is None or cameras is None or masks is None:
+            raise StageError("cropping by masks needs --witness, --cameras and --masks; give them, or mode fiducials")
+        points = vote_marks(cloud, witness, cameras, masks, settings)
+        cut = crop_cloud(cloud, points, up, settings)
+        marked = f"marked by the votes of {masks} through the second witness, not by fiducials"
+        cut = replace(cut, notes=[marked, *cut.notes])
+        _announce(cut, settings, str(masks))
+    else:
+        if fiducials is None:
+            raise StageError("cropping by fiducials needs --fiducials; give them, or mode masks")
+        names, points, _ = locate(fiducials, model, settings.max_residual_px)
+        cut = crop_marked(cloud, names, points, up, settings, fiducials)
     part = cloud[cut.keep]
     write_cloud(crop, part)
     write_json(report, _report(cloud, part, points, cut, up, mode, unit))
+
+
+def vote_marks(cloud: Cloud, witness: Path, cameras: Path, masks: Path, settings: CropSettings) -> Array:
+    """(F, 3) scene points that the object's masks vote for, loose ones left out: they stand in for fiducials (C3).
+
+    Raises:
+        StageError: the witness has no pose, or the masks vote for too few points.
+    """
+    said = read_json(witness)
+    if not value(said, "found"):
+        raise StageError(
+            f"there are no fiducials, and the photos do not tell where the object lies ({value(said, 'reason')}; see"
+            f" {witness}): click at least four points on it in the scene's photos and name the file in the column"
+            " fiducials of the objects table, or add photos of the object that show its surroundings too, from as far"
+            " away as the scene's"
+        )
+    pose = Sim3.from_matrix(np.array(value(said, "scene_from_object")))
+    points = cloud.points[vote(cloud.points, read_silhouettes(cameras, masks), pose, settings.min_votes)]
+    if len(points) >= settings.min_points:
+        part_of, counts = _parts(points, 3 * spacing(points))
+        points = points[(counts >= settings.min_part * len(points))[part_of]]
+    if len(points) < settings.min_points:
+        raise StageError(
+            f"only {len(points)} scene points lie inside the masks of {masks}, {settings.min_points} are needed: the"
+            " scene may not show the object; look at the masks, or click fiducials and name them in the objects table"
+        )
+    print(f"{len(points)} of {len(cloud)} scene points by the votes of the masks", flush=True)
+    return points
 
 
 def crop_marked(
@@ -119,25 +174,32 @@ def crop_marked(
         raise StageError(f"{path} gives {len(fiducials)} fiducials; an object needs at least 4 different points on it")
     _check_near(names, fiducials, scene, path)
     cut = crop_cloud(scene, fiducials, up, settings)
+    _announce(cut, settings, str(path))
+    return cut
+
+
+def _announce(cut: Crop, settings: CropSettings, source: str) -> None:
+    """Print the notes; StageError when too little is left."""
     if cut.keep.sum() < settings.min_points:
         raise StageError(
-            f"only {cut.keep.sum()} scene points are left in the box of {path}, {settings.min_points} are needed:"
-            " a fiducial may lie outside the object, or the scene may not show it"
+            f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {settings.min_points} are"
+            " needed: a fiducial may lie outside the object, or the scene may not show it"
         )
     for note in cut.notes:
         print(note, flush=True)
-    return cut
 
 
 def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings) -> Crop:
     """The points of a scene that belong to the object marked by fiducials (F, 3); see `crop_scene`."""
-    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    level, shape = rotation_between(up, np.array([0.0, 0.0, 1.0])), settings.shape
+    notes: list[str] = []
+    if shape == "oriented":
+        level = least_footprint(fiducials @ level.T) @ level
     points, marks = scene.points @ level.T, fiducials @ level.T
     extent = np.ptp(marks, axis=0)
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + settings.margin_fraction * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
-    notes: list[str] = []
     ground = None
     if settings.remove_ground:
         ground = fit_ground(points, low, high, settings.ring_fraction * diagonal, settings.ground_fraction * diagonal)
@@ -148,6 +210,12 @@ def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings
             corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
             low[2] = min(low[2], ground.height(corners).min() - settings.ground_fraction * diagonal)
     in_box = ((points >= low) & (points <= high)).all(1)
+    if shape == "hull":
+        try:
+            in_box[in_box] = in_wide_hull(points[in_box], marks, low[2], margin)
+        except QhullError:
+            shape = "box"
+            notes.append("the fiducials lie in one vertical plane and span no hull: their box was cut out instead")
     above = in_box.copy()
     if ground is not None:
         above &= points[:, 2] > ground.height(points[:, :2]) + ground.tolerance
@@ -160,7 +228,16 @@ def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings
             keep[inside] = near
         else:
             notes.append("no part in the box lies near a fiducial: all of them were kept")
-    return Crop(keep, in_box, level, low, high, ground, notes)
+    return Crop(keep, in_box, shape, level, low, high, ground, notes)
+
+
+def _parts(points: Array, link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The connected part of each point, of points closer than about `link`, and how many points each part has."""
+    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
+    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
+    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
+    part_of = connected_components(graph, directed=False)[1][cell_of.ravel()]
+    return part_of, np.bincount(part_of)
 
 
 def _parts_near(points: Array, marks: Array, link: float, reach: float, min_part: float) -> NDArray[np.bool_]:
@@ -169,12 +246,7 @@ def _parts_near(points: Array, marks: Array, link: float, reach: float, min_part
     The second counts for parts no one clicked, a wall under a roof for instance: half their points in the fiducials'
     own box, seen from above.
     """
-    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
-    cell_of = cell_of.ravel()
-    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
-    part_of = connected_components(graph, directed=False)[1][cell_of]
-    counts = np.bincount(part_of)
+    part_of, counts = _parts(points, link)
     touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
     low, high = marks.min(0)[:2], marks.max(0)[:2]
     between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
@@ -195,17 +267,19 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
 
 
 def _report(
-    scene: Cloud, part: Cloud, fiducials: Array | None, cut: Crop | None, up: Array, mode: str, unit: str
+    scene: Cloud, part: Cloud, marks: Array | None, cut: Crop | None, up: Array, mode: str, unit: str
 ) -> dict[str, object]:
     """The stage JSON of a crop."""
     ground = None if cut is None else cut.ground
     return {
         "mode": quantity(mode, ""),
+        "shape": quantity(None if cut is None else cut.shape, ""),
         "up_in_scene": quantity(up, ""),
         "level_from_scene": quantity(np.eye(3) if cut is None else cut.level_from_scene, ""),
         "box_low": quantity(scene.points.min(0) if cut is None else cut.low, unit),
         "box_high": quantity(scene.points.max(0) if cut is None else cut.high, unit),
-        "fiducials": quantity([] if fiducials is None else fiducials, unit),
+        "fiducials": quantity(marks if marks is not None and mode == "fiducials" else [], unit),
+        "voted_points": quantity(len(marks) if marks is not None and mode == "masks" else 0, "points"),
         "scene_points": quantity(len(scene), "points"),
         "box_points": quantity(len(scene) if cut is None else int(cut.in_box.sum()), "points"),
         "crop_points": quantity(len(part), "points"),

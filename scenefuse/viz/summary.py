@@ -32,7 +32,7 @@ from scenefuse.viz.values import Fields, find, number, unit_of
 WIDTH = 100
 _COLUMNS = ("value", "null", "scene")
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
-_TOLD = ("fine.reason", "fusion.reason")
+_TOLD = ("fine.reason", "fusion.reason", "witness.reason")
 _CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "kept", "kernels")
 
 
@@ -165,7 +165,7 @@ def _object_lines(item: Collected, row: dict[str, Any], arms: list[str]) -> list
         lines += _line(f"stage {stage}", _pairs(cells))
     cloud = [("points", row["points"], ""), ("median distance", row["accuracy_pct_of_diagonal"], "% of the diagonal")]
     cloud += [(k.replace("_", "-"), row[f"{k}_1pct"], "at 1 %") for k in ("precision", "completeness", "f_score")]
-    lines += _line("cloud", _pairs(cloud)) + _arm_lines(item, arms)
+    lines += _line("cloud", _pairs(cloud)) + _line("witness", _witness(item.stages)) + _arm_lines(item, arms)
     lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
     lines += _around_line(item.stages) + _completion_lines(item, arms[0])
     return lines + _remarks(item.stages | fields | item.fusion)
@@ -176,6 +176,15 @@ _DECIDED = {
     "both": "clouds and shared photos agree",
     "photos": "by shared photos, against the clouds",
 }
+
+
+def _witness(fields: Fields) -> str:
+    """What the photos alone say of the object's place."""
+    found, reason = find(fields, "witness.found"), find(fields, "witness.reason")
+    if not found:
+        return "" if found is None else f"not found: {reason}"
+    deviation = 100 * find(fields, "witness.scale_sd_log")
+    return f"scale {number(find(fields, 'witness.scale'))} (standard deviation {number(deviation)} %), {reason}"
 
 
 def _arm_lines(item: Collected, arms: list[str]) -> list[str]:

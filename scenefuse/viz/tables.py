@@ -229,7 +229,7 @@ def collect(folder: Path, arms: list[str], logs: Path, scene: str = "", scene_ga
         scene_gap: the first file that this scene lacks, or "".
     """
     there, gap = unbroken(folder, _OBJECT_FILES)
-    stages = read_fields(folder, there)
+    stages = read_fields(folder, [*there, *([] if gap else ["witness.json"])])
     who = folder.name
     if not gap and scene_gap:
         gap, who = f"{scene_gap} of the scene {scene}", scene

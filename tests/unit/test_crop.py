@@ -2,17 +2,23 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 from planted import plant
 
 from scenefuse.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.registration.crop import CropSettings, crop_cloud, crop_scene
 from scenefuse.registration.ground import fit_ground
+from scenefuse.registration.shapes import in_wide_hull, least_footprint
+from scenefuse.registration.vote import read_silhouettes, vote
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
 SETTINGS = CropSettings(
+    shape="box",
     margin=0.05,
     margin_fraction=0.04,
     remove_ground=True,
@@ -23,6 +29,7 @@ SETTINGS = CropSettings(
     min_part=0.01,
     min_points=200,
     max_residual_px=5.0,
+    min_votes=0.8,
 )
 
 
@@ -94,6 +101,163 @@ def test_bad_fiducials_end_in_one_sentence(tmp_path):
         with pytest.raises(StageError, match=sentence):
             crop_scene(**files, mode="fiducials", settings=SETTINGS)
         assert not files["crop"].exists()
+
+
+def turned(angle_deg):
+    c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+
+
+def shell(size, count=3000):
+    """Points on the faces of an upright box about the origin."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    points[np.arange(count), rng.integers(0, 3, count)] = rng.choice([-0.5, 0.5], count)
+    return points * size
+
+
+def test_an_oriented_box_fits_a_turned_object_closely():
+    corners = np.array([[x, y, z] for x in (-4.5, 4.5) for y in (-2, 2) for z in (0.1, 3.9)])
+    scene, marks = Cloud((shell([9, 4, 4]) + [0, 0, 2]) @ turned(30).T), corners @ turned(30).T
+    cuts = {shape: crop_cloud(scene, marks, Z, replace(SETTINGS, shape=shape)) for shape in ("box", "oriented")}
+    footprint = {shape: np.prod((cut.high - cut.low)[:2]) for shape, cut in cuts.items()}
+    assert footprint["oriented"] < 0.6 * footprint["box"]
+    assert cuts["oriented"].keep.all()
+    np.testing.assert_allclose(cuts["oriented"].level_from_scene @ Z, Z, atol=1e-12)
+
+
+def test_the_least_footprint_of_a_rectangle_and_of_a_line():
+    sides = np.array([[x, y, 0.0] for x in (0, 5) for y in (0, 2)])
+    for angle in (0, 20, 44, 70, 130):
+        turn = least_footprint(sides @ turned(angle).T)
+        assert sorted(np.ptp(sides @ turned(angle).T @ turn.T, axis=0)[:2]) == pytest.approx([2, 5])
+        assert turn[0, 0] >= np.cos(np.pi / 4) - 1e-9
+    line = np.outer(np.arange(5.0), [1, 0.3, 0])
+    assert np.ptp(line @ least_footprint(line).T, axis=0)[1] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_hull_leaves_out_the_corners_of_the_box():
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    marks = np.stack([4 * np.cos(angles), 4 * np.sin(angles), np.tile([6.0, 6.5], 6)], axis=1)
+    corner = np.array([3.9, 3.9, 6.2]) + np.random.default_rng(0).normal(0, 0.02, (300, 3))
+    scene = concatenate([Cloud(shell([5, 5, 0.6]) + [0, 0, 6.2]), Cloud(corner)])
+    box, hull = (crop_cloud(scene, marks, Z, replace(SETTINGS, shape=shape)) for shape in ("box", "hull"))
+    assert box.in_box[-300:].all() and not hull.in_box[-300:].any()
+    assert hull.keep[:3000].mean() > 0.95
+    # Down to the floor, right below the marks.
+    below = np.array([[0, 0, 0.1], [3.5, 0, 0.1], [3.9, 3.9, 6], [0, 0, -0.1]])
+    assert in_wide_hull(below, marks, 0.0, np.zeros(3)).tolist() == [True, True, False, False]
+    assert in_wide_hull(below, marks, 0.0, np.full(3, 0.2)).tolist() == [True, True, False, True]
+
+
+def test_marks_in_one_vertical_plane_span_no_hull_and_that_is_said():
+    wall = np.array([[x, 0, z] for x in (-4.0, 0, 4) for z in (0.2, 3)])
+    scene = Cloud(shell([8, 0.1, 4]) + [0, 0, 2])
+    cut = crop_cloud(scene, wall, Z, replace(SETTINGS, shape="hull", remove_ground=False))
+    assert cut.shape == "box" and "no hull" in cut.notes[0] and cut.keep.sum() > 1000
+
+
+@pytest.fixture(scope="module")
+def orbit(tmp_path_factory):
+    """A planted house with its masks, seen by 12 cameras around it in the object's own frame."""
+    folder = tmp_path_factory.mktemp("orbit")
+    trial = plant("house", 2, noise=0.002, object_points=20000, density_ratio=0.5)
+    object_from_scene = trial.scene_from_object.inverse()
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=320, height=240, params=[250, 250, 160, 120], camera_id=1)
+    )
+    (folder / "masks").mkdir()
+    middle = trial.fiducials.mean(0)
+    for k, angle in enumerate(np.linspace(0, 2 * np.pi, 12, endpoint=False)):
+        centre = middle + 1.4 * trial.diagonal * np.array([np.cos(angle), np.sin(angle), 0.3])
+        z = (middle - centre) / np.linalg.norm(middle - centre)
+        x = np.cross(z, Z) / np.linalg.norm(np.cross(z, Z))
+        in_object = np.stack([x, np.cross(z, x), z]) @ trial.scene_from_object.rotation
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(in_object), -in_object @ object_from_scene.apply(centre))
+        model.add_image_with_trivial_frame(pycolmap.Image(name=f"{k}.jpg", camera_id=1, image_id=k + 1), pose)
+        seen = trial.object.points @ in_object.T + pose.translation
+        u, v = (250 * seen[:, :2] / seen[:, 2:] + [160, 120]).astype(int).T
+        mask = np.zeros((240, 320), np.uint8)
+        mask[v, u] = 255
+        cv2.imwrite(str(folder / f"masks/{k}.png"), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)))
+    (folder / "cameras/sparse").mkdir(parents=True)
+    model.write(folder / "cameras/sparse")
+    write_cloud(folder / "dense.ply", trial.scene)
+    pose = quantity(trial.scene_from_object.matrix, "")
+    write_json(folder / "witness.json", {"found": quantity(True, ""), "scene_from_object": pose})
+    return folder, trial
+
+
+def own_points(trial):
+    """How many of the scene's points, its first ones, are the object's."""
+    return int(10000 * trial.coverage)
+
+
+def test_masks_vote_for_the_object_and_for_nothing_around_it(orbit):
+    folder, trial = orbit
+    silhouettes = read_silhouettes(folder / "cameras", folder / "masks")
+    assert len(silhouettes) == 12
+    own = np.arange(len(trial.scene)) < own_points(trial)
+    chosen = vote(trial.scene.points, silhouettes, trial.scene_from_object, 0.8)
+    assert chosen[own].mean() > 0.95
+    low, high = trial.fiducials.min(0) - 0.05 * trial.diagonal, trial.fiducials.max(0) + 0.05 * trial.diagonal
+    outside = ~own & ((trial.scene.points < low) | (trial.scene.points > high))[:, :2].any(1)
+    assert outside.sum() > 1000 and chosen[outside].sum() == 0
+    # Through a wrong similarity the masks meet other points, or none.
+    moved = Sim3(1.0, np.eye(3), np.array([0.5 * trial.diagonal, 0, 0])) @ trial.scene_from_object
+    assert vote(trial.scene.points, silhouettes, moved, 0.8)[own].mean() < 0.6
+
+
+def test_what_hides_the_object_takes_no_vote_from_it(orbit):
+    """A fence between some of the cameras and the house; their masks show no house."""
+    folder, trial = orbit
+    silhouettes = read_silhouettes(folder / "cameras", folder / "masks")
+    middle, size = trial.fiducials.mean(0), trial.diagonal
+    rng = np.random.default_rng(0)
+    y, z = rng.uniform(-2 * size, 2 * size, 200000), rng.uniform(-size, size, 200000)
+    fence = middle + np.stack([np.full(200000, 0.7 * size), y, z], axis=1)
+    blind = []
+    for s in silhouettes:
+        centre = trial.scene_from_object.apply(-np.linalg.inv(s.projection[:, :3]) @ s.projection[:, 3])
+        blind.append(replace(s, mask=np.zeros_like(s.mask)) if centre[0] > middle[0] + 0.7 * size else s)
+    assert sum(not s.mask.any() for s in blind) == 3
+    points = trial.scene.points
+    facing = np.flatnonzero(points[: own_points(trial), 0] > middle[0] + 0.2 * size)
+    assert len(facing) > 100
+    assert vote(np.concatenate([points, fence]), blind, trial.scene_from_object, 0.8)[facing].mean() > 0.8
+    assert vote(points, blind, trial.scene_from_object, 0.8)[facing].mean() < 0.4
+
+
+def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
+    folder, trial = orbit
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    crop_scene(**files, mode="fiducials", settings=SETTINGS)
+    clicked = read_cloud(files["crop"]).points
+    files |= {"fiducials": None, "witness": folder / "witness.json"}
+    files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
+    crop_scene(**files, mode="masks", settings=SETTINGS)
+    voted, report = read_cloud(files["crop"]).points, read_json(files["report"])
+    both = len({*map(tuple, clicked)} & {*map(tuple, voted)})
+    assert both > 0.9 * max(len(clicked), len(voted))
+    assert value(report, "mode") == "masks" and value(report, "voted_points") > 4000
+    assert value(report, "fiducials") == [] and value(report, "ground_removed") is True
+
+
+def test_without_fiducials_and_without_a_witness_the_sentence_names_both_ways_out(orbit, tmp_path):
+    folder, trial = orbit
+    files = stage_files(tmp_path, trial, trial.fiducials) | {"fiducials": None, "witness": tmp_path / "witness.json"}
+    files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
+    denied = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
+    write_json(tmp_path / "witness.json", denied)
+    with pytest.raises(StageError, match=r"only 3 of 90 .* column fiducials .* or add photos"):
+        crop_scene(**files, mode="masks", settings=SETTINGS)
+    far = Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])) @ trial.scene_from_object
+    elsewhere = {"found": quantity(True, ""), "scene_from_object": quantity(far.matrix, "")}
+    write_json(tmp_path / "witness.json", elsewhere)
+    with pytest.raises(StageError, match="only 0 scene points lie inside the masks"):
+        crop_scene(**files, mode="masks", settings=SETTINGS)
+    assert not files["crop"].exists()
 
 
 def stage_files(folder, trial, fiducials):

@@ -161,6 +161,17 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
 
 
+def test_the_text_says_what_the_photos_alone_say(results):
+    said = {"found": quantity(True, ""), "reason": quantity("9 of 12 points agree", ""), "scale": quantity(2.5, "")}
+    write_json(results / "objects/house/witness.json", said | {"scale_sd_log": quantity(0.0123, "1")})
+    denied = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
+    write_json(results / "objects/balloon/witness.json", denied)
+    text = (summarise(results) / "summary.txt").read_text()
+    assert re.search(r"witness +scale 2.5 \(standard deviation 1.23 %\), 9 of 12", text)
+    assert re.search(r"witness +not found: 3 of 12", text)
+    assert "witness.reason" not in text
+
+
 def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
     (results / "objects/house/masks.json").unlink()
     summary = summarise(results)

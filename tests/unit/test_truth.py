@@ -155,9 +155,9 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     evaluate_object(
         cameras=planted / "cameras", masks=planted / "masks", stages=[planted / "stage1", planted / "stage2"],
         cloud=planted / "object.ply", arms=[planted / arm / "fine.json" for arm in ("full", "no_scale", "no_crop")],
-        before=planted / "before.ply", after=planted / "after.ply", scene_evaluation=tmp_path / "s.json",
-        truth_scene=planted / "truth/scene", truth_object=planted / "truth/thing", evaluation=tmp_path / "o.json",
-        max_photos=5, samples=20000, seed=0,
+        witness=planted / "no_scale/fine.json", before=planted / "before.ply", after=planted / "after.ply",
+        scene_evaluation=tmp_path / "s.json", truth_scene=planted / "truth/scene",
+        truth_object=planted / "truth/thing", evaluation=tmp_path / "o.json", max_photos=5, samples=20000, seed=0,
     )  # fmt: skip
     result = read_json(tmp_path / "o.json")
     assert value(result, "mask_iou_min") == 1.0
@@ -171,6 +171,7 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     assert value(result, "object_f_score") > 0.98
     assert value(result, "rotation_error_deg") < 1e-4
     assert value(result["arms"]["no_scale"], "scale_error_pct") == pytest.approx(2.0, abs=1e-4)
+    assert value(result, "witness_scale_error_pct") == pytest.approx(2.0, abs=1e-4)
     assert value(result["arms"]["no_crop"], "object_f_score") is None
     assert value(result, "scene_f_score_before") < 0.75 < 0.97 < value(result, "scene_f_score_after")
     assert value(result, "scene_precision_before") > 0.99

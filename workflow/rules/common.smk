@@ -215,9 +215,38 @@ def arm_options(part):
     return lambda wildcards: flags(ARMS[wildcards.arm][part])
 
 
-def fiducials(wildcards):
-    """The points that bound an object in its scene."""
-    return object_row(wildcards.object)["fiducials"]
+def crop_mode(wildcards):
+    """How an arm crops; without fiducials, the object's masks mark it."""
+    mode = ARMS[wildcards.arm]["crop"]["mode"]
+    unmarked = not object_row(wildcards.object).get("fiducials")
+    return "masks" if mode == "fiducials" and unmarked else mode
+
+
+def crop_marks(wildcards):
+    """The files that mark an object in its scene: option of the crop -> path."""
+    mode, row = crop_mode(wildcards), object_row(wildcards.object)
+    if mode == "masks":
+        folder = f"results/objects/{wildcards.object}"
+        return {
+            "witness": f"{folder}/witness.json",
+            "cameras": f"{folder}/cameras",
+            "masks": f"{folder}/masks",
+        }
+    return {"fiducials": row["fiducials"]} if mode == "fiducials" else {}
+
+
+def crop_inputs(wildcards):
+    """The same, and what else says that one of them has changed."""
+    marks = crop_marks(wildcards)
+    return [*marks.values()] + [
+        f"{path}.json" for name, path in marks.items() if name in ("cameras", "masks")
+    ]
+
+
+def crop_options(wildcards):
+    """Settings of an arm's crop."""
+    own = {"mode": crop_mode(wildcards)} | crop_marks(wildcards)
+    return flags(ARMS[wildcards.arm]["crop"] | own)
 
 
 def results_of(wildcards):

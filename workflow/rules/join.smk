@@ -1,6 +1,6 @@
 # The join: witness, crop, scale, coarse and fine registration, fusion, metrics; and each scene with all its objects.
 #
-# INPUTS    config/objects.tsv: fiducials; the scene's cloud and model; the object's cloud; config: registration, arms, fusion, metrics
+# INPUTS    config/objects.tsv: fiducials, where there are any; the scene's cloud and model; the object's cloud; config: registration, arms, fusion, metrics
 # OUTPUTS   results/objects/{object}/witness.json                where photographs alone put the object
 #           results/objects/{object}/registration/{arm}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png, metrics.json
 #           results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, fusion.json     of the `full` arm
@@ -46,9 +46,9 @@ rule witness:
 
 
 rule crop:
-    """Cut the object's surroundings out of the scene by its fiducials (paper 3.3)."""
+    """Cut the object's surroundings out of the scene by its fiducials, or by its masks' votes (paper 3.3; C1 to C3)."""
     input:
-        fiducials=fiducials,
+        crop_inputs,
         scene=in_scene("dense.ply"),
         model=in_scene("georeferenced"),
         model_json=in_scene("georeference.json"),
@@ -65,13 +65,13 @@ rule crop:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        options=arm_options("crop"),
+        options=crop_options,
         script=script("crop.py"),
         code=code("crop.py"),
     message:
         "{wildcards.object}, arm {wildcards.arm}: crop"
     shell:
-        "exec python {params.script} --scene {input.scene} --model {input.model} --georeference {input.model_json} --fiducials {input.fiducials:q}"
+        "exec python {params.script} --scene {input.scene} --model {input.model} --georeference {input.model_json}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 

@@ -53,6 +53,7 @@ rule evaluate_object:
             arm=ARMS,
             allow_missing=True,
         ),
+        witness="results/objects/{object}/witness.json",
         before=in_scene("dense.ply"),
         after="results/objects/{object}/fused_scene.ply",
         scene=in_scene("truth.json"),
@@ -78,7 +79,7 @@ rule evaluate_object:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
-        " --cloud {input.cloud} --arms {input.arms} --before {input.before} --after {input.after}"
+        " --cloud {input.cloud} --arms {input.arms} --witness {input.witness} --before {input.before} --after {input.after}"
         " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
         " --evaluation {output} --seed {params.seed} {params.options} &> {log}"
 
