@@ -19,10 +19,8 @@ Columns = dict[str, NDArray[Any]]
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 # What other programs call the same columns, in lower case and without spaces, dots and underscores.
 OTHER_NAMES = {
-    **dict(zip(("normalx", "normaly", "normalz", "nor:normalx", "nor:normaly", "nor:normalz"), NORMAL * 2)),
-    **dict(zip(("r", "g", "b", "rf", "gf", "bf"), COLOR * 2)),
-    **dict(zip(("diffusered", "diffusegreen", "diffuseblue", "colorred", "colorgreen", "colorblue"), COLOR * 2)),
-    **dict(zip(("cartesianx", "cartesiany", "cartesianz"), POSITION)),
+    **dict(zip(("normalx", "normaly", "normalz"), NORMAL)),
+    **dict(zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), COLOR * 3)),
 }
 
 
@@ -133,16 +131,15 @@ def _e57(path: Path) -> Columns:
 
 
 def _e57_scan(file: Any, header: Any) -> Columns:
-    """One scan in the file's frame, read as float64: pye57's own reader takes no colours above 255 and no normals."""
+    """One scan in the file's frame, read as float64: pye57's own reader fails on colours above 255."""
     from pye57 import libe57
     from scipy.spatial.transform import Rotation
 
     spherical = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
     cartesian = ("cartesianX", "cartesianY", "cartesianZ")
-    normal = ("nor:normalX", "nor:normalY", "nor:normalZ")
     color = ("colorRed", "colorGreen", "colorBlue")
     states = ("cartesianInvalidState", "sphericalInvalidState")
-    wanted = [name for name in (*cartesian, *spherical, *normal, *color, *states) if name in header.point_fields]
+    wanted = [name for name in (*cartesian, *spherical, *color, *states) if name in header.point_fields]
     columns = {name: np.empty(header.point_count) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, values in columns.items():
@@ -162,8 +159,6 @@ def _e57_scan(file: Any, header: Any) -> Columns:
         turn = Rotation.from_quat([rotation[part].value() for part in "xyzw"]).as_matrix()
         shift = np.array([translation[part].value() for part in "xyz"])
     found = dict(zip(POSITION, (points @ turn.T + shift).T))
-    if normal[0] in columns:
-        found |= dict(zip(NORMAL, (np.stack([columns[name] for name in normal], axis=1) @ turn.T).T))
     if color[0] in columns:
         found |= {name: columns[own].astype(np.uint16) for name, own in zip(COLOR, color)}
     valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)

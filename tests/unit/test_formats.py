@@ -5,6 +5,7 @@ import numpy as np
 import open3d as o3d
 import pye57
 import pytest
+from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
 from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
@@ -87,6 +88,36 @@ def test_e57_points_that_are_marked_invalid_are_left_out(tmp_path, cloud):
     write_e57(tmp_path / "a.e57", [(cloud.points - UTM, cloud.colors, still, UTM)], cartesianInvalidState=state)
     found = read_cloud(tmp_path / "a.e57")
     assert np.array_equal(found.colors, cloud.colors[state == 0])
+
+
+def test_e57_in_spherical_coordinates_with_sixteen_bit_colours(tmp_path):
+    rng = np.random.default_rng(0)
+    columns = {
+        "sphericalRange": rng.uniform(1, 50, 30),
+        "sphericalAzimuth": rng.uniform(-np.pi, np.pi, 30),
+        "sphericalElevation": rng.uniform(-1.5, 1.5, 30),
+        **{f"color{name}": rng.integers(0, 65536, 30).astype(np.float64) for name in ("Red", "Green", "Blue")},
+    }
+    file = pye57.E57(str(tmp_path / "a.e57"), mode="w")
+    image = file.image_file
+    prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
+    for name, values in columns.items():
+        whole = name.startswith("color")
+        node = libe57.IntegerNode(image, 0, 0, 65535) if whole else libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
+        prototype.set(name, node)
+        buffers.append(libe57.SourceDestBuffer(image, name, values, 30, True, True))
+    scan = libe57.StructureNode(image)
+    points = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
+    scan.set("points", points)
+    file.data3d.append(scan)
+    points.writer(buffers).write(30)
+    file.close()
+    found = read_cloud(tmp_path / "a.e57")
+    x, y, z = found.points.T
+    assert np.allclose(np.linalg.norm(found.points, axis=1), columns["sphericalRange"])
+    assert np.allclose(np.arctan2(y, x), columns["sphericalAzimuth"])
+    assert np.allclose(np.arcsin(z / columns["sphericalRange"]), columns["sphericalElevation"])
+    assert np.array_equal(found.colors[:, 1], np.rint(columns["colorGreen"] / 257))
 
 
 @pytest.mark.parametrize("ending", ["las", "laz"])
