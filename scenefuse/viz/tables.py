@@ -233,6 +233,9 @@ def collect(folder: Path, arms: list[str], logs: Path, scene: str = "", scene_ga
     who = folder.name
     if not gap and scene_gap:
         gap, who = f"{scene_gap} of the scene {scene}", scene
+    if not gap:
+        there, gap = unbroken(folder, ("witness.json",))
+        stages |= read_fields(folder, there)
     per_arm: dict[str, Fields] = {arm: {} for arm in arms}
     fusion: Fields = {}
     for arm in [] if gap else arms:

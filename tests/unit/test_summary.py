@@ -29,7 +29,7 @@ def results(tmp_path):
     write_json(scene / "completed.json", {"points": quantity(5030, "points"), **completed})
     for name, status in (("house", "registered"), ("balloon", "unregistered")):
         folder = tmp_path / "objects" / name
-        for stage in ("photos", "matches", "sfm", "cameras", "masks", "stage1", "stage2", "stage3"):
+        for stage in ("photos", "matches", "sfm", "cameras", "masks", "stage1", "stage2", "stage3", "witness"):
             write_json(folder / f"{stage}.json", {})
         (folder / "features.db").touch()
         quality = {"psnr_held_out": quantity(27.5, "dB"), "measured_on": quantity("training photos", "")}
