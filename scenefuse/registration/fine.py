@@ -24,6 +24,7 @@ MOST_POINTS = 12000
 LOOK_POINTS = 1200
 REFINE_POINTS = 3000
 POLISHED = 4
+ROUNDS = 60
 OFF_SCALE = 1.06
 BEYOND_PRIOR = 0.15
 
@@ -219,7 +220,7 @@ def refine_hypotheses(
         return keep_distinct(ranked, obj.points.mean(0), diagonal, len(ranked), angle_deg)
 
     def polish(h: Hypothesis) -> Hypothesis:
-        planes = refine_planes(*asking, h.pose, scales, narrow, 20, settings.color_weight)
+        planes = refine_planes(*asking, h.pose, scales, narrow, ROUNDS, settings.color_weight)
         polished, before = (Hypothesis(pose, h.source, rate(pose, asking)) for pose in (planes, h.pose))
         # The score is too coarse to choose between two poses in one valley; it only tells that a polish went astray.
         return polished if polished.score.total > 0.9 * before.score.total else before

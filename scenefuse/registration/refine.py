@@ -11,6 +11,7 @@ from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3, fit_sim3
 
 POINT_WEIGHT = 0.1
+SETTLED = 0.005
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ def refine_planes(
         start: scene_from_object to begin with.
         scales: bounds of the scale.
         tau: pairs within this distance, scene units.
-        rounds: iterations.
+        rounds: iterations at most; a step that moves the points by less than 0.5 % of `tau` is the last.
         color_weight: weight of the colour rows; 0 for geometry alone.
     """
     gradients = _gradients(obj, scene, color_weight)
@@ -89,7 +90,14 @@ def refine_planes(
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
         pose = _apply_step(pose, step, rows.centre, scales)
+        if _motion(step, rows) < SETTLED * tau:
+            break
     return pose
+
+
+def _motion(step: Array, rows: "_Rows") -> float:
+    """How far a step moves the paired points, scene units."""
+    return float(np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])))
 
 
 @dataclass(frozen=True)
@@ -190,12 +198,14 @@ class _Rows:
         residual: (M,).
         weight: (M,).
         centre: (3,) that the step turns and grows about.
+        reach: RMS distance of the paired points from it.
     """
 
     jacobian: Array
     residual: Array
     weight: Array
     centre: Array
+    reach: float
 
     def normal_equations(self) -> tuple[Array, Array]:
         return self.jacobian.T @ (self.weight[:, None] * self.jacobian), self.jacobian.T @ (self.weight * self.residual)
@@ -230,7 +240,7 @@ def _rows(
             off = (theirs - mine)[:, channel]
             parts.append(_weighted((p - centre)[ahead], slopes[:, channel], off, color_weight / 3 * weights[ahead]))
     jacobian, residual, weight = (np.concatenate(kind) for kind in zip(*parts))
-    return _Rows(jacobian, residual, weight, centre)
+    return _Rows(jacobian, residual, weight, centre, float(np.sqrt(((p - centre) ** 2).sum(1).mean())))
 
 
 def _gradients(obj: Surface, scene: Surface, color_weight: float) -> Array | None:
