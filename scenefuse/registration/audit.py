@@ -34,9 +34,6 @@ class Gate:
     """Largest standard deviation of the rotation about any axis, degrees; about a free axis it may be more."""
     max_translation_sd_fraction: float
     """Largest standard deviation of the object's centre, as a share of the diagonal."""
-    min_f_with_photos: float
-    """Smallest two-way F-score where photos link object and scene: they decide the pose, the clouds only must not deny
-    it."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +87,8 @@ def judge(
     """Weigh the best hypothesis against its rivals, the photos and the gate.
 
     A rival that maps the object onto itself, in shape and colour, is no rival: fused, both give the same points.
-    Photos that link object and scene settle which pose is meant, so that rivals, colours and recall no longer matter:
-    the scene may lack most of the object, or show much beside it.
+    Photos that link object and scene settle which pose is meant, so that rivals, colours and scores no longer matter:
+    the scene may lack nearly all of the object, or show much beside it. Free space and gravity can still deny it.
 
     Args:
         ranked: refined hypotheses, best first; the photos' own pose first where they overrule geometry.
@@ -117,12 +114,9 @@ def judge(
             rival = other
     # The photos' pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    linked = decided_by != "geometry"
     problem = _blocked(best, gate)
-    if problem is None:
-        problem = (
-            _poor_with_photos(best, gate) if linked else _poor(best, margin, diagonal, gate, scales, spread, free_axis)
-        )
+    if problem is None and decided_by == "geometry":
+        problem = _poor(best, margin, diagonal, gate, scales, spread, free_axis)
     tilt = tilt_deg(best.pose, ups)
     if problem is None and tilt is not None and tilt > gate.max_final_tilt_deg:
         problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
@@ -142,15 +136,6 @@ def _blocked(best: Hypothesis, gate: Gate) -> str | None:
     return (
         f"{best.score.blocked:.0%} of the object would stand where the scene's photos saw through, more than"
         f" {gate.max_blocked:.0%}"
-    )
-
-
-def _poor_with_photos(best: Hypothesis, gate: Gate) -> str | None:
-    if best.score.f_score >= gate.min_f_with_photos:
-        return None
-    return (
-        f"shared photos give a pose where the clouds hardly meet: the two-way F-score is {best.score.f_score:.2f},"
-        f" below {gate.min_f_with_photos:.2f}"
     )
 
 

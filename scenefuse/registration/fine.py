@@ -73,8 +73,6 @@ class FineSettings:
     """Gate: largest standard deviation of the scale, natural logarithm."""
     max_rotation_sd_deg: float
     """Gate: largest standard deviation of the rotation, degrees, but about a free axis."""
-    min_f_with_photos: float
-    """Gate: smallest two-way F-score of a pose that shared photos decide."""
 
 
 @dataclass(frozen=True)
