@@ -14,7 +14,7 @@ from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.fiducials import locate
 from scenefuse.registration.ground import Ground, fit_ground
 from scenefuse.registration.shapes import in_wide_hull, least_footprint
-from scenefuse.registration.vote import read_silhouettes, vote
+from scenefuse.registration.vote import Votes, vote
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.units import length_unit
@@ -116,11 +116,13 @@ def crop_scene(
         write_cloud(crop, cloud)
         write_json(report, _report(cloud, cloud, None, None, up, mode, unit))
         return
+    voted = 0
     if mode == "masks":
         if witness is None or cameras is None or masks is None:
             raise StageError("cropping by masks needs --witness, --cameras and --masks; give them, or mode fiducials")
-        points = vote_marks(cloud, witness, cameras, masks, settings)
-        cut = crop_cloud(cloud, points, up, settings)
+        votes = votes_of(cloud, witness, cameras, masks, settings)
+        points, voted = np.concatenate([cloud.points[votes.object], votes.own]), int(votes.object.sum())
+        cut = crop_cloud(cloud, points, up, settings, votes.other)
         marked = f"marked by the votes of {masks} through the second witness, not by fiducials"
         cut = replace(cut, notes=[marked, *cut.notes])
         _announce(cut, settings, str(masks))
@@ -131,14 +133,14 @@ def crop_scene(
         cut = crop_marked(cloud, names, points, up, settings, fiducials)
     part = cloud[cut.keep]
     write_cloud(crop, part)
-    write_json(report, _report(cloud, part, points, cut, up, mode, unit))
+    write_json(report, _report(cloud, part, points, cut, up, mode, unit, voted))
 
 
-def vote_marks(cloud: Cloud, witness: Path, cameras: Path, masks: Path, settings: CropSettings) -> Array:
-    """(F, 3) scene points that the object's masks vote for, loose ones left out: they stand in for fiducials (C3).
+def votes_of(cloud: Cloud, witness: Path, cameras: Path, masks: Path, settings: CropSettings) -> Votes:
+    """What the object's masks say of the scene's points, loose ones among those they vote for left out (C3).
 
     Raises:
-        StageError: the witness has no pose, or the masks vote for too few points.
+        StageError: the witness has no pose, or the masks are of no use.
     """
     said = read_json(witness)
     if not value(said, "found"):
@@ -149,17 +151,13 @@ def vote_marks(cloud: Cloud, witness: Path, cameras: Path, masks: Path, settings
             " away as the scene's"
         )
     pose = Sim3.from_matrix(np.array(value(said, "scene_from_object")))
-    points = cloud.points[vote(cloud.points, read_silhouettes(cameras, masks), pose, settings.min_votes)]
-    if len(points) >= settings.min_points:
-        part_of, counts = _parts(points, 3 * spacing(points))
-        points = points[(counts >= settings.min_part * len(points))[part_of]]
-    if len(points) < settings.min_points:
-        raise StageError(
-            f"only {len(points)} scene points lie inside the masks of {masks}, {settings.min_points} are needed: the"
-            " scene may not show the object; look at the masks, or click fiducials and name them in the objects table"
-        )
-    print(f"{len(points)} of {len(cloud)} scene points by the votes of the masks", flush=True)
-    return points
+    votes = vote(cloud.points, cameras, masks, pose, settings.min_votes)
+    chosen = np.flatnonzero(votes.object)
+    if len(chosen) > 1:
+        part_of, counts = _parts(cloud.points[chosen], 3 * spacing(cloud.points[chosen]))
+        chosen = chosen[(counts >= settings.min_part * len(chosen))[part_of]]
+    print(f"{len(chosen)} of {len(cloud)} scene points by the votes of the masks", flush=True)
+    return replace(votes, object=np.isin(np.arange(len(cloud)), chosen))
 
 
 def crop_marked(
@@ -183,14 +181,16 @@ def _announce(cut: Crop, settings: CropSettings, source: str) -> None:
     if cut.keep.sum() < settings.min_points:
         raise StageError(
             f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {settings.min_points} are"
-            " needed: a fiducial may lie outside the object, or the scene may not show it"
+            " needed: the scene may not show the object, or a fiducial or mask may not lie on it"
         )
     for note in cut.notes:
         print(note, flush=True)
 
 
-def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings) -> Crop:
-    """The points of a scene that belong to the object marked by fiducials (F, 3); see `crop_scene`."""
+def crop_cloud(
+    scene: Cloud, fiducials: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_] | None = None
+) -> Crop:
+    """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
     level, shape = rotation_between(up, np.array([0.0, 0.0, 1.0])), settings.shape
     notes: list[str] = []
     if shape == "oriented":
@@ -219,6 +219,8 @@ def crop_cloud(scene: Cloud, fiducials: Array, up: Array, settings: CropSettings
     above = in_box.copy()
     if ground is not None:
         above &= points[:, 2] > ground.height(points[:, :2]) + ground.tolerance
+    if other is not None:
+        above &= ~other
     keep = above.copy()
     inside = np.flatnonzero(above)
     if len(inside):
@@ -267,7 +269,7 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
 
 
 def _report(
-    scene: Cloud, part: Cloud, marks: Array | None, cut: Crop | None, up: Array, mode: str, unit: str
+    scene: Cloud, part: Cloud, marks: Array | None, cut: Crop | None, up: Array, mode: str, unit: str, voted: int = 0
 ) -> dict[str, object]:
     """The stage JSON of a crop."""
     ground = None if cut is None else cut.ground
@@ -279,7 +281,7 @@ def _report(
         "box_low": quantity(scene.points.min(0) if cut is None else cut.low, unit),
         "box_high": quantity(scene.points.max(0) if cut is None else cut.high, unit),
         "fiducials": quantity(marks if marks is not None and mode == "fiducials" else [], unit),
-        "voted_points": quantity(len(marks) if marks is not None and mode == "masks" else 0, "points"),
+        "voted_points": quantity(voted, "points"),
         "scene_points": quantity(len(scene), "points"),
         "box_points": quantity(len(scene) if cut is None else int(cut.in_box.sum()), "points"),
         "crop_points": quantity(len(part), "points"),

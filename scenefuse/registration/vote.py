@@ -7,9 +7,10 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.clouds import spacing
-from scenefuse.stage import StageError
+from scenefuse.stage import StageError, threads
 from scenefuse.transforms import Array, Sim3
 
 Columns = tuple[NDArray[np.float32], ...]
@@ -18,6 +19,8 @@ MOST_PHOTOS = 60
 SLACK = 0.005
 CELL_SPACINGS = 4
 HIDDEN_CELLS = 2
+NEAR_OWN = 0.15
+MIN_OWN = 10
 
 
 @dataclass(frozen=True)
@@ -28,17 +31,63 @@ class Silhouette:
     projection: Array
 
 
-def read_silhouettes(cameras: Path, masks: Path) -> list[Silhouette]:
-    """Masks and cameras of an object's photos, at most 60 spread evenly; masks grown by 0.5 % of the photo's width.
+@dataclass(frozen=True)
+class Votes:
+    """What an object's masks say of points of the scene.
 
-    The growth allows for what the similarity and the masks err by at outlines.
+    Attributes:
+        object: (N,) bool, True for points of the object.
+        other: (N,) bool, True for points of something else; what no photo tells is neither.
+        own: (K, 3) SfM points of the object's photos on the object, in the scene frame.
+    """
+
+    object: NDArray[np.bool_]
+    other: NDArray[np.bool_]
+    own: Array
+
+
+def vote(points: Array, cameras: Path, masks: Path, scene_from_object: Sim3, min_share: float) -> Votes:
+    """Look at every point of a scene through an object's masks.
+
+    A photo has a say on a point that falls into its frame and that no nearer scene point hides; three of them make a
+    verdict. A point is the object's when at least `min_share` of them have it inside their mask, a quarter of all
+    photos frame it, and one of the object's own SfM points is near; something else's when most have it outside.
+
+    Args:
+        points: (N, 3) in the scene frame.
+        cameras: undistorted COLMAP workspace of the object.
+        masks: folder of {name}.png, non-zero on the object.
+        scene_from_object: the similarity.
+        min_share: of the photos that have a say, how many must have a point inside the mask.
+
+    Raises:
+        StageError: too few photos have a mask, or too few SfM points lie inside.
+    """
+    silhouettes, own = read_silhouettes(cameras, masks, min_share)
+    in_object = scene_from_object.inverse().apply(points)
+    framed, shown, inside = count(in_object, silhouettes)
+    told = shown >= 3
+    is_object = told & (framed >= len(silhouettes) / 4) & (inside >= min_share * shown)
+    rows = np.flatnonzero(is_object)
+    reach = NEAR_OWN * float(np.linalg.norm(np.ptp(own, axis=0)))
+    is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
+    return Votes(is_object, told & (inside < 0.5 * shown), scene_from_object.apply(own))
+
+
+def read_silhouettes(cameras: Path, masks: Path, min_share: float) -> tuple[list[Silhouette], Array]:
+    """Masks and cameras of at most 60 of an object's photos, spread evenly, and the SfM points (K, 3) on the object.
+
+    Masks are grown by 0.5 % of the photo's width, for what the similarity and the masks err by at outlines. An SfM
+    point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or more; the
+    outermost 1 % on each side are left out.
 
     Args:
         cameras: undistorted COLMAP workspace of the object.
         masks: folder of {name}.png, non-zero on the object.
+        min_share: see `vote`.
 
     Raises:
-        StageError: fewer than three photos have a mask.
+        StageError: too few photos have a mask, or too few SfM points lie inside.
     """
     model = pycolmap.Reconstruction(cameras / "sparse")
     images = sorted((model.images[i] for i in model.reg_image_ids()), key=lambda image: image.name)
@@ -46,47 +95,57 @@ def read_silhouettes(cameras: Path, masks: Path) -> list[Silhouette]:
     files = [(image, path) for image, path in files if path.is_file()]
     if len(files) < 3:
         raise StageError(f"{len(files)} photos of {cameras} have a mask in {masks}, three are needed; rerun the masks")
-    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_PHOTOS, len(files))).round().astype(int))
+    row_of = {point: row for row, point in enumerate(sorted(model.points3D))}
+    sparse = np.array([model.points3D[point].xyz for point in row_of]).reshape(-1, 3)
+    seen, inside = (np.zeros(len(sparse), dtype=np.int32) for _ in range(2))
     found = []
+    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_PHOTOS, len(files))).round().astype(int))
     for image, path in (files[k] for k in chosen):
         mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
         if mask is None:
             raise StageError(f"{path} cannot be read; rerun the masks")
-        reach = 2 * int(np.ceil(SLACK * mask.shape[1])) + 1
-        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)))
+        extent = 2 * int(np.ceil(SLACK * mask.shape[1])) + 1
+        grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
         camera = model.cameras[image.camera_id].calibration_matrix()
-        found.append(Silhouette(grown > 0, camera @ image.cam_from_world().matrix()))
-    return found
+        one = Silhouette(grown > 0, camera @ image.cam_from_world().matrix())
+        found.append(one)
+        observed = np.array(sorted({row_of[p.point3D_id] for p in image.get_observation_points2D()}), dtype=np.int64)
+        rows, pixels, _ = _in_frame(_columns(sparse[observed]), one)
+        seen[observed[rows]] += 1
+        inside[observed[rows]] += one.mask[pixels[:, 1], pixels[:, 0]]
+    own = sparse[(seen >= 3) & (inside >= min_share * seen)]
+    if len(own) < MIN_OWN:
+        raise StageError(
+            f"only {len(own)} SfM points of {cameras} lie inside the masks of {masks}, {MIN_OWN} are needed; look at"
+            " the masks, and take sharper photos of the object"
+        )
+    low, high = np.percentile(own, [1, 99], axis=0)
+    return found, own[((own >= low) & (own <= high)).all(1)]
 
 
-def vote(points: Array, silhouettes: list[Silhouette], scene_from_object: Sim3, min_share: float) -> NDArray[np.bool_]:
-    """(N,) scene points that lie inside the mask in most photos that show them.
-
-    A photo has a say on a point that falls into its frame and that no nearer scene point hides. At least a quarter of
-    the photos must frame the point, and three must have a say: what only stands behind the object passes neither.
-
-    Args:
-        points: (N, 3) in the scene frame.
-        silhouettes: masks and cameras.
-        scene_from_object: the similarity.
-        min_share: of the photos that have a say, how many must have the point inside the mask.
-    """
-    in_object = scene_from_object.inverse().apply(points)
-    columns = tuple(np.ascontiguousarray(in_object.T, dtype=np.float32))
-    framed, shown, inside = (np.zeros(len(points), dtype=np.int32) for _ in range(3))
+def count(
+    in_object: Array, silhouettes: list[Silhouette]
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """How many photos frame each of (N, 3) points, show it unhidden, and have it inside the mask then."""
+    columns = _columns(in_object)
+    framed, shown, inside = (np.zeros(len(in_object), dtype=np.int32) for _ in range(3))
     for one in silhouettes:
         framed[_in_frame(columns, one)[0]] += 1
     around = np.flatnonzero(framed >= len(silhouettes) / 4)
     if len(around) < 2:
-        return np.zeros(len(points), dtype=bool)
+        return framed, shown, inside
     step = spacing(in_object[around])
     for one in silhouettes:
         rows, pixels, depth = _in_frame(columns, one)
-        seen = ~_hidden(pixels, depth, step, one)
-        rows, pixels = rows[seen], pixels[seen]
+        unhidden = ~_hidden(pixels, depth, step, one)
+        rows, pixels = rows[unhidden], pixels[unhidden]
         shown[rows] += 1
         inside[rows] += one.mask[pixels[:, 1], pixels[:, 0]]
-    return (framed >= len(silhouettes) / 4) & (shown >= 3) & (inside >= min_share * shown)
+    return framed, shown, inside
+
+
+def _columns(points: Array) -> Columns:
+    return tuple(np.ascontiguousarray(points.T, dtype=np.float32))
 
 
 def _in_frame(points: Columns, one: Silhouette) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:

@@ -1,5 +1,6 @@
 """The crop keeps the object and nothing else."""
 
+import shutil
 from dataclasses import replace
 
 import cv2
@@ -12,7 +13,7 @@ from scenefuse.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.registration.crop import CropSettings, crop_cloud, crop_scene
 from scenefuse.registration.ground import fit_ground
 from scenefuse.registration.shapes import in_wide_hull, least_footprint
-from scenefuse.registration.vote import read_silhouettes, vote
+from scenefuse.registration.vote import count, read_silhouettes, vote
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -94,7 +95,7 @@ def test_bad_fiducials_end_in_one_sentence(tmp_path):
     cases = [
         (trial.fiducials[:3], "at least 4"),
         (trial.fiducials + [500, 0, 0], "nearest scene point"),
-        (trial.fiducials[:1] + 0.05 * np.eye(4, 3), "a fiducial may lie outside"),
+        (trial.fiducials[:1] + 0.05 * np.eye(4, 3), "a fiducial or mask may not lie on it"),
     ]
     for fiducials, sentence in cases:
         files = stage_files(tmp_path, trial, fiducials)
@@ -169,18 +170,27 @@ def orbit(tmp_path_factory):
     )
     (folder / "masks").mkdir()
     middle = trial.fiducials.mean(0)
+    sparse, tracks = trial.object.points[:400], [[] for _ in range(400)]
     for k, angle in enumerate(np.linspace(0, 2 * np.pi, 12, endpoint=False)):
         centre = middle + 1.4 * trial.diagonal * np.array([np.cos(angle), np.sin(angle), 0.3])
         z = (middle - centre) / np.linalg.norm(middle - centre)
         x = np.cross(z, Z) / np.linalg.norm(np.cross(z, Z))
         in_object = np.stack([x, np.cross(z, x), z]) @ trial.scene_from_object.rotation
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(in_object), -in_object @ object_from_scene.apply(centre))
-        model.add_image_with_trivial_frame(pycolmap.Image(name=f"{k}.jpg", camera_id=1, image_id=k + 1), pose)
         seen = trial.object.points @ in_object.T + pose.translation
-        u, v = (250 * seen[:, :2] / seen[:, 2:] + [160, 120]).astype(int).T
+        pixels = 250 * seen[:, :2] / seen[:, 2:] + [160, 120]
+        image = pycolmap.Image(
+            name=f"{k}.jpg", camera_id=1, image_id=k + 1, points2D=[pycolmap.Point2D(p) for p in pixels[:400]]
+        )
+        model.add_image_with_trivial_frame(image, pose)
+        for row, track in enumerate(tracks):
+            track.append(pycolmap.TrackElement(k + 1, row))
+        u, v = pixels.astype(int).T
         mask = np.zeros((240, 320), np.uint8)
         mask[v, u] = 255
         cv2.imwrite(str(folder / f"masks/{k}.png"), cv2.morphologyEx(mask, cv2.MORPH_CLOSE, np.ones((7, 7), np.uint8)))
+    for point, track in zip(sparse, tracks):
+        model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
     (folder / "cameras/sparse").mkdir(parents=True)
     model.write(folder / "cameras/sparse")
     write_cloud(folder / "dense.ply", trial.scene)
@@ -194,25 +204,44 @@ def own_points(trial):
     return int(10000 * trial.coverage)
 
 
-def test_masks_vote_for_the_object_and_for_nothing_around_it(orbit):
+def test_masks_vote_for_the_object_and_against_what_is_around_it(orbit):
     folder, trial = orbit
-    silhouettes = read_silhouettes(folder / "cameras", folder / "masks")
-    assert len(silhouettes) == 12
     own = np.arange(len(trial.scene)) < own_points(trial)
-    chosen = vote(trial.scene.points, silhouettes, trial.scene_from_object, 0.8)
-    assert chosen[own].mean() > 0.95
+    votes = vote(trial.scene.points, folder / "cameras", folder / "masks", trial.scene_from_object, 0.8)
+    assert votes.object[own].mean() > 0.95 and votes.other[own].mean() < 0.02
     low, high = trial.fiducials.min(0) - 0.05 * trial.diagonal, trial.fiducials.max(0) + 0.05 * trial.diagonal
     outside = ~own & ((trial.scene.points < low) | (trial.scene.points > high))[:, :2].any(1)
-    assert outside.sum() > 1000 and chosen[outside].sum() == 0
+    assert outside.sum() > 1000 and votes.object[outside].sum() == 0
+    reach = 0.2 * trial.diagonal
+    beside = outside & ((trial.scene.points > low - reach) & (trial.scene.points < high + reach)).all(1)
+    assert beside.sum() > 1000 and votes.other[beside].mean() > 0.8
+    assert len(votes.own) > 300 and ((votes.own > low) & (votes.own < high))[:, :2].all()
     # Through a wrong similarity the masks meet other points, or none.
     moved = Sim3(1.0, np.eye(3), np.array([0.5 * trial.diagonal, 0, 0])) @ trial.scene_from_object
-    assert vote(trial.scene.points, silhouettes, moved, 0.8)[own].mean() < 0.6
+    wrong = vote(trial.scene.points, folder / "cameras", folder / "masks", moved, 0.8)
+    assert wrong.object[own].mean() < 0.6
+
+
+def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbit, tmp_path):
+    """Three photos from one side: what lies behind the house is inside all their masks."""
+    folder, trial = orbit
+    (tmp_path / "masks").mkdir()
+    for k in (11, 0, 1):
+        shutil.copy(folder / f"masks/{k}.png", tmp_path / "masks")
+    middle = trial.fiducials.mean(0)
+    behind = middle - [0.8 * trial.diagonal, 0, 0] + np.random.default_rng(0).normal(0, 0.004, (50, 3)) * trial.diagonal
+    on_it = np.array([middle, middle + 0.02 * trial.diagonal])
+    votes = vote(np.concatenate([behind, on_it]), folder / "cameras", tmp_path / "masks", trial.scene_from_object, 0.8)
+    silhouettes = read_silhouettes(folder / "cameras", tmp_path / "masks", 0.8)[0]
+    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), silhouettes)
+    assert ((inside == 3) & (shown == 3)).mean() > 0.8
+    assert not votes.object[:50].any()
 
 
 def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     """A fence between some of the cameras and the house; their masks show no house."""
     folder, trial = orbit
-    silhouettes = read_silhouettes(folder / "cameras", folder / "masks")
+    silhouettes = read_silhouettes(folder / "cameras", folder / "masks", 0.8)[0]
     middle, size = trial.fiducials.mean(0), trial.diagonal
     rng = np.random.default_rng(0)
     y, z = rng.uniform(-2 * size, 2 * size, 200000), rng.uniform(-size, size, 200000)
@@ -225,8 +254,11 @@ def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     points = trial.scene.points
     facing = np.flatnonzero(points[: own_points(trial), 0] > middle[0] + 0.2 * size)
     assert len(facing) > 100
-    assert vote(np.concatenate([points, fence]), blind, trial.scene_from_object, 0.8)[facing].mean() > 0.8
-    assert vote(points, blind, trial.scene_from_object, 0.8)[facing].mean() < 0.4
+    shares = []
+    for scene in (np.concatenate([points, fence]), points):
+        _, shown, inside = count(trial.scene_from_object.inverse().apply(scene), blind)
+        shares.append(np.mean((shown >= 3)[facing] & (inside >= 0.8 * shown)[facing]))
+    assert shares[0] > 0.8 and shares[1] < 0.4
 
 
 def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
@@ -255,7 +287,7 @@ def test_without_fiducials_and_without_a_witness_the_sentence_names_both_ways_ou
     far = Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])) @ trial.scene_from_object
     elsewhere = {"found": quantity(True, ""), "scene_from_object": quantity(far.matrix, "")}
     write_json(tmp_path / "witness.json", elsewhere)
-    with pytest.raises(StageError, match="only 0 scene points lie inside the masks"):
+    with pytest.raises(StageError, match="only 0 scene points are left in the box of .*masks"):
         crop_scene(**files, mode="masks", settings=SETTINGS)
     assert not files["crop"].exists()
 
