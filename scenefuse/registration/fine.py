@@ -18,7 +18,7 @@ from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes
 from scenefuse.registration.score import Score, score
 from scenefuse.registration.surface import Surface, probing, with_grid
 from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.transforms import Array, Sim3
 
 MOST_POINTS = 12000
 LOOK_POINTS = 1200
@@ -193,72 +193,152 @@ def refine_hypotheses(
     seed: int,
 ) -> Outcome:
     """Refine, turn, polish, rank, compare with the photos and judge; see `register_finely`."""
-    diagonal = scene.diagonal
-    tau = settings.score_fraction * diagonal
-    wide, narrow = settings.start_fraction * diagonal, settings.end_fraction * diagonal
-    obj, target = prepare_both(cloud, scene, poses[0][0].scale, settings.fine_voxel_fraction, seed, MOST_POINTS)
-    scale, cell, reach = poses[0][0].scale, 2 * settings.fine_voxel_fraction * diagonal, 2 * wide
-    looking = (
-        probing(with_grid(obj, cell / scale, reach / scale), LOOK_POINTS, seed),
-        probing(with_grid(target, cell, reach), LOOK_POINTS, seed),
-    )
-    # The coarse search stays inside the prior; what it found at a bound may go on beyond it.
-    scales = scales.widened(BEYOND_PRIOR)
-    asking = probing(obj, REFINE_POINTS, seed), probing(target, REFINE_POINTS, seed)
+    pair = _Pair.prepare(cloud, scene, poses[0][0].scale, scales, evidence, settings, seed)
+    ranked = pair.in_order([pair.settle(pose, source, pair.wide) for pose, source in poses])
+    ranked = pair.in_order([*ranked, *pair.turned(ranked[:2])])
+    ranked = pair.in_order([pair.polish(h) for h in ranked[:POLISHED]])
+    # A valley that is flat in scale has several ends; start from both sides.
+    sides = (pair.polish(pair.resized(ranked[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE))
+    ranked = pair.in_order([*ranked, *sides])
+    ranked, spread, decided_by = pair.with_photos(ranked)
+    gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
+    looks = probing(pair.obj, LOOK_POINTS, seed)
+    verdict = judge(ranked, looks, pair.diagonal, pair.tau, gate, pair.scales, evidence.ups, spread, decided_by)
+    return Outcome(ranked, verdict, spread)
 
-    def rate(pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
-        return score(*surfaces, pose, tau, settings.recall_weight, scales.centre, evidence.free_space)
 
-    def settle(pose: Sim3, source: str, first: float) -> Hypothesis:
-        pose = refine_points(*looking, pose, scales, (first, narrow), 25)
-        return Hypothesis(pose, source, rate(pose, looking))
+@dataclass(frozen=True)
+class _Pair:
+    """Both clouds, prepared once, and what is done with a pose on them.
 
-    def in_order(hypotheses: list[Hypothesis], angle_deg: float = 8) -> list[Hypothesis]:
+    Attributes:
+        obj: the object's surface, thinned.
+        looking: object and scene with few probing points and distance grids, for the first refinement and ranking.
+        asking: the same with more points, for the polish and the final score.
+        coarser: both at twice the spacing, for the spread.
+        diagonal: of the scene crop.
+        scales: what the scale may be: the coarse search stays inside the prior, what it found at a bound may go on.
+        evidence: gravity, free space and photos.
+        settings: of the fine registration.
+        seed: of the spread's halves.
+    """
+
+    obj: Surface
+    looking: tuple[Surface, Surface]
+    asking: tuple[Surface, Surface]
+    coarser: tuple[Surface, Surface]
+    diagonal: float
+    scales: ScaleRange
+    evidence: Evidence
+    settings: FineSettings
+    seed: int
+
+    @staticmethod
+    def prepare(
+        cloud: Cloud,
+        scene: Cloud,
+        scale: float,
+        scales: ScaleRange,
+        evidence: Evidence,
+        settings: FineSettings,
+        seed: int,
+    ) -> "_Pair":
+        """Thin and index both clouds for poses of about this scale."""
+        diagonal, fraction = scene.diagonal, settings.fine_voxel_fraction
+        obj, target = prepare_both(cloud, scene, scale, fraction, seed, MOST_POINTS)
+        cell, reach = 2 * fraction * diagonal, 2 * settings.start_fraction * diagonal
+        looking = (
+            probing(with_grid(obj, cell / scale, reach / scale), LOOK_POINTS, seed),
+            probing(with_grid(target, cell, reach), LOOK_POINTS, seed),
+        )
+        asking = probing(obj, REFINE_POINTS, seed), probing(target, REFINE_POINTS, seed)
+        coarser = prepare_both(cloud, scene, scale, 2 * fraction, seed, MOST_POINTS)
+        scales = scales.widened(BEYOND_PRIOR)
+        return _Pair(obj, looking, asking, coarser, diagonal, scales, evidence, settings, seed)
+
+    @property
+    def centre(self) -> Array:
+        """(3,) centre of the object, in its own frame."""
+        return self.obj.points.mean(0)
+
+    @property
+    def tau(self) -> float:
+        """Distance within which points agree, scene units."""
+        return self.settings.score_fraction * self.diagonal
+
+    @property
+    def wide(self) -> float:
+        """First pairing distance, scene units."""
+        return self.settings.start_fraction * self.diagonal
+
+    @property
+    def narrow(self) -> float:
+        """Last pairing distance, scene units."""
+        return self.settings.end_fraction * self.diagonal
+
+    def rate(self, pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
+        """How well a pose explains both clouds."""
+        recall_weight = self.settings.recall_weight
+        return score(*surfaces, pose, self.tau, recall_weight, self.scales.centre, self.evidence.free_space)
+
+    def in_order(self, hypotheses: list[Hypothesis], angle_deg: float = 8) -> list[Hypothesis]:
+        """Best first, one of each valley."""
         ranked = sorted(hypotheses, key=lambda h: -h.score.total)
-        return keep_distinct(ranked, obj.points.mean(0), diagonal, len(ranked), angle_deg)
+        return keep_distinct(ranked, self.centre, self.diagonal, len(ranked), angle_deg)
 
-    def polish(h: Hypothesis) -> Hypothesis:
-        planes = refine_planes(*asking, h.pose, scales, narrow, ROUNDS, settings.color_weight)
-        polished, before = (Hypothesis(pose, h.source, rate(pose, asking)) for pose in (planes, h.pose))
+    def settle(self, pose: Sim3, source: str, first: float) -> Hypothesis:
+        """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
+        pose = refine_points(*self.looking, pose, self.scales, (first, self.narrow), 25)
+        return Hypothesis(pose, source, self.rate(pose, self.looking))
+
+    def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
+        """The best of the leaders' turned copies, settled."""
+        up = None if self.evidence.ups is None else self.evidence.ups[1]
+        copies = [c for h in leaders for c in turned_copies(h.pose, self.obj, up, self.settings.turn_steps)]
+        rated = [Hypothesis(c, "turned", self.rate(c, self.looking)) for c in copies]
+        # A copy counts only as the best of its surroundings: those near a leader would only slide back to it.
+        best = [h for h in self.in_order(leaders + rated, angle_deg=25) if h.source == "turned"]
+        return [self.settle(h.pose, "turned", 0.7 * self.wide) for h in best[:6]]
+
+    def polish(self, h: Hypothesis) -> Hypothesis:
+        """The hypothesis after the last refinement, by planes and colours."""
+        color_weight = self.settings.color_weight
+        planes = refine_planes(*self.asking, h.pose, self.scales, self.narrow, ROUNDS, color_weight)
+        polished, before = (Hypothesis(p, h.source, self.rate(p, self.asking)) for p in (planes, h.pose))
         # The score is too coarse to choose between two poses in one valley; it only tells that a polish went astray.
         return polished if polished.score.total > 0.9 * before.score.total else before
 
-    def resized(h: Hypothesis, factor: float) -> Hypothesis:
-        fixed = h.pose.apply(obj.points.mean(0))
+    def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
+        """The hypothesis with the object grown about its centre."""
+        fixed = h.pose.apply(self.centre)
         grown = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
-        return Hypothesis(grown, h.source, rate(grown, asking))
+        return Hypothesis(grown, h.source, self.rate(grown, self.asking))
 
-    ranked = in_order([settle(pose, source, wide) for pose, source in poses])
-    up_in_scene = None if evidence.ups is None else evidence.ups[1]
-    turned = [c for h in ranked[:2] for c in turned_copies(h.pose, obj, up_in_scene, settings.turn_steps)]
-    # A copy counts only as the best of its surroundings: those near a leader would only slide back to it.
-    leaders = in_order(ranked[:2] + [Hypothesis(c, "turned", rate(c, looking)) for c in turned], angle_deg=25)
-    ranked += [settle(h.pose, "turned", 0.7 * wide) for h in leaders if h.source == "turned"][:6]
-    ranked = in_order([polish(h) for h in in_order(ranked)[:POLISHED]])
-    # A valley that is flat in scale has several ends; start from both sides.
-    ranked = in_order([*ranked, *(polish(resized(ranked[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE))])
-    coarser = prepare_both(cloud, scene, scale, 2 * settings.fine_voxel_fraction, seed, MOST_POINTS)
+    def spread(self, h: Hypothesis) -> Uncertainty | None:
+        """How far the pose moves when halves of the surface are left out."""
+        both, settings = [self.asking, self.coarser], self.settings
+        color_weight, resamplings = settings.color_weight, settings.resamplings
+        return uncertainty(both, h.pose, self.scales, self.narrow, color_weight, resamplings, self.seed)
 
-    def spread_of(h: Hypothesis) -> Uncertainty | None:
-        both = [asking, coarser]
-        return uncertainty(both, h.pose, scales, narrow, settings.color_weight, settings.resamplings, seed)
+    def with_photos(
+        self, ranked: list[Hypothesis]
+    ) -> tuple[list[Hypothesis], Uncertainty | None, Literal["geometry", "photos", "both"]]:
+        """The ranking after the photos' word, the spread of its first, and who decided.
 
-    witness, centre, decided_by = evidence.witness, obj.points.mean(0), "geometry"
-    if witness is not None:
-        decided_by = "both" if witness.agrees(ranked[0].pose, centre, diagonal) else "photos"
-        if decided_by == "photos":
-            ranked.insert(0, polish(settle(witness.pose, "photos", narrow)))
-    spread = spread_of(ranked[0])
-    if witness is not None:
-        # Where clouds and photos are in one valley, the surer of them has the last word; clouds cannot leave it.
-        strays = not witness.agrees(ranked[0].pose, centre, diagonal)
-        if strays or spread is None or witness.spread.size(diagonal) < spread.size(diagonal):
-            ranked.insert(0, Hypothesis(witness.pose, "photos", rate(witness.pose, asking)))
+        Where clouds and photos are in one valley, the surer of them has the last word; clouds cannot leave it.
+        """
+        witness = self.evidence.witness
+        if witness is None:
+            return ranked, self.spread(ranked[0]), "geometry"
+        agree = witness.agrees(ranked[0].pose, self.centre, self.diagonal)
+        if not agree:
+            ranked = [self.polish(self.settle(witness.pose, "photos", self.narrow)), *ranked]
+        spread = self.spread(ranked[0])
+        strays = not witness.agrees(ranked[0].pose, self.centre, self.diagonal)
+        if strays or spread is None or witness.spread.size(self.diagonal) < spread.size(self.diagonal):
+            ranked = [Hypothesis(witness.pose, "photos", self.rate(witness.pose, self.asking)), *ranked]
             spread = witness.spread
-    gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
-    looks = probing(obj, LOOK_POINTS, seed)
-    verdict = judge(ranked, looks, diagonal, tau, gate, scales, evidence.ups, spread, decided_by)
-    return Outcome(ranked, verdict, spread)
+        return ranked, spread, "both" if agree else "photos"
 
 
 def spread_quantities(spread: Uncertainty | None, unit: str) -> dict[str, Any]:

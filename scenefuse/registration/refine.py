@@ -12,6 +12,8 @@ from scenefuse.transforms import Array, Sim3, fit_sim3
 
 POINT_WEIGHT = 0.1
 SETTLED = 0.005
+OFF_SCALE = 1.03
+HALF_ROUNDS = 30
 
 
 @dataclass(frozen=True)
@@ -144,7 +146,8 @@ def uncertainty(
     Pieces are a sixth of the scene crop's diagonal wide, so that what is correlated stays together. The deviation of a
     half's pose from the whole's has the spread that the whole's has from the truth. New pairs are made each time; a
     bootstrap of fixed pairs is some five times too sure of itself. Taking turns with differently thinned clouds lets
-    a pose that hangs on the thinning show it.
+    a pose that hangs on the thinning show it, and beginning 3 % too small or too large lets one show that stays where
+    it is put.
 
     Args:
         surfaces: object and scene at one or more spacings, in turn.
@@ -174,7 +177,9 @@ def uncertainty(
         chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
         half_object = replace(obj, probe=obj.probe[chosen[in_object[obj.probe]]])
         half_scene = replace(scene, probe=scene.probe[chosen[in_scene[scene.probe]]])
-        other = refine_planes(half_object, half_scene, pose, scales, tau, 10, color_weight)
+        factor = OFF_SCALE if k // len(surfaces) % 2 else 1 / OFF_SCALE
+        start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
+        other = refine_planes(half_object, half_scene, start, scales, tau, HALF_ROUNDS, color_weight)
         deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
         deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
         deviations[k, 6] = np.log(other.scale / pose.scale)
@@ -216,7 +221,7 @@ def _rows(
 ) -> _Rows | None:
     """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
     planes leave free, and colours where there are gradients."""
-    pairs = pair(obj, scene, pose, tau)
+    pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
     if min(pairs.forward, len(pairs.distance) - pairs.forward) < 10:
         return None
     p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
@@ -241,6 +246,21 @@ def _rows(
             parts.append(_weighted((p - centre)[ahead], slopes[:, channel], off, color_weight / 3 * weights[ahead]))
     jacobian, residual, weight = (np.concatenate(kind) for kind in zip(*parts))
     return _Rows(jacobian, residual, weight, centre, float(np.sqrt(((p - centre) ** 2).sum(1).mean())))
+
+
+def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pairs: Pairs) -> Pairs:
+    """The pairs without object points beyond the rim of what the scene shows.
+
+    They all meet the rim and would pull inwards: the less the scene shows, the more the object would shrink (Turk and
+    Levoy 1994 leave out pairs at rims for that). They are known by their partner's own nearest object point, which is
+    more than half of `tau` away.
+    """
+    ahead = slice(0, pairs.forward)
+    own = obj.nearest(pose.inverse().apply(scene.points[pairs.scene_index[ahead]]), np.inf)[1]
+    aside = np.linalg.norm(obj.points[own] - obj.points[pairs.object_index[ahead]], axis=1) * pose.scale
+    keep = np.concatenate([aside < tau / 2, np.ones(len(pairs.distance) - pairs.forward, dtype=bool)])
+    kept = int(keep[ahead].sum())
+    return Pairs(pairs.object_index[keep], pairs.scene_index[keep], pairs.distance[keep], kept)
 
 
 def _gradients(obj: Surface, scene: Surface, color_weight: float) -> Array | None:

@@ -159,6 +159,7 @@ def registration(
     *,
     out: Path = Path("results/bench/registration.tsv"),
     repeats: int = 8,
+    first: int = 0,
     shapes: list[str] | None = None,
     coverages: list[float] | None = None,
     methods: list[str] | None = None,
@@ -172,6 +173,7 @@ def registration(
     Args:
         out: every trial and method as a row (TSV).
         repeats: trials per shape and coverage; ground and noise alternate with it, the rest is drawn by its seed.
+        first: number of the first repeat, for trials that nobody has looked at.
         shapes: which; all without it.
         coverages: which; 0.3, 0.5, 0.7 and 0.9 without it.
         methods: which; all without it.
@@ -179,7 +181,12 @@ def registration(
     """
     o3d.utility.set_verbosity_level(o3d.utility.VerbosityLevel.Error)
     chosen = methods or list(METHODS)
-    tasks = [(name, c, k, chosen) for k in range(repeats) for c in coverages or COVERAGES for name in shapes or SHAPES]
+    tasks = [
+        (name, c, k, chosen)
+        for k in range(first, first + repeats)
+        for c in coverages or COVERAGES
+        for name in shapes or SHAPES
+    ]
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
         table = pd.DataFrame([row for rows in pool.map(one, tasks) for row in rows])
     out.parent.mkdir(parents=True, exist_ok=True)

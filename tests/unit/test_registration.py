@@ -121,6 +121,14 @@ def test_refinement_recovers_a_disturbed_similarity(house):
     assert abs(scale) < 1 and angle < 1 and shift < 0.005
 
 
+def test_what_the_scene_does_not_show_does_not_shrink_the_object():
+    trial = plant("gate", 5, coverage=0.35, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
+    truth, tau = trial.scene_from_object, 0.02 * trial.diagonal
+    obj, scene = surfaces(trial, tau / 2)
+    pose = refine_planes(obj, scene, truth, ScaleRange(truth.scale, 0.5), tau, 60, 0.0)
+    assert abs(errors(pose, truth, trial.object.points.mean(0), trial.diagonal)[0]) < 0.3
+
+
 def test_a_prior_of_no_width_holds_the_scale(house):
     obj, scene = surfaces(house, 0.2)
     held = ScaleRange(house.scene_from_object.scale * 1.1, 0.0)
