@@ -81,10 +81,9 @@ def refine_planes(
         rounds: iterations at most; a step that moves the points by less than 0.5 % of `tau` is the last.
         color_weight: weight of the colour rows; 0 for geometry alone.
     """
-    gradients = _gradients(obj, scene, color_weight)
     pose = start
     for _ in range(rounds):
-        rows = _rows(obj, scene, pose, tau, color_weight, gradients)
+        rows = _rows(obj, scene, pose, tau, color_weight)
         if rows is None:
             return pose
         system, right = rows.normal_equations()
@@ -216,11 +215,9 @@ class _Rows:
         return self.jacobian.T @ (self.weight[:, None] * self.jacobian), self.jacobian.T @ (self.weight * self.residual)
 
 
-def _rows(
-    obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float, gradients: Array | None
-) -> _Rows | None:
+def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float) -> _Rows | None:
     """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
-    planes leave free, and colours where there are gradients."""
+    planes leave free, and colours where both sides have them."""
     pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
     if min(pairs.forward, len(pairs.distance) - pairs.forward) < 10:
         return None
@@ -234,11 +231,10 @@ def _rows(
     for axis in np.eye(3):
         along = np.broadcast_to(axis, p.shape)
         parts.append(_weighted(p - centre, along, (p - q) @ axis, POINT_WEIGHT * weights))
-    if gradients is not None:
-        assert obj.colors is not None and scene.colors is not None
+    if color_weight > 0 and obj.colors is not None and scene.colors is not None:
         gain, bias = color_gain(obj, scene, pairs)
         ahead = slice(0, pairs.forward)
-        slopes = gradients[pairs.scene_index[ahead]]
+        slopes = scene.color_slopes()[pairs.scene_index[ahead]]
         mine = gain * obj.colors[pairs.object_index[ahead]] + bias
         theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, (p - q)[ahead])
         for channel in range(3):
@@ -261,12 +257,6 @@ def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pair
     keep = np.concatenate([aside < tau / 2, np.ones(len(pairs.distance) - pairs.forward, dtype=bool)])
     kept = int(keep[ahead].sum())
     return Pairs(pairs.object_index[keep], pairs.scene_index[keep], pairs.distance[keep], kept)
-
-
-def _gradients(obj: Surface, scene: Surface, color_weight: float) -> Array | None:
-    """Slopes of the scene's colours, where both sides have colours and they are wanted."""
-    wanted = color_weight > 0 and obj.colors is not None and scene.colors is not None
-    return _color_gradients(scene) if wanted else None
 
 
 def _two_way_weights(pairs: Pairs, tau: float) -> Array:
@@ -301,20 +291,3 @@ def _apply_step(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> S
     about = Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre))
     moved = about @ pose
     return Sim3(scale, moved.rotation, moved.translation)
-
-
-def _color_gradients(surface: Surface, neighbours: int = 20) -> Array:
-    """Slope of each colour channel along the tangent plane, (N, 3 channels, 3), by least squares on neighbours."""
-    assert surface.colors is not None
-    index = surface.tree.query(surface.points, k=min(neighbours, len(surface)), workers=threads())[1]
-    offset = surface.points[index] - surface.points[:, None]
-    normals = surface.normals[:, None]
-    offset = offset - (offset * normals).sum(2, keepdims=True) * normals
-    change = surface.colors[index] - surface.colors[:, None]
-    normal_matrix = np.einsum("nki,nkj->nij", offset, offset)
-    # The normal direction carries no colour; a unit there keeps the system regular.
-    scale = np.trace(normal_matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
-    normal_matrix = normal_matrix + scale * np.einsum("ni,nj->nij", surface.normals, surface.normals)
-    right = np.einsum("nki,nkc->nic", offset, change)
-    solved = np.linalg.solve(normal_matrix + 1e-3 * scale * np.eye(3), right)
-    return np.swapaxes(solved, 1, 2)

@@ -1,6 +1,6 @@
 """A cloud made ready for matching: thinned to one spacing, normals from its own neighbourhoods, smoothed colours."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ class Surface:
         tree: nearest-neighbour search over `points`.
         probe: (P,) indices of the points that ask for their nearest neighbour on the other surface; all can answer.
         grid: a table of the nearest points that answers in place of the tree, or None.
+        slopes: those of `color_slopes`, once known; copies that differ in `probe` share them.
     """
 
     points: Array
@@ -31,6 +32,7 @@ class Surface:
     tree: cKDTree
     probe: NDArray[np.int64]
     grid: "NearestGrid | None" = None
+    slopes: list[Array] = field(default_factory=list, repr=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -39,6 +41,12 @@ class Surface:
         """The same surface in frame b."""
         points = b_from_a.apply(self.points)
         return Surface(points, b_from_a.rotate(self.normals), self.colors, cKDTree(points), self.probe)
+
+    def color_slopes(self) -> Array:
+        """Slope of each colour channel along the tangent plane, (N, 3 channels, 3), computed when first asked for."""
+        if not self.slopes:
+            self.slopes.append(_color_slopes(self))
+        return self.slopes[0]
 
     def nearest(self, points: Array, within: float) -> tuple[Array, NDArray[np.int64]]:
         """Distances (N,) and indices (N,) of the nearest points; the distance is infinite beyond `within`."""
@@ -122,3 +130,20 @@ def _plane_normals(points: Array, neighbours: NDArray[np.int64]) -> Array:
     local = points[neighbours]
     local = local - local.mean(1, keepdims=True)
     return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+
+
+def _color_slopes(surface: Surface, neighbours: int = 20) -> Array:
+    """(N, 3 channels, 3) by least squares on each point's neighbours."""
+    assert surface.colors is not None
+    index = surface.tree.query(surface.points, k=min(neighbours, len(surface)), workers=threads())[1]
+    offset = surface.points[index] - surface.points[:, None]
+    normals = surface.normals[:, None]
+    offset = offset - (offset * normals).sum(2, keepdims=True) * normals
+    change = surface.colors[index] - surface.colors[:, None]
+    normal_matrix = np.einsum("nki,nkj->nij", offset, offset)
+    # The normal direction carries no colour; a unit there keeps the system regular.
+    scale = np.trace(normal_matrix, axis1=1, axis2=2)[:, None, None] + 1e-12
+    normal_matrix = normal_matrix + scale * np.einsum("ni,nj->nij", surface.normals, surface.normals)
+    right = np.einsum("nki,nkc->nic", offset, change)
+    solved = np.linalg.solve(normal_matrix + 1e-3 * scale * np.eye(3), right)
+    return np.swapaxes(solved, 1, 2)
