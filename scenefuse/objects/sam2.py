@@ -7,11 +7,20 @@ import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
 
-from scenefuse.objects.hull import Mask
+from scenefuse.objects.grabcut import cleaned
+from scenefuse.objects.hull import Frame, Mask, agreement
+from scenefuse.objects.target import Target
 from scenefuse.stage import StageError, sha256
 
 SIDE_PX = 1024
 """Side of the square image the network takes."""
+LOGITS_PX = 256
+"""Side of the masks it gives and takes."""
+BOX_GROWTH = 0.05
+"""Growth of the box around the prompts, as a share of its longer side."""
+
+Array = NDArray[np.float64]
+Features = dict[str, NDArray[np.float16]]
 
 
 class Sam2:
@@ -28,44 +37,74 @@ class Sam2:
         self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
         self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
 
-    def mask(
-        self,
-        image: NDArray[np.uint8],
-        box_px: NDArray[np.float64],
-        points_px: NDArray[np.float64],
-        labels: NDArray[np.int_],
-    ) -> tuple[Mask, float]:
-        """Mask (H, W) of what a box and points ask for, and the IoU that the network predicts for it.
-
-        Args:
-            image: (H, W, 3) uint8 BGR.
-            box_px: (4,) left, top, right, bottom.
-            points_px: (P, 2) pixels.
-            labels: (P,) 1 on the object, 0 beside it.
-        """
-        height, width = image.shape[:2]
+    def encode(self, image: NDArray[np.uint8]) -> Features:
+        """Features of a (H, W, 3) uint8 BGR photo, for any number of prompts; 8 MB."""
         rgb = cv2.cvtColor(cv2.resize(image, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
         normalised = (rgb / 255.0 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
         blob = np.ascontiguousarray(normalised.transpose(2, 0, 1)[None], dtype=np.float32)
         names = [o.name for o in self._encoder.get_outputs()]
-        features = dict(zip(names, self._encoder.run(None, {self._encoder.get_inputs()[0].name: blob})))
-        scale = np.array([SIDE_PX / width, SIDE_PX / height])
-        prompts = np.concatenate([box_px.reshape(2, 2), points_px.reshape(-1, 2)]) * scale
-        kinds = np.concatenate([[2, 3], labels])
-        inputs = features | {
-            "point_coords": prompts[None].astype(np.float32),
-            "point_labels": kinds[None].astype(np.float32),
-            "mask_input": np.zeros((1, 1, SIDE_PX // 4, SIDE_PX // 4), dtype=np.float32),
+        outputs = self._encoder.run(None, {self._encoder.get_inputs()[0].name: blob})
+        return {name: output.astype(np.float16) for name, output in zip(names, outputs)}
+
+    def masks(
+        self, features: Features, size: tuple[int, int], points_px: Array, box_px: Array
+    ) -> tuple[list[Mask], Array]:
+        """Three masks (H, W), a part, a larger part and the whole, and how good the network thinks they are, (3,).
+
+        Args:
+            features: of the photo.
+            size: its (height, width).
+            points_px: (P, 2) pixels on the object.
+            box_px: (2, 2) corners of a box around it, upper left first.
+        """
+        height, width = size
+        points = np.concatenate([points_px, box_px]) * [SIDE_PX / width, SIDE_PX / height]
+        labels = [1.0] * len(points_px) + [2.0, 3.0]
+        inputs = {name: feature.astype(np.float32) for name, feature in features.items()} | {
+            "point_coords": points[None].astype(np.float32),
+            "point_labels": np.array([labels], dtype=np.float32),
+            "mask_input": np.zeros((1, 1, LOGITS_PX, LOGITS_PX), dtype=np.float32),
             "has_mask_input": np.zeros(1, dtype=np.float32),
         }
         wanted = {i.name for i in self._decoder.get_inputs()}
         outputs = self._decoder.run(None, {k: v for k, v in inputs.items() if k in wanted})
-        by_name = {o.name: v for o, v in zip(self._decoder.get_outputs(), outputs)}
-        logits = next(v for v in by_name.values() if v.ndim == 4)[0]
-        quality = next(v for v in by_name.values() if v.ndim == 2)[0]
-        best = int(np.argmax(quality))
-        mask = cv2.resize(logits[best].astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0
-        return mask, float(quality[best])
+        found = next(o for o in outputs if o.ndim == 4)[0]
+        quality = next(o for o in outputs if o.ndim == 2)[0].astype(np.float64)
+        masks = [cv2.resize(m.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0 for m in found]
+        return masks, quality
+
+
+def ask(network: Sam2, target: Target, frame: Frame, outline: Mask | None) -> Mask:
+    """The object in one photo: asked for by all prompts, as this photo sees them, and the box around them.
+
+    A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+
+    Args:
+        network: SAM 2.
+        target: prompts that span the object.
+        frame: the photo.
+        outline: (H, W) what the other photos make of the object; then the box is its own, and the answer most like it
+            is taken. The network does not see it: it would only give it back.
+
+    Returns:
+        (H, W), of the network's answers the one with most prompts in it and the best quality, or the most like the
+        outline; empty where no prompt is in the photo.
+    """
+    size = frame.image.shape[:2]
+    pixels, depth = frame.project(target.spanning)
+    front = depth > 0
+    inside = front & (pixels >= 0).all(1) & (pixels < size[::-1]).all(1)
+    if not inside.any():
+        return np.zeros(size, dtype=bool)
+    spanned = pixels[front] if outline is None or not outline.any() else np.argwhere(outline)[:, ::-1] + 0.5
+    low, high = spanned.min(0), spanned.max(0)
+    grow = BOX_GROWTH * (high - low).max()
+    box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
+    answers, quality = network.masks(network.encode(frame.image), size, pixels[inside], box)
+    u, v = pixels[inside].astype(int).T
+    if outline is not None:
+        quality = np.array([agreement(m, outline) for m in answers])
+    return cleaned(answers[int(np.argmax([m[v, u].mean() * q for m, q in zip(answers, quality)]))])
 
 
 def check_weights(path: Path | None, expected_sha256: str, what: str) -> Path:

@@ -8,11 +8,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+from scenefuse.objects import masks as masks_module
 from scenefuse.objects.box import find_ground, upright_box
+from scenefuse.objects.cut import stamp
 from scenefuse.objects.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.objects.hull import Frame, agreement, carve, silhouette
-from scenefuse.objects.masks import MaskSettings, _object_from_points, _stamp, make_masks
+from scenefuse.objects.masks import MaskSettings, make_masks
 from scenefuse.objects.sam2 import check_weights
+from scenefuse.objects.target import target_from_points
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
@@ -171,6 +174,38 @@ def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
     assert not (tmp_path / "x").exists()
 
 
+class TrueNetwork:
+    """Answers with the true mask and ever more beside it, the fifth photo at first with the ground."""
+
+    def __init__(self, *_):
+        self.asked = []
+
+    def encode(self, image):
+        k = next(k for k in range(PHOTOS) if np.array_equal(image, self.images[k]))
+        self.asked.append(k)
+        return k
+
+    def masks(self, k, size, points_px, box_px):
+        ball = look(camera_pose(k))[0]
+        assert size == ball.shape
+        assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()
+        assert (points_px > box_px[0]).all() and (points_px < box_px[1]).all()
+        if k == 5 and self.asked.count(5) == 1:
+            return [~ball] * 3, np.ones(3)
+        half = ball & (np.arange(size[1]) < points_px[:, 0].mean())
+        return [half, ball, ball | np.roll(ball, 30, axis=1)], np.array([0.9, 0.8, 0.6])
+
+
+def test_a_photo_that_disagrees_is_asked_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
+    network = TrueNetwork()
+    network.images = [cv2.imread(str(capture / "cameras" / "images" / f"f{k}.png")) for k in range(PHOTOS)]
+    monkeypatch.setattr(masks_module, "Sam2", lambda *_: network)
+    monkeypatch.setattr(masks_module, "check_weights", lambda path, *_: path)
+    run_stage(capture, tmp_path, method="sam2")
+    assert network.asked == [*range(PHOTOS), 5]
+    assert min(iou_with_truth(capture, tmp_path)) > 0.95
+
+
 def test_wrong_or_missing_weights_are_named(tmp_path):
     weights = tmp_path / "encoder.ort"
     with pytest.raises(StageError, match="do not exist"):
@@ -275,10 +310,10 @@ def test_close_prompts_fill_their_part_and_points_of_two_photos_have_no_say():
         rows = np.array([0, 2]) if k == 2 else np.arange(4)
         frame = Frame(f"{k}", blank, intrinsics, camera_pose(k), np.empty((0, 2)), rows)
         frames.append(dataclasses.replace(frame, observed=frame.project(sparse[rows])[0]))
-    target = _object_from_points(prompts, frames, sparse, np.array([0, 0, 1.0]), SETTINGS, 0)
+    target = target_from_points(prompts, frames, sparse, np.array([0, 0, 1.0]), 0.15, 0.02, 0)
     assert target.kind.tolist() == [1, 0, -1, 0]
     trimap = np.full((HEIGHT, WIDTH), cv2.GC_PR_BGD, np.uint8)
-    _stamp(trimap, target, frames[0])
+    stamp(trimap, target, frames[0])
     for point, label in (([0, 0, 0.1], cv2.GC_FGD), ([0.5, 0, 1.0], cv2.GC_PR_BGD), ([0, 0, 3.0], cv2.GC_FGD)):
         x, y = frames[0].project(np.array([point]))[0][0].astype(int)
         assert trimap[y, x] == label
