@@ -40,18 +40,16 @@ def verdict(directory) -> dict:
     return json.loads((directory / "results/objects/house/registration/full/fine.json").read_text())
 
 
-def test_the_verdict_is_never_wrong(finished):
-    # The tiny capture is coarse, and SfM on two threads is not bit-reproducible: the pose may be refused with a reason,
-    # but what is accepted lies where the object is. docs/results.md has the accuracy.
+def test_the_house_is_registered_where_it_is(finished):
+    # The tiny capture is coarse; docs/results.md has the accuracy of the demo.
     fine, truth = verdict(finished), json.loads((finished / "results/objects/house/truth.json").read_text())
-    assert fine["status"]["value"] in ("registered", "unregistered") and fine["reason"]["value"]
-    if fine["status"]["value"] == "registered":
-        assert abs(truth["scale_error_pct"]["value"]) <= 5.0
-        assert truth["rotation_error_deg"]["value"] <= 5.0
-        assert truth["translation_error_over_diagonal"]["value"] <= 0.05
+    assert fine["status"]["value"] == "registered", fine["reason"]["value"]
+    assert abs(truth["scale_error_pct"]["value"]) <= 2.0
+    assert truth["rotation_error_deg"]["value"] <= 2.0
+    assert truth["translation_error_over_diagonal"]["value"] <= 0.02
 
 
-def test_fusion_completes_what_is_registered_and_keeps_the_provenance_of_every_point(finished):
+def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(finished):
     house = finished / "results/objects/house"
     truth = json.loads((house / "truth.json").read_text())
     fused = read_cloud(house / "fused_scene.ply")
@@ -59,11 +57,8 @@ def test_fusion_completes_what_is_registered_and_keeps_the_provenance_of_every_p
     added = fused.fields["source"] == 1
     assert (~added).sum() == len(scene)
     assert (house / "fused_scene.laz").stat().st_size > 0
-    if verdict(finished)["status"]["value"] == "registered":
-        assert added.sum() > 0 and (fused.fields["views"][added] >= 2).all()
-        assert truth["scene_f_score_after"]["value"] > truth["scene_f_score_before"]["value"]
-    else:
-        assert added.sum() == 0
+    assert added.sum() > 0 and (fused.fields["views"][added] >= 2).all()
+    assert truth["scene_f_score_after"]["value"] > truth["scene_f_score_before"]["value"]
 
 
 def test_the_completed_scene_holds_what_the_object_adds(finished):
