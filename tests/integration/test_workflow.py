@@ -35,9 +35,9 @@ def test_everything_a_user_reads_is_there(finished):
     assert {"before_after.png", "object.png"} <= {p.name for p in (results / "objects/house/figures").iterdir()}
 
 
-def verdict(directory) -> dict:
-    """The full arm's registration of the house."""
-    return json.loads((directory / "results/objects/house/registration/full/fine.json").read_text())
+def verdict(directory, arm="full") -> dict:
+    """An arm's registration of the house."""
+    return json.loads((directory / f"results/objects/house/registration/{arm}/fine.json").read_text())
 
 
 def test_the_house_is_registered_where_it_is(finished):
@@ -47,6 +47,12 @@ def test_the_house_is_registered_where_it_is(finished):
     assert abs(truth["scale_error_pct"]["value"]) <= 2.0
     assert truth["rotation_error_deg"]["value"] <= 2.0
     assert truth["translation_error_over_diagonal"]["value"] <= 0.02
+
+
+def test_masks_find_the_house_in_the_scene_without_clicks(finished):
+    full, no_clicks = (np.array(verdict(finished, arm)["scene_from_object"]["value"]) for arm in ("full", "no_clicks"))
+    assert verdict(finished, "no_clicks")["status"]["value"] == "registered"
+    assert np.linalg.norm(full[:3, 3] - no_clicks[:3, 3]) < 0.1  # metres
 
 
 def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(finished):
