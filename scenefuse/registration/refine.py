@@ -7,7 +7,6 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.score import Pairs, color_gain, pair
 from scenefuse.registration.surface import Surface
-from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3, fit_sim3
 
 POINT_WEIGHT = 0.1
