@@ -48,6 +48,13 @@ class Landmarks:
         offset = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
         return self.start[points][owner] + offset, owner
 
+    def looked_at(self) -> Array:
+        """(3,) the point that the optical axes of all photos pass nearest to, by least squares."""
+        axes, rotations = self.cam_from_model[:, 2, :3], self.cam_from_model[:, :, :3]
+        centres = -np.einsum("nji,nj->ni", rotations, self.cam_from_model[:, :, 3])
+        across = np.eye(3) - axes[:, :, None] * axes[:, None]
+        return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=1e-9)[0]
+
     def pixel_size(self, points: NDArray[np.int64]) -> Array:
         """What one pixel of the nearest photo covers at each of some points, in the model's unit."""
         rows, owner = self.observations_of(points)

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.landmarks import Landmarks
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
 BEHIND_PX = 1e4
 
@@ -19,6 +19,14 @@ class Deviation:
     scale_log: float
     rotation_deg: float
     shift: float
+
+    def beside(self, pose: Sim3, other: Sim3, at: Array) -> "Deviation":
+        """With the difference of two estimates of the pose, judged at (3,) in the object's frame, added in squares."""
+        return Deviation(
+            float(np.hypot(self.scale_log, np.log(other.scale / pose.scale))),
+            float(np.hypot(self.rotation_deg, rotation_angle_deg(other.rotation @ pose.rotation.T))),
+            float(np.hypot(self.shift, np.linalg.norm(other.apply(at) - pose.apply(at)))),
+        )
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ It looks at photographs only and knows nothing of the dense clouds, so what goes
 
 import contextlib
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,9 @@ class WitnessSettings:
     """Gate: fewest points shared by both models."""
     min_photos: int
     """Gate: fewest photos on either side that see shared points."""
+    nearest_points: int
+    """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
+    bent against each other."""
     max_rival_share: float
     """Gate: inliers of the best pose among the other matches, over inliers."""
     max_scale_sd_log: float
@@ -115,10 +118,21 @@ def testify(obj: Landmarks, scene: Landmarks, settings: WitnessSettings, seed: i
         return _report(reason, len(pairs), None, None, None, None, np.zeros(3))
     centre = np.median(obj.points, axis=0)
     inliers = seen.subset(agreed.inliers)
-    deviation = bootstrap(inliers, agreed.pose, settings.max_error_px / 2, centre, settings.bootstrap_draws, seed)
+    near = nearest(inliers, obj.looked_at(), settings.nearest_points)
+    pose = refine(near, agreed.pose, settings.max_error_px / 2, 20)
+    drawn = bootstrap(near, pose, settings.max_error_px / 2, centre, settings.bootstrap_draws, seed)
+    # What all points would make of the pose shows how much the models are bent against each other.
+    deviation = drawn.beside(pose, agreed.pose, centre)
+    agreed = replace(agreed, pose=pose)
     problem = objection(agreed, inliers, len(pairs), deviation, settings)
-    centres = None if problem else localise(obj, scene, pairs, agreed.pose, settings.max_error_px, seed)
+    centres = None if problem else localise(obj, scene, pairs, pose, settings.max_error_px, seed)
     return _report(problem, len(pairs), agreed, inliers, deviation, centres, centre)
+
+
+def nearest(seen: Sightings, place: Array, count: int) -> Sightings:
+    """The `count` matches nearest to a place (3,) in the object's frame."""
+    distance = np.linalg.norm(seen.x - place, axis=1)
+    return seen.subset(distance <= np.sort(distance)[min(count, len(distance)) - 1])
 
 
 def agree(seen: Sightings, settings: WitnessSettings, seed: int) -> Agreement | None:

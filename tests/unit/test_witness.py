@@ -22,6 +22,7 @@ SETTINGS = WitnessSettings(
     max_error_px=6,
     min_points=15,
     min_photos=3,
+    nearest_points=200,
     max_rival_share=0.5,
     max_scale_sd_log=0.05,
     max_rotation_sd_deg=3,
@@ -153,6 +154,23 @@ def test_camera_centres_say_the_same(pair, tmp_path):
     assert value(found, "centres_photos") >= 8
     assert value(found, "scale_from_centres") == pytest.approx(OBJECT_FROM_WORLD.inverse().scale, rel=0.02)
     assert value(found, "centres_rotation_deg") < 1 and value(found, "centres_shift") < 0.1
+
+
+def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos_look_at(tmp_path):
+    whole = world(1)
+    far = np.maximum(np.linalg.norm(whole.points, axis=1) - 3, 0)
+    bent = replace(whole, points=whole.points + np.outer(0.02 * far, [1, 0, 0]))
+    scene = capture(tmp_path, "scene", bent, ring(6, 14, 12), 3)
+    obj = capture(tmp_path, "object", whole, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
+    truth, centre = OBJECT_FROM_WORLD.inverse(), OBJECT_FROM_WORLD.apply(np.zeros(3))
+    shifts = []
+    for count in (100, 1000):
+        found = ask(tmp_path, obj, scene, replace(SETTINGS, nearest_points=count))
+        pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
+        shifts.append(np.linalg.norm(pose.apply(centre) - truth.apply(centre)))
+        if count == 100:
+            assert shifts[0] < 3 * value(found, "translation_sd")
+    assert shifts[0] < 0.5 * shifts[1]
 
 
 def test_the_same_input_gives_the_same_output(pair, tmp_path):
