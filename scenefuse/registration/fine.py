@@ -27,6 +27,7 @@ POLISHED = 4
 ROUNDS = 60
 OFF_SCALE = 1.06
 BEYOND_PRIOR = 0.15
+ASTRAY = 0.9
 
 
 @dataclass(frozen=True)
@@ -306,7 +307,7 @@ class _Pair:
         planes = refine_planes(*self.asking, h.pose, self.scales, self.narrow, ROUNDS, color_weight)
         polished, before = (Hypothesis(p, h.source, self.rate(p, self.asking)) for p in (planes, h.pose))
         # The score is too coarse to choose between two poses in one valley; it only tells that a polish went astray.
-        return polished if polished.score.total > 0.9 * before.score.total else before
+        return polished if polished.score.total > ASTRAY * before.score.total else before
 
     def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
         """The hypothesis with the object grown about its centre."""
@@ -325,7 +326,8 @@ class _Pair:
     ) -> tuple[list[Hypothesis], Uncertainty | None, Literal["geometry", "photos", "both"]]:
         """The ranking after the photos' word, the spread of its first, and who decided.
 
-        Where clouds and photos are in one valley, the surer of them has the last word; clouds cannot leave it.
+        Where clouds and photos are in one valley, the surer of them has the last word. Clouds cannot leave it, and
+        photos whose pose lays the clouds on each other clearly worse than the clouds' own have gone astray in it.
         """
         witness = self.evidence.witness
         if witness is None:
@@ -335,9 +337,11 @@ class _Pair:
             ranked = [self.polish(self.settle(witness.pose, "photos", self.narrow)), *ranked]
         spread = self.spread(ranked[0])
         strays = not witness.agrees(ranked[0].pose, self.centre, self.diagonal)
-        if strays or spread is None or witness.spread.size(self.diagonal) < spread.size(self.diagonal):
-            ranked = [Hypothesis(witness.pose, "photos", self.rate(witness.pose, self.asking)), *ranked]
-            spread = witness.spread
+        surer = spread is None or witness.spread.size(self.diagonal) < spread.size(self.diagonal)
+        by_photos = Hypothesis(witness.pose, "photos", self.rate(witness.pose, self.asking))
+        astray = agree and by_photos.score.total < ASTRAY * ranked[0].score.total
+        if strays or (surer and not astray):
+            ranked, spread = [by_photos, *ranked], witness.spread
         return ranked, spread, "both" if agree else "photos"
 
 
