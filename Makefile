@@ -3,7 +3,7 @@ CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo test lint report bench bench-registration docs clean
+.PHONY: demo test lint report bench bench-registration bench-nerf docs clean
 
 demo: .venv/ready
 	snakemake --cores $(CORES)
@@ -23,12 +23,18 @@ lint: .venv/ready
 report: .venv/ready
 	snakemake --cores 1 --report results/summary/snakemake-report.html
 
-bench: bench-registration
+bench: bench-registration bench-nerf
 
 # Planted registrations, beside the paper's recipe, FGR and KISS-Matcher; about half an hour on two cores.
 bench-registration: .venv/ready
 	pip install --quiet --disable-pip-version-check -r tests/benchmarks/requirements.txt
 	PYTHONPATH=tests OMP_NUM_THREADS=1 python tests/benchmarks/registration.py --jobs $(CORES)
+
+# Hash encoding and training steps, beside plain PyTorch and nerfstudio's encoding; a minute. Only that one module of
+# nerfstudio is used, so what else it depends on is not installed.
+bench-nerf: .venv/ready
+	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7
+	PYTHONPATH=tests python tests/benchmarks/nerf.py --threads $(CORES)
 
 # The tables of config/README.md, from the schemas.
 docs: .venv/ready

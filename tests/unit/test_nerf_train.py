@@ -3,72 +3,22 @@
 import numpy as np
 import pytest
 import torch
+from painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
 from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import tight_cube, visual_hull
+from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
-from scenefuse.nerf.rays import Photos, cube_from_cameras, dilate, draw_batch, pixel_pool
+from scenefuse.nerf.rays import cube_from_cameras, dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.train import Schedule, new_model, train
 from scenefuse.transforms import Sim3
-
-RADIUS, CENTER = 1.5, np.array([4.0, -2.0, 1.0])
-SIZE, FOCAL = 48, 48.0
-
-
-def sphere_views(count=12):
-    """Photos of a sphere with smooth colours: images, masks, intrinsics, poses, true depths."""
-    k = np.array([[FOCAL, 0, SIZE / 2], [0, FOCAL, SIZE / 2], [0, 0, 1]])
-    v, u = np.indices((SIZE, SIZE)) + 0.5
-    rays = np.stack([(u - SIZE / 2) / FOCAL, (v - SIZE / 2) / FOCAL, np.ones_like(u)], -1)
-    images, masks, poses, depths = [], [], [], []
-    for i in range(count):
-        angle, height = 2 * np.pi * i / count, (-0.5, 0.6, 1.5)[i % 3]
-        position = CENTER + 5.0 * np.array([np.cos(angle), np.sin(angle), height]) / np.hypot(1, height)
-        z = (CENTER - position) / np.linalg.norm(CENTER - position)
-        x = np.cross(z, [0, 0, 1.0])
-        x /= np.linalg.norm(x)
-        rotation = np.stack([x, np.cross(z, x), z], axis=1)
-        d = rays @ rotation.T
-        offset = position - CENTER
-        a, b, c = (d**2).sum(-1), d @ offset, offset @ offset - RADIUS**2
-        root = b**2 - a * c
-        depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
-        normal = (position + d * depth[..., None] - CENTER) / RADIUS
-        image = 0.5 + 0.4 * np.sin(normal * 5.0 + np.array([0.0, 1.0, 2.0]))
-        images.append((image * (root > 0)[..., None] * 255).astype(np.uint8))
-        masks.append(root > 0)
-        poses.append(np.vstack([np.column_stack([rotation, position]), [0, 0, 0, 1]]))
-        depths.append(depth)
-    return np.stack(images), np.stack(masks), np.repeat(k[None], count, 0), np.stack(poses), np.stack(depths)
 
 
 @pytest.fixture(scope="module")
 def sphere():
     return sphere_views()
-
-
-def _volume(sphere, cells=32):
-    _, masks, k, poses, _ = sphere
-    first = cube_from_cameras(masks, k, poses)
-    cube = tight_cube(visual_hull(masks, k, poses, first, 32, 0.0), first, 0.05)
-    return cube, visual_hull(masks, k, poses, cube, cells, 0.0)
-
-
-def _photos(sphere, cube, prior=0.0):
-    images, masks, k, poses, depths = sphere
-    known = depths * cube.scale * (1.0 if prior else 0.0)
-    return Photos(
-        torch.from_numpy(images),
-        torch.from_numpy(masks),
-        torch.from_numpy(k.astype(np.float32)),
-        torch.from_numpy(poses[:, :3, :3].astype(np.float32)),
-        torch.from_numpy(cube.apply(poses[:, :3, 3]).astype(np.float32)),
-        torch.from_numpy(known.astype(np.float32)),
-        torch.from_numpy((known > 0).astype(np.float32)),
-    )
 
 
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
@@ -80,8 +30,8 @@ def _schedule(steps, pose=0.0):
 
 
 def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0):
-    cube, hull = _volume(sphere)
-    photos = _photos(sphere, cube, prior=1.0)
+    cube, hull = sphere_volume(sphere)
+    photos = photos_of(sphere, cube, prior=1.0)
     model = new_model(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
     schedule = _schedule(steps, pose)
     result = train(
@@ -91,7 +41,7 @@ def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None
 
 
 def test_hull_holds_the_sphere_and_little_more(sphere):
-    cube, hull = _volume(sphere, cells=64)
+    cube, hull = sphere_volume(sphere, cells=64)
     cells = cube.inverse().apply((np.argwhere(hull) + 0.5) / 64)
     distance = np.linalg.norm(cells - CENTER, axis=1)
     volume = hull.mean() / cube.scale**3
@@ -108,8 +58,8 @@ def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
 
 
 def test_batches_repeat_and_keep_off_the_band(sphere):
-    cube, _ = _volume(sphere)
-    photos = _photos(sphere, cube)
+    cube, _ = sphere_volume(sphere)
+    photos = photos_of(sphere, cube)
     pool = pixel_pool(photos, band_px=2, ring_px=6, edge_px=2)
     batch, again = (draw_batch(photos, pool, 5, 9, 8, 64, 0.25) for _ in range(2))
     assert torch.equal(batch.uv, again.uv) and torch.equal(batch.view, again.view)

@@ -1,0 +1,67 @@
+"""Real scenes laid on each other by their clouds alone, judged by the photos that they share.
+
+snakemake --configfile config/examples/two_walks/config.yaml --cores 2 \\
+    results/scenes/{walk1,walk2,boulder,boulder_section}/dense.ply
+python tests/benchmarks/two_walks.py --results results --pictures results/two_walks
+"""
+
+from pathlib import Path
+
+import numpy as np
+
+from scenefuse.clouds import read_cloud
+from scenefuse.registration.landmarks import read_landmarks
+from scenefuse.registration.picture import draw_alignment
+from scenefuse.registration.register import register_clouds
+from scenefuse.registration.witness import WitnessSettings, testify
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import run, value
+from scenefuse.transforms import Sim3, rotation_angle_deg
+
+PAIRS = {"south_building": ("walk2", "walk1"), "rock": ("boulder_section", "boulder")}
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def two_walks(*, results: Path, pictures: Path) -> None:
+    """Print the verdict of the clouds, the witness of the photos, and how far they are apart.
+
+    Args:
+        results: the results folder of the workflow.
+        pictures: folder for the clouds on each other, by clouds and by photos.
+    """
+    settings = shipped_with(None)
+    witness_settings = build(WitnessSettings, settings["registration"]["witness"])
+    pictures.mkdir(parents=True, exist_ok=True)
+    for name, pair in PAIRS.items():
+        folders = [results / "scenes" / part for part in pair]
+        obj, scene = (read_cloud(folder / "dense.ply") for folder in folders)
+        found = register_clouds(obj, scene, settings, 0, ups=(UP, UP))
+        ours, theirs = (
+            read_landmarks(
+                folder / "georeferenced",
+                folder / "database.db",
+                witness_settings.most_points,
+                witness_settings.descriptors_per_point,
+            )
+            for folder in folders
+        )
+        witness = testify(ours, theirs, witness_settings, 0)
+        print(f"{name}, {len(obj)} points in {len(scene)}")
+        print(f"  clouds  {'registered' if found.registered else 'unregistered'}: {found.reason}")
+        print(f"  photos  {'found' if value(witness, 'found') else 'not found'}: {value(witness, 'reason')}")
+        if found.scene_from_object is not None:
+            draw_alignment(pictures / f"{name}_clouds.png", obj, scene, found.scene_from_object, 0)
+        if not value(witness, "found"):
+            continue
+        pose = Sim3.from_matrix(np.array(value(witness, "scene_from_object")))
+        draw_alignment(pictures / f"{name}_photos.png", obj, scene, pose, 0)
+        if found.scene_from_object is not None:
+            centre, diagonal = obj.points.mean(0), obj.diagonal * pose.scale
+            shift = np.linalg.norm(found.scene_from_object.apply(centre) - pose.apply(centre)) / diagonal
+            turn = rotation_angle_deg(found.scene_from_object.rotation @ pose.rotation.T)
+            scale = found.scene_from_object.scale / pose.scale - 1
+            print(f"  apart   scale {scale:+.2%}, rotation {turn:.2f} degrees, shift {shift:.2%} of the diagonal")
+
+
+if __name__ == "__main__":
+    run(two_walks)
