@@ -326,8 +326,8 @@ class _Pair:
     ) -> tuple[list[Hypothesis], Uncertainty | None, Literal["geometry", "photos", "both"]]:
         """The ranking after the photos' word, the spread of its first, and who decided.
 
-        Where clouds and photos are in one valley, the surer of them has the last word. Clouds cannot leave it, and
-        photos whose pose lays the clouds on each other clearly worse than the clouds' own have gone astray in it.
+        Where clouds and photos are in one valley, the surer of them has the last word, and clouds cannot leave it. The
+        worse the clouds lie on each other at the photos' pose, the surer the photos must be.
         """
         witness = self.evidence.witness
         if witness is None:
@@ -337,10 +337,9 @@ class _Pair:
             ranked = [self.polish(self.settle(witness.pose, "photos", self.narrow)), *ranked]
         spread = self.spread(ranked[0])
         strays = not witness.agrees(ranked[0].pose, self.centre, self.diagonal)
-        surer = spread is None or witness.spread.size(self.diagonal) < spread.size(self.diagonal)
         by_photos = Hypothesis(witness.pose, "photos", self.rate(witness.pose, self.asking))
-        astray = agree and by_photos.score.total < ASTRAY * ranked[0].score.total
-        if strays or (surer and not astray):
+        worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
+        if strays or spread is None or witness.spread.size(self.diagonal) < worth * spread.size(self.diagonal):
             ranked, spread = [by_photos, *ranked], witness.spread
         return ranked, spread, "both" if agree else "photos"
 

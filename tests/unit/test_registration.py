@@ -282,15 +282,17 @@ def test_the_surer_of_photos_and_clouds_has_the_last_word(house):
         assert (outcome.ranked[0].pose.scale == near.scale) == won
 
 
-def test_photos_that_fit_the_clouds_clearly_worse_have_gone_astray_in_their_valley(house):
+def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_surer(house):
     truth = house.scene_from_object
     beside = Sim3(1.0, np.eye(3), np.array([0.03 * house.diagonal, 0, 0])) @ truth
-    evidence = Evidence((house.up_in_object, Z), None, shared(beside))
-    prior = ScaleRange(truth.scale, 0.3)
-    outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
-    assert outcome.verdict.registered and outcome.verdict.decided_by == "both"
-    centre = house.object.points.mean(0)
-    assert errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] < 0.01
+    prior, centre = ScaleRange(truth.scale, 0.3), house.object.points.mean(0)
+    alone = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, Evidence(), LITTLE[1], 0)
+    for share, by_photos in ((0.9, False), (0.05, True)):
+        sd = share * alone.spread.size(house.scene.diagonal) * house.scene.diagonal
+        evidence = Evidence(None, None, Witness(beside, Uncertainty.even(0.0, 0.0, sd), 40, None))
+        outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
+        assert outcome.verdict.decided_by == "both"
+        assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
 
 
 def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
