@@ -118,7 +118,7 @@ def carve(
         p = centres[alive] @ projection[:, :3].T + projection[:, 3]
         height, width = mask.shape
         depth = np.maximum(p[:, 2], 1e-6)
-        u, v = (p[:, 0] / depth).astype(np.int32), (p[:, 1] / depth).astype(np.int32)
+        u, v = np.clip(p[:, :2].T / depth, -1, 1e6).astype(np.int32)
         inside = (p[:, 2] > 0) & (p[:, 0] >= 0) & (u < width) & (p[:, 1] >= 0) & (v < height)
         hit = np.zeros(len(alive), dtype=bool)
         hit[inside] = mask[v[inside], u[inside]]

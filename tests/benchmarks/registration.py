@@ -135,9 +135,9 @@ def one(task: tuple[str, float, int, list[str]]) -> list[dict[str, Any]]:
     trial, scene, drawn = planted(name, coverage, repeat)
     rows = []
     for method in methods:
-        start = time.process_time()
+        start, start_cpu = time.perf_counter(), time.process_time()
         found = METHODS[method](trial, scene)
-        seconds = time.process_time() - start
+        seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - start_cpu
         axis = trial.axis if method == "scenefuse" or not SHAPES[name].round else UP
         scale, angle, shift = (np.nan,) * 3
         if found.pose is not None:
@@ -149,7 +149,7 @@ def one(task: tuple[str, float, int, list[str]]) -> list[dict[str, Any]]:
                 "shape": name, "coverage": coverage, "shown": trial.coverage, "repeat": repeat, **drawn,
                 "object_points": len(trial.object), "scene_points": len(scene), "method": method,
                 "scale_pct": scale, "rotation_deg": angle, "shift_pct": 100 * shift, "right": right,
-                "accepted": found.accepted, "cpu_seconds": seconds, "reason": found.reason,
+                "accepted": found.accepted, "seconds": seconds, "cpu_seconds": cpu_seconds, "reason": found.reason,
             }
         )  # fmt: skip
     return rows
@@ -199,7 +199,7 @@ def summary(table: pd.DataFrame) -> str:
     lines = []
     for column, groups in (("coverage", sorted(table.coverage.unique())), ("shape", list(table["shape"].unique()))):
         lines.append(
-            f"{column:14s}{'method':15s} trials  right  wrong accepted  refused median CPU s  scale %  rot deg"
+            f"{column:14s}{'method':15s} trials  right  wrong accepted  refused  median s    CPU s  scale %  rot deg"
         )
         for group in [*groups, "all"]:
             for method, part in table.groupby("method", sort=False):
@@ -207,7 +207,7 @@ def summary(table: pd.DataFrame) -> str:
                 good, wrong = part[part.right], (part.accepted & ~part.right).mean()
                 lines.append(
                     f"{group!s:14s}{method:15s} {len(part):6d} {part.right.mean():6.1%} {wrong:15.1%}"
-                    f" {(~part.accepted).mean():8.1%} {part.cpu_seconds.median():12.2f}"
+                    f" {(~part.accepted).mean():8.1%} {part.seconds.median():9.2f} {part.cpu_seconds.median():8.2f}"
                     f" {good.scale_pct.abs().median():8.2f} {good.rotation_deg.median():8.2f}"
                 )
         lines.append("")
