@@ -33,7 +33,7 @@ bench-registration: .venv/ready
 # Hash encoding and training steps, beside plain PyTorch and nerfstudio's encoding; a minute. Only that one module of
 # nerfstudio is used, so what else it depends on is not installed.
 bench-nerf: .venv/ready
-	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7
+	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7 rich==14.0.0 markdown-it-py==3.0.0 mdurl==0.1.2
 	PYTHONPATH=tests python tests/benchmarks/nerf.py --threads $(CORES)
 
 # The tables of config/README.md, from the schemas.

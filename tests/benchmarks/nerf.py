@@ -4,7 +4,9 @@ make bench-nerf, or: python tests/benchmarks/nerf.py --repeats 3
 """
 
 import statistics
+import sys
 import time
+import types
 from collections.abc import Callable
 
 import numpy as np
@@ -66,6 +68,9 @@ def encodings() -> dict[str, Callable[[], None]]:
         "scenefuse": lambda: step(lambda: encode(x, table, grid, every_level), table),
         "scenefuse in plain PyTorch": lambda: step(lambda: encode_reference(x, table, grid, every_level), table),
     }
+    # Its web viewer is imported on the way and not needed.
+    for name in ("viser", "viser.transforms"):
+        sys.modules.setdefault(name, types.ModuleType(name))
     try:
         from nerfstudio.field_components.encodings import HashEncoding
     except ImportError as error:
