@@ -23,6 +23,8 @@ from scenefuse.scenes.sfm import cancellable
 from scenefuse.stage import StageError, atomic_directory, manifest, quantity, read_json, threads, value, write_json
 from scenefuse.units import length_unit
 
+FEW_FUSED = 0.01
+
 
 @dataclass(frozen=True)
 class FusionSettings:
@@ -155,7 +157,8 @@ def fuse_depth_maps(
         settings: see FusionSettings.
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
-        report: output JSON: number of points, spacing, backend, what was dropped.
+        report: output JSON: number of points, spacing, backend, what was dropped, the share of the pixels with a depth
+            that are in the cloud, and a note where it is small.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -186,6 +189,15 @@ def fuse_depth_maps(
         raise _no_points(settings)
     kept = agreed[_near_others(agreed.points, settings)]
     print(f"{len(kept)} points, {len(agreed) - len(kept)} lonely ones dropped", flush=True)
+    measured = sum(int((read_depth(path) > 0).sum()) for _, path in maps.values())
+    fused_share = float(kept.fields["views"].sum() / max(measured, 1))
+    notes = []
+    if fused_share < FEW_FUSED:
+        notes.append(
+            f"only {fused_share:.2%} of the pixels with a depth are in the cloud: the photos' depths disagree; look at"
+            " the cameras, or raise max_depth_error, max_reprojection_px or max_normal_error_deg"
+        )
+        print(f"note: {notes[0]}", flush=True)
     write_cloud(cloud, kept)
     write_json(
         report,
@@ -195,6 +207,8 @@ def fuse_depth_maps(
             "spacing": quantity(spacing(kept.points), length_unit(georeference)),
             "median_views": quantity(float(np.median(kept.fields["views"])), "1"),
             "depth_maps": quantity(len(maps), "1"),
+            "fused_share": quantity(fused_share, "1"),
+            "notes": quantity(notes, ""),
             "backend": quantity(", ".join(backends), ""),
             "device": quantity(", ".join(sorted({value(s, "device") for s in stages})), ""),
             "reason": quantity(value(stages[0], "reason") if stages else "", ""),

@@ -1,5 +1,7 @@
 """Stereo and fusion on a planted scene: a bumpy, textured surface of known depth seen by five cameras."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pycolmap
@@ -124,6 +126,7 @@ def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, m
     cloud = read_cloud(cloud_path)
     report = read_json(report_path)
     assert len(cloud) == value(report, "points") > 3000 and report["spacing"]["unit"] == "m"
+    assert value(report, "fused_share") > 0.1 and value(report, "notes") == []
     assert cloud.fields["views"].min() >= 3
     x, y, z = cloud.points.T
     signed = (z - surface(x, y)) / np.sqrt(1 + 0.3**2 + 0.2**2)
@@ -131,6 +134,20 @@ def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, m
     assert np.abs(np.median(signed)) < 0.0025
     assert np.median(np.abs(signed)) < 0.02
     assert cloud.normals is not None and (cloud.normals[:, 2] < 0).mean() > 0.99
+
+
+def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_path):
+    fuse_depth_maps(
+        workspace=workspace,
+        depth=[maps / "0", maps / "1"],
+        depth_reports=[maps / "0.json", maps / "1.json"],
+        settings=replace(FUSION, max_reprojection_px=0.3, max_depth_error=1e-3),
+        cloud=tmp_path / "dense.ply",
+        report=tmp_path / "dense.json",
+    )
+    report = read_json(tmp_path / "dense.json")
+    assert 0 < value(report, "fused_share") < 0.01
+    assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
 
 
 def test_errors_are_sentences(workspace, maps, tmp_path):
