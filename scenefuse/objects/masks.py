@@ -16,7 +16,7 @@ from scenefuse.objects.frames import original_sizes
 from scenefuse.objects.hull import Frame, Hull, Mask, agreement, carve, silhouette
 from scenefuse.objects.sam2 import Sam2, ask, check_weights
 from scenefuse.objects.supplied import supplied_masks
-from scenefuse.objects.target import Target, target_from_masks, target_from_points
+from scenefuse.objects.target import Target, points_in_masks, target_from_points
 from scenefuse.stage import (
     StageError,
     atomic_directory,
@@ -114,18 +114,19 @@ def make_masks(
         found = supplied_masks(supplied, sfm, frames)
         without = {f.name: "no mask was supplied" for f in frames if f.name not in found}
         frames = [f for f in frames if f.name in found]
-        made = _supplied([found[f.name] for f in frames], frames, sparse, up, settings, seed)
+        points = points_in_masks(frames, [found[f.name] for f in frames], sparse, up)
     else:
-        sizes = original_sizes(read_json(photos))
-        points = _prompt_points(prompts, sfm, sizes, settings)
-        target = target_from_points(points, frames, sparse, up, settings.box_margin, settings.ground_margin, seed)
-        print(f"{np.sum(target.kind > 0)} sparse points on the object, {np.sum(target.kind < 0)} not", flush=True)
-        if method == "sam2":
-            encoder = check_weights(sam2_encoder, settings.sam2_encoder_sha256, "encoder")
-            decoder = check_weights(sam2_decoder, settings.sam2_decoder_sha256, "decoder")
-            made = _segment(Sam2(encoder, decoder, threads()), target, frames, settings)
-        else:
-            made = _cut(target, frames, settings)
+        points = _prompt_points(prompts, sfm, original_sizes(read_json(photos)), settings)
+    target = target_from_points(points, frames, sparse, up, settings.box_margin, settings.ground_margin, seed)
+    print(f"{np.sum(target.kind > 0)} sparse points on the object, {np.sum(target.kind < 0)} not", flush=True)
+    if method == "supplied":
+        made = _judged([found[f.name] for f in frames], frames, target, settings)
+    elif method == "sam2":
+        encoder = check_weights(sam2_encoder, settings.sam2_encoder_sha256, "encoder")
+        decoder = check_weights(sam2_decoder, settings.sam2_decoder_sha256, "decoder")
+        made = _segment(Sam2(encoder, decoder, threads()), target, frames, settings)
+    else:
+        made = _cut(target, frames, settings)
     dropped = without | made.dropped
     kept = [k for k, f in enumerate(frames) if f.name not in dropped]
     for name, reason in sorted(dropped.items()):
@@ -156,7 +157,7 @@ def make_masks(
             "masks": quantity(len(kept), "1"),
             "photos": quantity(len(frames) + len(without), "1"),
             "median_agreement": quantity(median, "1"),
-            "ground": quantity("measured" if made.target.ground_found else "not found; bottom of the box", ""),
+            "ground": quantity("measured" if target.ground_found else "not found; bottom of the box", ""),
             "hull_voxel": quantity(made.hull.voxel, "object units"),
             "dropped": dropped,
             "per_photo": per_photo,
@@ -171,27 +172,15 @@ class _Made:
 
     Attributes:
         masks: (H, W) per photo.
-        scores: how well each agrees with the others, 0..1.
+        scores: IoU of each with the outline of the hull, 0..1.
         dropped: photo name -> why it has no usable mask.
-        hull: of the others.
-        target: where the object is.
+        hull: of all masks.
     """
 
     masks: list[Mask]
     scores: list[float]
     dropped: dict[str, str]
     hull: Hull
-    target: Target
-
-
-def _supplied(
-    masks: list[Mask], frames: list[Frame], sparse: Array, up: Array, settings: MaskSettings, seed: int
-) -> _Made:
-    """Supplied masks, measured against their hull."""
-    target = target_from_masks(frames, masks, sparse, up, settings.box_margin, settings.ground_margin, seed)
-    return _beside_hull(
-        masks, frames, _carve(target, frames, masks, settings, settings.hull_tolerance), target, settings
-    )
 
 
 def _cut(target: Target, frames: list[Frame], settings: MaskSettings) -> _Made:
@@ -199,14 +188,14 @@ def _cut(target: Target, frames: list[Frame], settings: MaskSettings) -> _Made:
     masks = first_cuts(target, frames, settings.grabcut_width_px, settings.grabcut_iterations)
     # The first masks are made photo by photo: their hull lets twice as many of them disagree.
     hull = _carve(target, frames, masks, settings, 2 * settings.hull_tolerance)
-    for _ in range(2):
-        masks = second_cuts(target, masks, frames, hull, settings.band_px)
-        hull = _carve(target, frames, masks, settings, settings.hull_tolerance)
-    return _beside_hull(masks, frames, hull, target, settings)
+    masks = second_cuts(target, masks, frames, hull, settings.band_px)
+    hull = _carve(target, frames, masks, settings, settings.hull_tolerance)
+    masks = second_cuts(target, masks, frames, hull, settings.band_px)
+    return _judged(masks, frames, target, settings)
 
 
 def _segment(network: Sam2, target: Target, frames: list[Frame], settings: MaskSettings) -> _Made:
-    """SAM 2 photo by photo, and once more, with the visual hull's outline, where a mask disagrees with it."""
+    """SAM 2 photo by photo, and once more, with the visual hull's box, where a mask disagrees with the hull."""
     masks = [ask(network, target, f, None) for f in frames]
     hull = _carve(target, frames, masks, settings, 2 * settings.hull_tolerance)
     for k, frame in enumerate(frames):
@@ -215,13 +204,12 @@ def _segment(network: Sam2, target: Target, frames: list[Frame], settings: MaskS
             again = ask(network, target, frame, outline)
             masks[k] = max(masks[k], again, key=lambda m: agreement(m, outline))
             print(f"{frame.name} asked again, IoU {agreement(masks[k], outline):.2f}", flush=True)
-    return _beside_hull(
-        masks, frames, _carve(target, frames, masks, settings, settings.hull_tolerance), target, settings
-    )
+    return _judged(masks, frames, target, settings)
 
 
-def _beside_hull(masks: list[Mask], frames: list[Frame], hull: Hull, target: Target, settings: MaskSettings) -> _Made:
-    """Masks that are judged by their agreement with the visual hull."""
+def _judged(masks: list[Mask], frames: list[Frame], target: Target, settings: MaskSettings) -> _Made:
+    """Masks judged by their agreement with their visual hull."""
+    hull = _carve(target, frames, masks, settings, settings.hull_tolerance)
     scores = [agreement(m, silhouette(hull, f)) for m, f in zip(masks, frames)]
     dropped = {}
     for frame, mask, score in zip(frames, masks, scores):
@@ -231,7 +219,7 @@ def _beside_hull(masks: list[Mask], frames: list[Frame], hull: Hull, target: Tar
             dropped[frame.name] = (
                 f"IoU with the visual hull is {score:.2f}, below {settings.min_agreement} (min_agreement)"
             )
-    return _Made(masks, scores, dropped, hull, target)
+    return _Made(masks, scores, dropped, hull)
 
 
 def _read_frames(cameras: Path) -> tuple[list[Frame], Array]:

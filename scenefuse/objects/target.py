@@ -85,16 +85,8 @@ def target_from_points(
     return Target(box, ground, found, points, grow, _parts(points, 0.12 * box.diagonal), sparse, kind)
 
 
-def target_from_masks(
-    frames: list[Frame],
-    masks: list[Mask],
-    sparse: Array,
-    up: Array,
-    box_margin: float,
-    ground_margin: float,
-    seed: int,
-) -> Target:
-    """Box and ground from (H, W) masks: the sparse points that lie in the mask wherever they are seen.
+def points_in_masks(frames: list[Frame], masks: list[Mask], sparse: Array, up: Array) -> Array:
+    """(N, 3) sparse points that lie in the (H, W) masks wherever they are seen, without the outermost: they span it.
 
     Raises:
         StageError: there are fewer than ten of them.
@@ -110,11 +102,9 @@ def target_from_masks(
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"
         )
-    axes = upright_box(own, up, 0.0)
-    x = axes.to_box(own)
+    x = upright_box(own, up, 0.0).to_box(own)
     low, high = np.percentile(x, [0.5, 99.5], axis=0)
-    own = own[((x >= low) & (x <= high)).all(1)]
-    return target_from_points(own, frames, sparse, up, box_margin, ground_margin, seed)
+    return own[((x >= low) & (x <= high)).all(1)]
 
 
 def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:

@@ -9,7 +9,6 @@ import time
 import types
 from collections.abc import Callable
 
-import numpy as np
 import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
@@ -118,5 +117,4 @@ def print_nothing(line: str) -> None:
 
 
 if __name__ == "__main__":
-    np.seterr(all="raise", under="ignore")
     run(nerf)
