@@ -52,6 +52,7 @@ def photos_of(sphere, cube, prior=0.0):
     return Photos(
         torch.from_numpy(images),
         torch.from_numpy(masks),
+        torch.from_numpy(masks.astype(np.uint8) * 255),
         torch.from_numpy(k.astype(np.float32)),
         torch.from_numpy(poses[:, :3, :3].astype(np.float32)),
         torch.from_numpy(cube.apply(poses[:, :3, 3]).astype(np.float32)),

@@ -1,6 +1,6 @@
 """The losses of the depth-guided NeRF, each a plain function of per-ray values.
 
-`inside` rays were drawn from the eroded mask, the others outside the dilated one; rays in between are never drawn.
+`inside` rays were drawn from the object's pixels, the others beside it.
 """
 
 from dataclasses import dataclass
@@ -69,10 +69,10 @@ def rank_loss(distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor, 
     return (hinge * torch.minimum(w, w2) * valid).sum() / valid.sum().clamp(min=1)
 
 
-def mask_loss(opacity: Tensor, inside: Tensor) -> Tensor:
-    """Binary cross-entropy of opacity (R,) against the mask (R,) bool."""
+def mask_loss(opacity: Tensor, matte: Tensor) -> Tensor:
+    """Binary cross-entropy of opacity (R,) against the matte (R,) in 0..1."""
     clipped = opacity.clamp(1e-4, 1 - 1e-4)
-    return torch.nn.functional.binary_cross_entropy(clipped, inside.float())
+    return torch.nn.functional.binary_cross_entropy(clipped, matte)
 
 
 def sparsity_loss(sigma: Tensor, delta: Tensor, inside: Tensor) -> Tensor:

@@ -20,6 +20,7 @@ class Photos:
     Attributes:
         images: (V, H, W, 3) uint8 RGB.
         masks: (V, H, W) bool, True on the object.
+        mattes: (V, H, W) uint8, the share of each pixel that is object, in 255ths.
         intrinsics: (V, 3, 3) float32, pixel centres at +0.5.
         rotation: (V, 3, 3) float32, nerf_from_cam rotations.
         center: (V, 3) float32 camera centres.
@@ -29,6 +30,7 @@ class Photos:
 
     images: Tensor
     masks: Tensor
+    mattes: Tensor
     intrinsics: Tensor
     rotation: Tensor
     center: Tensor
@@ -49,9 +51,9 @@ class Pool:
     """Pixels that training draws from, view after view: `pixel` holds row * W + column, `start` (V + 1,) the bounds.
 
     Attributes:
-        inside: pixels of the eroded masks.
+        inside: pixels of the object.
         inside_start: bounds of each view in `inside`.
-        outside: pixels around the dilated masks.
+        outside: pixels beside the object.
         outside_start: bounds of each view in `outside`.
         edge: (V, H, W) float32 in 0..1, 1 at mask edges and at jumps of the prior depth.
     """
@@ -70,7 +72,8 @@ class Batch:
     Attributes:
         view: (R,) int64 index of the photo.
         uv: (R, 2) float32 pixel coordinates (centre of the pixel).
-        inside: (R,) bool, drawn from the eroded mask; the others are outside the dilated one.
+        inside: (R,) bool, drawn from the object's pixels; the others lie beside it.
+        matte: (R,) float32 in 0..1, the share of the pixel that is object.
         color: (R, 3) float32 in 0..1.
         depth: (R,) float32 prior along z, 0 without one.
         confidence: (R,) float32.
@@ -80,6 +83,7 @@ class Batch:
     view: Tensor
     uv: Tensor
     inside: Tensor
+    matte: Tensor
     color: Tensor
     depth: Tensor
     confidence: Tensor
@@ -102,14 +106,15 @@ def pixel_pool(photos: Photos, band_px: int, ring_px: int, edge_px: int) -> Pool
 
     Args:
         photos: the training photos.
-        band_px: half-width of the band that no loss touches.
+        band_px: half-width of the band that no loss touches; 0 draws from every pixel with some of the object in it.
         ring_px: how far beyond the band outside pixels are drawn.
         edge_px: half-width of the zone around mask edges and depth jumps that counts as edge.
     """
-    inner = dilate(photos.masks, -band_px)
-    few = inner.flatten(1).sum(1) < 0.2 * photos.masks.flatten(1).sum(1)
-    inner[few] = photos.masks[few]
-    outer = dilate(photos.masks, band_px)
+    whole = photos.masks if band_px else photos.mattes > 0
+    inner = dilate(whole, -band_px)
+    few = inner.flatten(1).sum(1) < 0.2 * whole.flatten(1).sum(1)
+    inner[few] = whole[few]
+    outer = dilate(whole, band_px)
     ring = dilate(outer, ring_px) & ~outer
     inside, inside_start = _flatten(inner)
     outside, outside_start = _flatten(ring)
@@ -171,6 +176,7 @@ def draw_batch(photos: Photos, pool: Pool, seed: int, step: int, images: int, ra
         view,
         torch.stack([across + 0.5, down + 0.5], dim=1).float(),
         torch.from_numpy(inside.reshape(-1)),
+        photos.mattes[view, down, across].float() / 255.0,
         photos.images[view, down, across].float() / 255.0,
         photos.depths[view, down, across],
         photos.confidence[view, down, across],

@@ -110,6 +110,7 @@ def train(
     threads: int,
     checkpoint: Path | None,
     report: Callable[[str], None],
+    band_px: int,
 ) -> dict[str, float]:
     """Train `model` in place on `photos`.
 
@@ -123,6 +124,7 @@ def train(
         threads: CPU threads.
         checkpoint: file to resume from and save to (every 30 s, and when the process is asked to end), or None.
         report: called with progress lines.
+        band_px: half-width of the band around the masks' edges that no loss touches; 0: mattes are exact.
 
     Returns:
         final loss terms and `psnr` (means over the last tenth), `steps`, `seconds`, `rays_per_second`,
@@ -131,7 +133,7 @@ def train(
     torch.set_num_threads(threads)
     kernels.set_threads(threads)
     keep_memory()
-    pool = pixel_pool(photos, band_px=max(1, round(photos.images.shape[2] / 320)), ring_px=12, edge_px=3)
+    pool = pixel_pool(photos, band_px=band_px, ring_px=12, edge_px=3)
     pose = nn.Parameter(model.pose.clone())
     networks = [p for name, p in model.field.named_parameters() if name != "table"]
     fused = {"fused": True, "betas": (0.9, 0.99), "eps": 1e-15}
@@ -219,10 +221,11 @@ def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count,
     sigma = sigma.view(drawn.t.shape)
     rgb = field.color(features, direction[ray])
     color, opacity, moment, spread, _ = composite(sigma, rgb, drawn.t, drawn.delta)
-    inside, shown = batch.inside[ray], background[ray]
+    inside, matte, shown = batch.inside[ray], batch.matte[ray, None], background[ray]
     composed = color + (1 - opacity)[:, None] * shown
+    target = matte * batch.color[ray] + (1 - matte) * shown
     distance = moment / opacity.clamp(min=1e-3)
-    terms = {"color": losses.color_loss(composed, batch.color[ray], inside)}
+    terms = {"color": losses.color_loss(composed, target, inside)}
     if weights.depth_weight > 0 and fade > 0:
         terms["depth"] = losses.depth_loss(distance, opacity, prior_distance[ray], fade * confidence[ray], DEPTH_DELTA)
     if weights.rank_weight > 0 and fade > 0:
@@ -233,12 +236,12 @@ def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count,
             0.02 * photos.images.shape[2], 0.02,
         )  # fmt: skip
     if weights.mask_weight > 0:
-        terms["mask"] = losses.mask_loss(opacity, inside)
+        terms["mask"] = losses.mask_loss(opacity, matte[:, 0])
     if weights.sparsity_weight > 0:
         terms["sparsity"] = losses.sparsity_loss(sigma, drawn.delta, inside)
     if weights.distortion_weight > 0:
         terms["distortion"] = losses.distortion_loss(spread)
-    error = ((composed.detach() - batch.color[ray]) ** 2)[inside].mean().clamp(min=1e-10)
+    error = ((composed.detach() - target) ** 2)[inside].mean().clamp(min=1e-10)
     terms["psnr"] = -10 * torch.log10(error)
     return terms, drawn.t.numel()
 

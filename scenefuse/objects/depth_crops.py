@@ -52,7 +52,7 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
     largest = np.minimum(np.minimum(ideal, np.percentile(extent, 90, axis=0) + 8), [width, height])
     canvas = np.maximum(np.round(largest / 4) * 4, 32).astype(int)
-    images, masks, intrinsics, moves = [], [], [], []
+    images, mattes, intrinsics, moves = [], [], [], []
     for index, box in enumerate(boxes):
         shrink = min(1.0, *(canvas / extent[index]))
         size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
@@ -60,11 +60,10 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
         corner = np.round((box[:2] + box[2:]) / 2 * scale - canvas / 2).astype(int)
         move = np.column_stack([np.diag(scale), -corner])
         images.append(_window(cv2.resize(views.images[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
-        share = cv2.resize(views.masks[index].astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        masks.append(_window(share, corner, canvas) > 0.5)
+        mattes.append(_window(cv2.resize(views.mattes[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
         intrinsics.append(np.vstack([move, [0, 0, 1]]) @ views.intrinsics[index])
         moves.append(move)
-    cut = replace(views, images=np.stack(images), masks=np.stack(masks), intrinsics=np.stack(intrinsics))
+    cut = replace(views, images=np.stack(images), mattes=np.stack(mattes), intrinsics=np.stack(intrinsics))
     return Crops(cut, np.stack(moves), views.masks)
 
 

@@ -2,7 +2,7 @@
 
 import hashlib
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -37,6 +37,8 @@ class NerfSettings:
     """photos are scaled down to this width, for training and for the rendered maps"""
     occupancy_cells: int
     """cells per side of the occupancy grid, a multiple of 4 times a power of 2"""
+    mask_band_px: int
+    """half-width of the band around a mask's edge that no loss touches; 0: masks are exact, grey values included"""
     hull_tolerance: float
     """share of the photos that may deny a cell of the visual hull"""
     render_samples: int
@@ -96,7 +98,7 @@ def train_nerf(
     training = np.flatnonzero(~views.held_out)
     earlier = None if previous is None else _read_model(previous / "model.pt")
     nerf_from_object, hull = _volume(views, training, settings, earlier)
-    photos = make_photos(views, nerf_from_object, prior)
+    photos = make_photos(views, nerf_from_object, prior, exact=settings.mask_band_px == 0)
     model = new_model(field, torch.from_numpy(hull), len(training), seed, chosen)
     warm = earlier is not None and earlier["model"]["settings"] == model.state()["settings"]
     if warm and earlier is not None:
@@ -112,10 +114,10 @@ def train_nerf(
     )
     result = train(
         model, photos.select(training), schedule, losses, warm=warm, seed=seed, threads=threads(),
-        checkpoint=checkpoint, report=lambda line: print(line, flush=True),
+        checkpoint=checkpoint, report=lambda line: print(line, flush=True), band_px=settings.mask_band_px,
     )  # fmt: skip
     poses, nerf_from_object, drift = _final_poses(views, training, nerf_from_object, model)
-    photos = make_photos(_with_poses(views, poses), nerf_from_object, None)
+    photos = make_photos(replace(views, object_from_cam=poses), nerf_from_object, None, exact=True)
     rendered = _render_all(model, photos, settings.render_samples)
     depths = np.stack([_gated_depth(r) for r in rendered]) / nerf_from_object.scale
     if not (depths > 0).any():
@@ -165,8 +167,8 @@ def train_nerf(
 _TERMS = ("color", "depth", "rank", "mask", "sparsity", "distortion")
 
 
-def make_photos(views: Views, nerf_from_object: Sim3, prior: Path | None) -> Photos:
-    """All photos in the unit cube's frame, with the depth prior of a stage folder where one is given."""
+def make_photos(views: Views, nerf_from_object: Sim3, prior: Path | None, exact: bool) -> Photos:
+    """All photos in the unit cube's frame, with the depth prior of a stage folder; grey mattes only where `exact`."""
     rotation = np.stack([nerf_from_object.rotation @ pose[:3, :3] for pose in views.object_from_cam])
     depths = np.zeros(views.masks.shape, dtype=np.float32)
     confidence = np.zeros(views.masks.shape, dtype=np.float32)
@@ -182,6 +184,7 @@ def make_photos(views: Views, nerf_from_object: Sim3, prior: Path | None) -> Pho
     return Photos(
         torch.from_numpy(views.images),
         torch.from_numpy(views.masks),
+        torch.from_numpy(views.mattes if exact else views.masks.astype(np.uint8) * 255),
         torch.from_numpy(views.intrinsics.astype(np.float32)),
         torch.from_numpy(rotation.astype(np.float32)),
         torch.from_numpy(nerf_from_object.apply(views.object_from_cam[:, :3, 3]).astype(np.float32)),
@@ -267,12 +270,6 @@ def _final_poses(
     return poses, nerf_from_object @ gauge, drift
 
 
-def _with_poses(views: Views, poses: NDArray[np.float64]) -> Views:
-    return Views(
-        views.names, views.images, views.masks, views.intrinsics, poses, views.held_out, views.sparse, views.tracks
-    )
-
-
 def _render_all(model: Model, photos: Photos, samples: int) -> list[Rendered]:
     where = dilate(photos.masks, 4)
     field, grid = model.field, model.occupancy
@@ -303,10 +300,10 @@ def _confidence(
     depths: NDArray[np.float32], rendered: list[Rendered], views: Views, poses: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float32]:
     """Opacity times the share of the views that should see a point and agree (at least two are asked for)."""
-    confidence = np.zeros_like(depths)
+    confidence, masks = np.zeros_like(depths), views.masks
     for index in range(len(depths)):
         points, rows, columns = _points(depths[index], views.intrinsics[index], poses[index])
-        said = compare(points, index, depths, views.masks, views.intrinsics, poses, tolerance)
+        said = compare(points, index, depths, masks, views.intrinsics, poses, tolerance)
         share = said.agree / np.maximum(said.agree + said.through, 2)
         confidence[index, rows, columns] = share * rendered[index].opacity.numpy()[rows, columns].clip(0, 1)
     return confidence

@@ -18,7 +18,7 @@ class Views:
     Attributes:
         names: V file names.
         images: (V, H, W, 3) uint8 RGB.
-        masks: (V, H, W) bool, True on the object.
+        mattes: (V, H, W) uint8, the share of each pixel that is object, in 255ths.
         intrinsics: (V, 3, 3) float64, pixels at this size, pixel centres at +0.5.
         object_from_cam: (V, 4, 4) float64 rigid camera poses.
         held_out: (V,) bool, True for photos that no training stage sees; they measure quality.
@@ -28,12 +28,17 @@ class Views:
 
     names: list[str]
     images: NDArray[np.uint8]
-    masks: NDArray[np.bool_]
+    mattes: NDArray[np.uint8]
     intrinsics: NDArray[np.float64]
     object_from_cam: NDArray[np.float64]
     held_out: NDArray[np.bool_]
     sparse: NDArray[np.float64]
     tracks: list[NDArray[np.int64]]
+
+    @property
+    def masks(self) -> NDArray[np.bool_]:
+        """(V, H, W), True where a pixel is mostly object."""
+        return self.mattes > 127
 
 
 def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -> Views:
@@ -41,7 +46,7 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
 
     Args:
         cameras: workspace with images/ and sparse/, PINHOLE cameras.
-        masks: folder of {name}.png, non-zero on the object.
+        masks: folder of {name}.png, above 127 on the object.
         width_px: target width; photos are never enlarged.
         hold_out_every: every n-th photo (in name order) is held out; 0 holds out none.
 
@@ -67,7 +72,7 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
         if picture is None or matte is None or matte.shape != picture.shape[:2]:
             raise StageError(f"{image.name}: photo and mask cannot be read or differ in size; rerun the masks stage")
         pictures.append(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB))
-        mattes.append(cv2.resize(matte, size, interpolation=cv2.INTER_AREA) > 127)
+        mattes.append(cv2.resize(matte, size, interpolation=cv2.INTER_AREA))
         shrink = np.diag([size[0] / camera.width, size[1] / camera.height, 1.0])
         intrinsics.append(shrink @ camera.calibration_matrix())
         pose = np.eye(4)

@@ -106,7 +106,16 @@ def training_seconds(steps: int, threads: int) -> float:
         model = new_model(build(FieldSettings, settings), torch.from_numpy(hull), len(photos), 0, "cpu")
         schedule = build(Schedule, fitted)
         result = train(
-            model, photos, schedule, weights, warm=False, seed=0, threads=threads, checkpoint=None, report=print_nothing
+            model,
+            photos,
+            schedule,
+            weights,
+            warm=False,
+            seed=0,
+            threads=threads,
+            checkpoint=None,
+            report=print_nothing,
+            band_px=settings["mask_band_px"],
         )
         seconds = result["seconds"] / result["steps"]
     return seconds

@@ -73,7 +73,9 @@ def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int
     held[count // 2 : count // 2 + held_out] = True
     names = [f"{i:03d}.jpg" for i in range(count)]
     k = np.repeat(intrinsics[None], count, 0)
-    return Views(names, np.stack(images), np.stack(masks), k, np.stack(poses), held, sparse, tracks), np.stack(depths)
+    mattes = np.stack(masks).astype(np.uint8) * 255
+    views = Views(names, np.stack(images), mattes, k, np.stack(poses), held, sparse, tracks)
+    return views, np.stack(depths)
 
 
 def _settings(**changes: float) -> stage.DepthSettings:

@@ -36,7 +36,7 @@ def test_rank_punishes_the_wrong_order_only():
 
 
 def test_mask_is_binary_cross_entropy():
-    value = losses.mask_loss(torch.tensor([0.9, 0.2]), torch.tensor([True, False]))
+    value = losses.mask_loss(torch.tensor([0.9, 0.2]), torch.tensor([1.0, 0.0]))
     assert float(value) == pytest.approx(-(math.log(0.9) + math.log(0.8)) / 2, rel=1e-5)
 
 

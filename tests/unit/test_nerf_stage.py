@@ -13,7 +13,9 @@ from scenefuse.objects.cloud import CloudSettings, object_cloud
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
-SETTINGS = NerfSettings(width_px=48, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03)
+SETTINGS = NerfSettings(
+    width_px=48, mask_band_px=1, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03
+)
 SCHEDULE = Schedule(2, 120 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 0.9, 1.0, 1e-5)
 
 

@@ -35,7 +35,16 @@ def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None
     model = new_model(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
     schedule = _schedule(steps, pose)
     result = train(
-        model, photos, schedule, WEIGHTS, warm=False, seed=seed, threads=1, checkpoint=checkpoint, report=report
+        model,
+        photos,
+        schedule,
+        WEIGHTS,
+        warm=False,
+        seed=seed,
+        threads=1,
+        checkpoint=checkpoint,
+        report=report,
+        band_px=1,
     )
     return model, photos, cube, result
 
@@ -69,6 +78,21 @@ def test_batches_repeat_and_keep_off_the_band(sphere):
     inner, outer = dilate(photos.masks, -2), dilate(photos.masks, 2)
     assert torch.equal(inner[batch.view, row, column], batch.inside)
     assert torch.equal(outer[batch.view, row, column], batch.inside)
+
+
+def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
+    cube, _ = sphere_volume(sphere)
+    photos = photos_of(sphere, cube)
+    rim = dilate(photos.masks, 1) & ~photos.masks
+    photos.mattes[rim] = 100
+    batch = draw_batch(photos, pixel_pool(photos, band_px=0, ring_px=6, edge_px=2), 5, 9, 8, 256, 0.25)
+    column, row = batch.uv.long().unbind(1)
+    grey = rim[batch.view, row, column]
+    assert grey.any() and batch.inside[grey].all()
+    assert torch.allclose(batch.matte[grey], torch.tensor(100 / 255))
+    whole = photos.masks[batch.view, row, column]
+    assert torch.equal(batch.inside, grey | whole) and (batch.matte[whole] == 1).all()
+    assert (batch.matte[~batch.inside] == 0).all()
 
 
 def test_training_finds_the_sphere(sphere):

@@ -17,7 +17,9 @@ def _views():
     empty = [np.zeros(0, np.int64)] * len(images)
     names = [f"{i}.png" for i in range(len(images))]
     held_out = np.zeros(len(images), bool)
-    return Views(names, images, masks, k, poses, held_out, np.zeros((0, 3)), empty), depths.astype(np.float32)
+    mattes = masks.astype(np.uint8) * 255
+    views = Views(names, images, mattes, k, poses, held_out, np.zeros((0, 3)), empty)
+    return views, depths.astype(np.float32)
 
 
 def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
