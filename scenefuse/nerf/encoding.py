@@ -18,7 +18,7 @@ class HashGrid:
     Attributes:
         resolution: (L,) float32, cells per side of the unit cube.
         stride: (L,) uint32, vertices per side of a level stored densely, 0 for a hashed level.
-        offset: (L,) int64, first row of the level in the table.
+        offset: (L,) uint32, first row of the level in the table.
         mask: (L,) uint32, rows of a hashed level minus one.
         rows: T, rows of the whole table.
     """
@@ -42,7 +42,7 @@ def hash_grid(levels: int, log2_table: int, coarsest: int, finest: int) -> HashG
     return HashGrid(
         np.array(cells, dtype=np.float32),
         np.array([size + 1 if fits else 0 for size, fits in zip(cells, dense)], dtype=np.uint32),
-        np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.int64),
+        np.concatenate([[0], np.cumsum(rows)[:-1]]).astype(np.uint32),
         np.full(levels, 2**log2_table - 1, dtype=np.uint32),
         int(sum(rows)),
     )
@@ -53,7 +53,7 @@ def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Ten
     device = x.device
     resolution = torch.from_numpy(grid.resolution).to(device)
     stride = torch.from_numpy(grid.stride.astype(np.int64)).to(device)[None, :, None]
-    offset = torch.from_numpy(grid.offset).to(device)[None, :, None]
+    offset = torch.from_numpy(grid.offset.astype(np.int64)).to(device)[None, :, None]
     mask = torch.from_numpy(grid.mask.astype(np.int64)).to(device)[None, :, None]
     scaled = x[:, None, :] * resolution[None, :, None]
     low = scaled.detach().floor()
@@ -75,7 +75,8 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
                 fine_from: int) -> Tensor:  # fmt: skip
         out = torch.empty(x.shape[0], 2 * len(grid.resolution))
-        kernels.encode(x.detach().numpy(), table.detach().numpy(), *_levels(grid), level_weight.numpy(), out.numpy())
+        positions, features = x.detach().numpy(), table.detach().numpy()
+        kernels.encode(positions, features, *_levels(grid), level_weight.numpy(), kernels.threads(), out.numpy())
         ctx.save_for_backward(x, table, level_weight)
         ctx.grid, ctx.boost, ctx.fine_from = grid, boost, fine_from
         return out
@@ -89,13 +90,20 @@ class _Encode(torch.autograd.Function):
         if ctx.needs_input_grad[0]:
             g_x = torch.empty_like(x)
             kernels.encode_backward_x(
-                positions, gradient, table.detach().numpy(), *_levels(ctx.grid), weight, g_x.numpy()
+                positions, gradient, table.detach().numpy(), *_levels(ctx.grid), weight, kernels.threads(), g_x.numpy()
             )
         if ctx.needs_input_grad[1]:
             boost = np.ones(len(positions), np.float32) if ctx.boost is None else ctx.boost.numpy()
-            g_table = torch.zeros_like(table)
+            g_table = torch.from_numpy(np.zeros(table.shape, np.float32))
             kernels.encode_backward(
-                positions, gradient, *_levels(ctx.grid), weight, boost, ctx.fine_from, g_table.numpy()
+                positions,
+                gradient,
+                *_levels(ctx.grid),
+                weight,
+                boost,
+                ctx.fine_from,
+                kernels.threads(),
+                g_table.numpy(),
             )
         return g_x, g_table, None, None, None, None
 

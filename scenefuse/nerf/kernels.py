@@ -22,11 +22,11 @@ else:
 
 AVAILABLE = nb is not None
 PRIMES = (1, 2654435761, 805459861)
-BLOCK = 2048
+ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 THIRD = np.float32(1.0 / 3.0)
-PY, PZ = np.uint32(PRIMES[1]), np.uint32(PRIMES[2])
+PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
 
 
 def _jit(function):  # type: ignore[no-untyped-def]
@@ -35,115 +35,170 @@ def _jit(function):  # type: ignore[no-untyped-def]
     return nb.njit(parallel=True, fastmath=True, cache=True)(function)
 
 
+def _inline(function):  # type: ignore[no-untyped-def]
+    return function if nb is None else nb.njit(fastmath=True, inline="always")(function)
+
+
 def set_threads(count: int) -> None:
     """Use `count` threads for every kernel."""
     if nb is not None:
         nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
 
 
+def threads() -> int:
+    """Threads that the kernels use."""
+    return nb.get_num_threads()
+
+
+@_inline
+def _cell(position, size):
+    """Lower vertex of the cell and place in it, along one axis."""
+    scaled = position * size
+    low = np.int32(scaled)
+    return np.uint32(low), scaled - np.float32(low)
+
+
+@_inline
+def _rows(ix, iy, iz, stride, start, mask):
+    """Table rows of a cell's eight vertices, x fastest: dense with a stride, hashed without (equation 4)."""
+    jx = ix + ONE_ROW
+    if stride > 0:
+        y0, z0 = iy * stride, start + iz * stride * stride
+        y1, z1 = y0 + stride, z0 + stride * stride
+        a, b, c, d = y0 + z0, y1 + z0, y0 + z1, y1 + z1
+        return ix + a, jx + a, ix + b, jx + b, ix + c, jx + c, ix + d, jx + d
+    y0, z0 = iy * PY, iz * PZ
+    y1, z1 = y0 + PY, z0 + PZ
+    a, b, c, d = y0 ^ z0, y1 ^ z0, y0 ^ z1, y1 ^ z1
+    return (
+        start + ((ix ^ a) & mask), start + ((jx ^ a) & mask), start + ((ix ^ b) & mask), start + ((jx ^ b) & mask),
+        start + ((ix ^ c) & mask), start + ((jx ^ c) & mask), start + ((ix ^ d) & mask), start + ((jx ^ d) & mask),
+    )  # fmt: skip
+
+
 @_jit
-def encode(x, table, resolution, stride, offset, mask, level_weight, out):
+def encode(x, table, resolution, stride, offset, mask, level_weight, threads, out):
     """Trilinear hash encoding (Mueller et al. 2022, section 3).
+
+    A thread goes through all of its samples level by level, so that one level's rows stay in its cache.
 
     x (N, 3) in 0..1; table (T, 2); per level: resolution, stride (0: hashed), offset into the table, index mask,
     weight; out (N, 2 L).
     """
     count = x.shape[0]
-    blocks = (count + BLOCK - 1) // BLOCK
-    for block in prange(blocks):
-        first, last = block * BLOCK, min((block + 1) * BLOCK, count)
+    for thread in prange(threads):
+        first, last = count * thread // threads, count * (thread + 1) // threads
         for level in range(resolution.shape[0]):
             weight = level_weight[level]
-            if weight == np.float32(0.0):
+            if weight == ZERO:
                 for n in range(first, last):
-                    out[n, 2 * level] = np.float32(0.0)
-                    out[n, 2 * level + 1] = np.float32(0.0)
+                    out[n, 2 * level] = ZERO
+                    out[n, 2 * level + 1] = ZERO
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
             for n in range(first, last):
-                px, py, pz = x[n, 0] * size, x[n, 1] * size, x[n, 2] * size
-                ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-                fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-                a, b = np.float32(0.0), np.float32(0.0)
-                for k in range(8):
-                    dx, dy, dz = np.uint32(k & 1), np.uint32((k >> 1) & 1), np.uint32(k >> 2)
-                    if step > 0:
-                        index = (ix + dx) + step * ((iy + dy) + step * (iz + dz))
-                    else:
-                        index = ((ix + dx) ^ ((iy + dy) * PY) ^ ((iz + dz) * PZ)) & bits
-                    row = start + np.int64(index)
-                    w = (fx if dx else ONE - fx) * (fy if dy else ONE - fy) * (fz if dz else ONE - fz)
-                    a += w * table[row, 0]
-                    b += w * table[row, 1]
-                out[n, 2 * level] = weight * a
-                out[n, 2 * level + 1] = weight * b
+                ix, fx = _cell(x[n, 0], size)
+                iy, fy = _cell(x[n, 1], size)
+                iz, fz = _cell(x[n, 2], size)
+                r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
+                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
+                a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+                out[n, 2 * level] = weight * (
+                    a * (gx * table[r0, 0] + fx * table[r1, 0]) + b * (gx * table[r2, 0] + fx * table[r3, 0])
+                    + c * (gx * table[r4, 0] + fx * table[r5, 0]) + d * (gx * table[r6, 0] + fx * table[r7, 0])
+                )  # fmt: skip
+                out[n, 2 * level + 1] = weight * (
+                    a * (gx * table[r0, 1] + fx * table[r1, 1]) + b * (gx * table[r2, 1] + fx * table[r3, 1])
+                    + c * (gx * table[r4, 1] + fx * table[r5, 1]) + d * (gx * table[r6, 1] + fx * table[r7, 1])
+                )  # fmt: skip
+
+
+@_inline
+def _add(out, row, weight, a, b):
+    out[row, 0] += weight * a
+    out[row, 1] += weight * b
 
 
 @_jit
-def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):
+def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, threads, out):
     """Gradient of `encode` with respect to the table, added to out (T, 2): one thread owns a level.
 
     gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
     """
-    for level in prange(resolution.shape[0]):
-        weight = level_weight[level]
-        if weight > np.float32(0.0):
+    for thread in prange(threads):
+        # Fine levels cost more than coarse ones: every thread gets some of both.
+        for level in range(thread, resolution.shape[0], threads):
+            weight = level_weight[level]
+            if weight == ZERO:
+                continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
             for n in range(x.shape[0]):
                 scale = weight * boost[n] if level >= fine_from else weight
                 ga, gb = scale * gradient[n, 2 * level], scale * gradient[n, 2 * level + 1]
-                if ga == np.float32(0.0) and gb == np.float32(0.0):
+                if ga == ZERO and gb == ZERO:
                     continue
-                px, py, pz = x[n, 0] * size, x[n, 1] * size, x[n, 2] * size
-                ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-                fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-                for k in range(8):
-                    dx, dy, dz = np.uint32(k & 1), np.uint32((k >> 1) & 1), np.uint32(k >> 2)
-                    if step > 0:
-                        index = (ix + dx) + step * ((iy + dy) + step * (iz + dz))
-                    else:
-                        index = ((ix + dx) ^ ((iy + dy) * PY) ^ ((iz + dz) * PZ)) & bits
-                    row = start + np.int64(index)
-                    w = (fx if dx else ONE - fx) * (fy if dy else ONE - fy) * (fz if dz else ONE - fz)
-                    out[row, 0] += w * ga
-                    out[row, 1] += w * gb
+                ix, fx = _cell(x[n, 0], size)
+                iy, fy = _cell(x[n, 1], size)
+                iz, fz = _cell(x[n, 2], size)
+                r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
+                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
+                a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
+                _add(out, r0, gx * a, ga, gb)
+                _add(out, r1, fx * a, ga, gb)
+                _add(out, r2, gx * b, ga, gb)
+                _add(out, r3, fx * b, ga, gb)
+                _add(out, r4, gx * c, ga, gb)
+                _add(out, r5, fx * c, ga, gb)
+                _add(out, r6, gx * d, ga, gb)
+                _add(out, r7, fx * d, ga, gb)
 
 
 @_jit
-def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, out):
+def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, threads, out):
     """Gradient of `encode` with respect to the positions, written to out (N, 3)."""
-    for n in prange(x.shape[0]):
-        sx, sy, sz = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+    count = x.shape[0]
+    for thread in prange(threads):
+        first, last = count * thread // threads, count * (thread + 1) // threads
+        out[first:last] = ZERO
         for level in range(resolution.shape[0]):
             weight = level_weight[level]
-            if weight == np.float32(0.0):
+            if weight == ZERO:
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
-            ga, gb = weight * gradient[n, 2 * level], weight * gradient[n, 2 * level + 1]
-            px, py, pz = x[n, 0] * size, x[n, 1] * size, x[n, 2] * size
-            ix, iy, iz = np.uint32(px), np.uint32(py), np.uint32(pz)
-            fx, fy, fz = px - np.float32(ix), py - np.float32(iy), pz - np.float32(iz)
-            for k in range(8):
-                dx, dy, dz = np.uint32(k & 1), np.uint32((k >> 1) & 1), np.uint32(k >> 2)
-                if step > 0:
-                    index = (ix + dx) + step * ((iy + dy) + step * (iz + dz))
-                else:
-                    index = ((ix + dx) ^ ((iy + dy) * PY) ^ ((iz + dz) * PZ)) & bits
-                row = start + np.int64(index)
-                value = (ga * table[row, 0] + gb * table[row, 1]) * size
-                wx, wy, wz = fx if dx else ONE - fx, fy if dy else ONE - fy, fz if dz else ONE - fz
-                sx += value * wy * wz * (ONE if dx else -ONE)
-                sy += value * wx * wz * (ONE if dy else -ONE)
-                sz += value * wx * wy * (ONE if dz else -ONE)
-        out[n, 0], out[n, 1], out[n, 2] = sx, sy, sz
+            for n in range(first, last):
+                p, q = weight * size * gradient[n, 2 * level], weight * size * gradient[n, 2 * level + 1]
+                ix, fx = _cell(x[n, 0], size)
+                iy, fy = _cell(x[n, 1], size)
+                iz, fz = _cell(x[n, 2], size)
+                r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
+                v0, v1 = p * table[r0, 0] + q * table[r0, 1], p * table[r1, 0] + q * table[r1, 1]
+                v2, v3 = p * table[r2, 0] + q * table[r2, 1], p * table[r3, 0] + q * table[r3, 1]
+                v4, v5 = p * table[r4, 0] + q * table[r4, 1], p * table[r5, 0] + q * table[r5, 1]
+                v6, v7 = p * table[r6, 0] + q * table[r6, 1], p * table[r7, 0] + q * table[r7, 1]
+                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
+                out[n, 0] += gz * (gy * (v1 - v0) + fy * (v3 - v2)) + fz * (gy * (v5 - v4) + fy * (v7 - v6))
+                out[n, 1] += gz * (gx * (v2 - v0) + fx * (v3 - v1)) + fz * (gx * (v6 - v4) + fx * (v7 - v5))
+                out[n, 2] += gy * (gx * (v4 - v0) + fx * (v5 - v1)) + fy * (gx * (v6 - v2) + fx * (v7 - v3))
+
+
+@_jit
+def adam(table, gradient, first, second, rate, beta_first, beta_second, epsilon):
+    """One step of Adam on the rows (T, 2) whose gradient is not zero; bias correction is part of the rate."""
+    for row in prange(table.shape[0]):
+        if gradient[row, 0] == ZERO and gradient[row, 1] == ZERO:
+            continue
+        for k in range(2):
+            g = gradient[row, k]
+            first[row, k] = beta_first * first[row, k] + (ONE - beta_first) * g
+            second[row, k] = beta_second * second[row, k] + (ONE - beta_second) * g * g
+            table[row, k] -= rate * first[row, k] / (np.sqrt(second[row, k]) + epsilon)
 
 
 @_jit
 def march(
     origin,
     direction,
-    occupied,
-    density,
+    alpha,
     step,
     jitter,
     uniform_share,
@@ -160,10 +215,10 @@ def march(
     probability mass mixes a uniform part, the compositing weights of the grid's cached density, and the intervals
     near a depth prior; S equal shares of the mass give one sample each. Lengths are lengths of occupied ray.
 
-    origin, direction (R, 3); occupied, density (G, G, G); jitter (R, S) in 0..1; prior, prior_width,
-    prior_share (R,); out_t, out_delta (R, S), out_hit (R,) uint8.
+    origin, direction (R, 3); alpha (G, G, G): opacity of one interval, negative in empty cells; jitter (R, S) in
+    0..1; prior, prior_width, prior_share (R,); out_t, out_delta (R, S), out_hit (R,) uint8.
     """
-    grid = occupied.shape[0]
+    grid = alpha.shape[0]
     scale = np.float32(grid)
     samples = jitter.shape[1]
     blocks = (origin.shape[0] + 63) // 64
@@ -195,13 +250,13 @@ def march(
                 ix = min(max(int((origin[r, 0] + t * direction[r, 0]) * scale), 0), grid - 1)
                 iy = min(max(int((origin[r, 1] + t * direction[r, 1]) * scale), 0), grid - 1)
                 iz = min(max(int((origin[r, 2] + t * direction[r, 2]) * scale), 0), grid - 1)
-                if occupied[ix, iy, iz] == 0:
+                opacity = alpha[ix, iy, iz]
+                if opacity < ZERO:
                     continue
-                alpha = ONE - np.exp(-density[ix, iy, iz] * step)
                 start[used] = t - HALF * step
-                raw[used] = transmittance * alpha
+                raw[used] = transmittance * opacity
                 total += raw[used]
-                transmittance *= ONE - alpha
+                transmittance *= ONE - opacity
                 close = abs(t - prior[r]) <= prior_width[r]
                 near[used] = 1 if close else 0
                 near_count += 1 if close else 0

@@ -1,6 +1,6 @@
 """Where the object can be: the visual hull of its masks, and a grid of cached densities that prunes it."""
 
-from dataclasses import dataclass
+import dataclasses
 
 import numpy as np
 import torch
@@ -11,8 +11,10 @@ from scenefuse.nerf.field import Field
 from scenefuse.nerf.rays import dilate
 from scenefuse.transforms import Sim3
 
+STEP_IN_CELLS = 0.75
 
-@dataclass
+
+@dataclasses.dataclass
 class Occupancy:
     """A grid over the unit cube; it changes while a field is trained.
 
@@ -20,11 +22,23 @@ class Occupancy:
         hull: (G, G, G) bool, cells inside the visual hull; nothing is ever sampled elsewhere.
         density: (G, G, G) float32, cached density.
         occupied: (G, G, G) bool, cells that rays are sampled in.
+        alpha: (G, G, G) float32, opacity of one marching step, -1 in cells that are not occupied.
     """
 
     hull: Tensor
     density: Tensor
     occupied: Tensor
+    alpha: Tensor = dataclasses.field(init=False)
+
+    def __post_init__(self) -> None:
+        """Opacities from densities."""
+        opacity = 1 - torch.exp(-self.density * self.step)
+        self.alpha = torch.where(self.occupied, opacity, torch.full_like(opacity, -1.0))
+
+    @property
+    def step(self) -> float:
+        """Length of an interval that rays are cut into."""
+        return STEP_IN_CELLS / self.size
 
     @property
     def size(self) -> int:
@@ -34,7 +48,7 @@ class Occupancy:
     @classmethod
     def from_hull(cls, hull: Tensor) -> "Occupancy":
         """All of the hull occupied, nothing known about densities."""
-        return cls(hull, torch.zeros(hull.shape), hull.clone())
+        return cls(hull, torch.zeros(hull.shape, device=hull.device), hull.clone())
 
 
 def visual_hull(
@@ -100,18 +114,18 @@ def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -
 
 
 @torch.no_grad()
-def update(occupancy: Occupancy, field: Field, seed: int, step: int, cells: int, decay: float, prune: bool,
-           threshold: float) -> None:  # fmt: skip
-    """Refresh the cached density of `cells` random hull cells, and drop nearly empty ones when `prune`.
+def updated(occupancy: Occupancy, field: Field, seed: int, step: int, cells: int, decay: float, prune: bool,
+            threshold: float) -> Occupancy:  # fmt: skip
+    """The grid with the cached density of `cells` random hull cells refreshed, and nearly empty ones dropped.
 
     Args:
-        occupancy: changed in place.
+        occupancy: the grid so far.
         field: the field being trained.
         seed: seed of the run.
         step: training step; seed and step determine the cells.
         cells: how many to evaluate.
         decay: factor on the old value before the maximum with the new one is taken.
-        prune: False keeps all of the hull occupied.
+        prune: False drops no cell.
         threshold: opacity over one cell below which it is empty.
     """
     rng = np.random.default_rng((seed, step, 1))
@@ -120,11 +134,17 @@ def update(occupancy: Occupancy, field: Field, seed: int, step: int, cells: int,
     size = occupancy.size
     index = torch.stack([chosen // (size * size), chosen // size % size, chosen % size], dim=1)
     jitter = torch.from_numpy(rng.random((len(chosen), 3), dtype=np.float32)).to(chosen.device)
-    density = field.density((index + jitter) / size)
-    flat = occupancy.density.view(-1)
-    flat[chosen] = torch.maximum(flat[chosen] * decay, density)
-    if prune:
-        opacity = 1 - torch.exp(-occupancy.density / size)
-        # A neighbour of an occupied cell stays: the surface may still move by one cell.
-        near = torch.nn.functional.max_pool3d((opacity > threshold).float()[None, None], 3, 1, 1)[0, 0] > 0
-        occupancy.occupied = occupancy.hull & near
+    fresh = field.density((index + jitter) / size)
+    density = occupancy.density.clone()
+    flat = density.view(-1)
+    flat[chosen] = torch.maximum(flat[chosen] * decay, fresh)
+    if not prune:
+        return Occupancy(occupancy.hull, density, occupancy.occupied)
+    near = 1 - torch.exp(-density / size) > threshold
+    # A neighbour of an occupied cell stays: the surface may still move by one cell.
+    for axis in range(3):
+        grown, last = near.clone(), size - 1
+        grown.narrow(axis, 0, last).logical_or_(near.narrow(axis, 1, last))
+        grown.narrow(axis, 1, last).logical_or_(near.narrow(axis, 0, last))
+        near = grown
+    return Occupancy(occupancy.hull, density, occupancy.hull & near)

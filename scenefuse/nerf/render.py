@@ -13,8 +13,6 @@ from scenefuse.nerf.field import Field
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.rays import camera_rays
 
-STEP_IN_CELLS = 0.75
-
 
 @dataclass(frozen=True)
 class Samples:
@@ -53,25 +51,25 @@ def march(
         uniform: share of the samples spread evenly over the occupied ray.
         prior: expected surface; a share of 0 where there is none.
     """
-    step = STEP_IN_CELLS / occupancy.size
     if not (kernels.AVAILABLE and origin.device.type == "cpu"):
-        t, delta, hit = march_reference(origin, direction, occupancy, step, jitter, uniform, prior)
+        t, delta, hit = march_reference(origin, direction, occupancy, jitter, uniform, prior)
     else:
         t, delta = torch.zeros(jitter.shape), torch.zeros(jitter.shape)
         hit = torch.zeros(len(jitter), dtype=torch.uint8)
         kernels.march(
-            origin.numpy(), direction.numpy(), occupancy.occupied.view(torch.uint8).numpy(), occupancy.density.numpy(),
-            _f32(step), jitter.numpy(), _f32(uniform), prior.distance.numpy(), prior.width.numpy(),
-            prior.share.numpy(), t.numpy(), delta.numpy(), hit.numpy(),
+            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), _f32(occupancy.step), jitter.numpy(),
+            _f32(uniform), prior.distance.numpy(), prior.width.numpy(), prior.share.numpy(), t.numpy(), delta.numpy(),
+            hit.numpy(),
         )  # fmt: skip
     ray = torch.nonzero(hit)[:, 0]
     return Samples(ray, t[ray], delta[ray])
 
 
 def march_reference(
-    origin: Tensor, direction: Tensor, occupancy: Occupancy, step: float, jitter: Tensor, uniform: float, prior: Prior
+    origin: Tensor, direction: Tensor, occupancy: Occupancy, jitter: Tensor, uniform: float, prior: Prior
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`kernels.march` in plain PyTorch: t (R, S), delta (R, S), hit (R,)."""
+    step = occupancy.step
     safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
     a, b = -origin / safe, (1 - origin) / safe
     low = torch.minimum(a, b).amax(1).clamp(min=0)
@@ -81,12 +79,12 @@ def march_reference(
     middle = low[:, None] + (index + 0.5) * step
     x = origin[:, None] + middle[..., None] * direction[:, None]
     cell = (x * occupancy.size).long().clamp(0, occupancy.size - 1)
-    valid = (index < torch.ceil((high - low).clamp(min=0) / step)[:, None]) & occupancy.occupied[cell.unbind(-1)]
+    opacity = occupancy.alpha[cell.unbind(-1)]
+    valid = (index < torch.ceil((high - low).clamp(min=0) / step)[:, None]) & (opacity >= 0)
     # Occupied intervals first, in their order along the ray.
     order = torch.argsort((~valid).to(torch.int8), dim=1, stable=True)
     valid, start = valid.gather(1, order), (middle - 0.5 * step).gather(1, order)
-    density = occupancy.density[cell.unbind(-1)].gather(1, order) * valid
-    alpha = 1 - torch.exp(-density * step)
+    alpha = opacity.gather(1, order) * valid
     ahead = torch.cumprod(1 - alpha, 1)
     raw = torch.cat([torch.ones_like(ahead[:, :1]), ahead[:, :-1]], 1) * alpha
     padded = torch.nn.functional.pad(raw, (1, 1))
@@ -185,7 +183,7 @@ class Rendered:
     """A view as rendered: maps (H, W), zero where the ray was not traced or met nothing.
 
     Attributes:
-        color: (H, W, 3) float32 on black.
+        color: (H, W, 3) float32 on black; all zero unless asked for.
         depth: median depth along z, nerf units.
         opacity: 0..1.
         deviation: standard deviation of the compositing weights along the ray, nerf units.
@@ -200,7 +198,7 @@ class Rendered:
 @torch.no_grad()
 def render_view(
     field: Field, occupancy: Occupancy, intrinsics: Tensor, rotation: Tensor, center: Tensor, where: Tensor,
-    samples: int, uniform: float, chunk: int = 4096,
+    samples: int, uniform: float, colored: bool, chunk: int = 4096,
 ) -> Rendered:  # fmt: skip
     """Render the pixels of one view.
 
@@ -213,6 +211,7 @@ def render_view(
         where: (H, W) bool, the pixels to trace.
         samples: samples per ray.
         uniform: share of the samples spread evenly over the occupied ray.
+        colored: False leaves the colours out, which is faster.
         chunk: rays at once.
     """
     maps = [torch.zeros(*where.shape, 3), *(torch.zeros(where.shape) for _ in range(3))]
@@ -231,7 +230,7 @@ def render_view(
             continue
         x = origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]
         sigma, features = field.geometry(x.view(-1, 3))
-        rgb = field.color(features, direction[drawn.ray])
+        rgb = field.color(features, direction[drawn.ray]) if colored else torch.zeros(*drawn.t.shape, 3, device=device)
         color, opacity, moment, _, w = composite(sigma.view(drawn.t.shape), rgb, drawn.t, drawn.delta)
         mean = moment / opacity.clamp(min=1e-6)
         variance = (w * (drawn.t - mean[:, None]) ** 2).sum(1) / opacity.clamp(min=1e-6)

@@ -18,9 +18,10 @@ import torch
 from torch import Tensor, nn
 
 from scenefuse.nerf import kernels, losses
+from scenefuse.nerf.adam import BETAS, EPSILON, TableAdam
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import Occupancy, update
+from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.rays import Batch, Photos, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import Prior, composite, march
 
@@ -136,8 +137,7 @@ def train(
     pool = pixel_pool(photos, band_px=band_px, ring_px=12, edge_px=3)
     pose = nn.Parameter(model.pose.clone())
     networks = [p for name, p in model.field.named_parameters() if name != "table"]
-    fused = {"fused": True, "betas": (0.9, 0.99), "eps": 1e-15}
-    optimizer = torch.optim.Adam([{"params": [model.field.table]}, {"params": networks}, {"params": [pose]}], **fused)  # type: ignore[arg-type]
+    optimizer = Optimizer(model.field.table, networks, pose)
     first = _resume(checkpoint, model, optimizer, pose)
     if first:
         report(f"resumed at step {first} of {schedule.steps}")
@@ -145,7 +145,6 @@ def train(
     saved = time.monotonic()
     with _between_steps() as asked:
         for step in range(first, schedule.steps):
-            _set_rates(optimizer, schedule, step)
             terms, counts = _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, step)
             meter.add(step, terms, counts)
             if checkpoint and (asked or time.monotonic() - saved > 30):
@@ -184,7 +183,8 @@ def _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, s
     if step % OCCUPANCY_EVERY == 0 and (step or warm):
         hull_cells = int(occupancy.hull.sum())
         prune = warm or progress > 0.1
-        update(occupancy, field, seed, step, min(hull_cells // 2, 65536) + 4096, 0.9, prune, 0.005)
+        occupancy = updated(occupancy, field, seed, step, min(hull_cells // 2, 65536) + 4096, 0.9, prune, 0.005)
+        model.occupancy = occupancy
     batch = draw_batch(photos, pool, seed, step, schedule.images_per_batch, schedule.rays_per_image, 0.1)
     batch = Batch(*(getattr(batch, name).to(device) for name in batch.__dataclass_fields__))
     count = round(schedule.samples_first + (schedule.samples_last - schedule.samples_first) * min(1, 2 * progress))
@@ -193,9 +193,8 @@ def _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, s
     terms, samples = _loss_terms(field, occupancy, photos, batch, schedule, weights, pose if refine else None,
                                  count, progress, rng)  # fmt: skip
     loss = sum(getattr(weights, f"{name}_weight") * value for name, value in terms.items() if name != "psnr")
-    optimizer.zero_grad(set_to_none=True)
     loss.backward()
-    optimizer.step()
+    optimizer.step(schedule, step)
     return {name: float(value.detach()) for name, value in terms.items()}, (len(batch.view), samples)
 
 
@@ -263,14 +262,35 @@ def keep_memory() -> None:
             libc.mallopt(-1, (1 << 31) - 1)
 
 
-def _set_rates(optimizer: torch.optim.Optimizer, schedule: Schedule, step: int) -> None:
-    warmup = max(1.0, schedule.warmup_epochs / schedule.epochs * schedule.steps)
-    rise = min(1.0, (step + 1) / warmup)
-    rest = max(0.0, (step - warmup) / max(1.0, schedule.steps - warmup))
-    factor = rise * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * rest)))
-    rates = (schedule.grid_learning_rate, schedule.learning_rate, schedule.pose_learning_rate)
-    for group, rate in zip(optimizer.param_groups, rates):
-        group["lr"] = rate * factor
+class Optimizer:
+    """Adam for table, networks and poses, with linear warm-up and a cosine to 2 % of the highest rates."""
+
+    def __init__(self, table: nn.Parameter, networks: list[nn.Parameter], pose: nn.Parameter) -> None:
+        self.table = TableAdam(table)
+        groups = [{"params": networks}, {"params": [pose]}]
+        self.rest = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+
+    def step(self, schedule: Schedule, step: int) -> None:
+        """Apply all gradients at the rates of this step, and clear them."""
+        warmup = max(1.0, schedule.warmup_epochs / schedule.epochs * schedule.steps)
+        rise = min(1.0, (step + 1) / warmup)
+        done = max(0.0, (step - warmup) / max(1.0, schedule.steps - warmup))
+        factor = rise * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
+        for group, rate in zip(self.rest.param_groups, (schedule.learning_rate, schedule.pose_learning_rate)):
+            group["lr"] = rate * factor
+        self.table.step(schedule.grid_learning_rate * factor)
+        self.rest.step()
+        self.table.table.grad = None
+        self.rest.zero_grad(set_to_none=True)
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"table": self.table.state(), "rest": self.rest.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Back from `state`."""
+        self.table.load(state["table"])
+        self.rest.load_state_dict(state["rest"])
 
 
 class _Meter:
@@ -312,24 +332,23 @@ class _Meter:
         }
 
 
-def _save(path: Path, model: Model, optimizer: torch.optim.Optimizer, pose: Tensor, step: int) -> None:
+def _save(path: Path, model: Model, optimizer: Optimizer, pose: Tensor, step: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    state = {"model": model.state(), "optimizer": optimizer.state_dict(), "pose": pose.detach(), "step": step}
+    state = {"model": model.state(), "optimizer": optimizer.state(), "pose": pose.detach(), "step": step}
     torch.save(state, temporary)
     os.replace(temporary, path)
 
 
-def _resume(path: Path | None, model: Model, optimizer: torch.optim.Optimizer, pose: Tensor) -> int:
+def _resume(path: Path | None, model: Model, optimizer: Optimizer, pose: Tensor) -> int:
     """Load a checkpoint into model, optimizer and pose; the step to go on with, 0 without one."""
     if path is None or not path.is_file():
         return 0
     state = torch.load(path, weights_only=True)
     model.field.load_state_dict(state["model"]["field"])
     device = model.field.table.device
-    for name in ("hull", "density", "occupied"):
-        setattr(model.occupancy, name, state["model"][name].to(device))
-    optimizer.load_state_dict(state["optimizer"])
+    model.occupancy = Occupancy(*(state["model"][name].to(device) for name in ("hull", "density", "occupied")))
+    optimizer.load(state["optimizer"])
     with torch.no_grad():
         pose.copy_(state["pose"])
     return int(state["step"])

@@ -16,7 +16,7 @@ from scenefuse.nerf import kernels
 from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import tight_cube, visual_hull
+from scenefuse.nerf.occupancy import Occupancy, tight_cube, visual_hull
 from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import Photos, cube_from_cameras, dilate
 from scenefuse.nerf.render import Rendered, render_view
@@ -103,7 +103,8 @@ def train_nerf(
     warm = earlier is not None and earlier["model"]["settings"] == model.state()["settings"]
     if warm and earlier is not None:
         model.field.load_state_dict(earlier["model"]["field"])
-        model.occupancy.density = earlier["model"]["density"].to(chosen)
+        hull_before = model.occupancy.hull
+        model.occupancy = Occupancy(hull_before, earlier["model"]["density"].to(chosen), hull_before)
         model.field.level_weight.fill_(1.0)
     key = _key(field, schedule, losses, settings, seed, hold_out_every, chosen, photos, earlier)
     checkpoint = checkpoints / key / "state.pt"
@@ -118,7 +119,8 @@ def train_nerf(
     )  # fmt: skip
     poses, nerf_from_object, drift = _final_poses(views, training, nerf_from_object, model)
     photos = make_photos(replace(views, object_from_cam=poses), nerf_from_object, None, exact=True)
-    rendered = _render_all(model, photos, settings.render_samples)
+    measured = views.held_out if views.held_out.any() else np.ones(len(views.names), bool)
+    rendered = _render_all(model, photos, settings.render_samples, measured)
     depths = np.stack([_gated_depth(r) for r in rendered]) / nerf_from_object.scale
     if not (depths > 0).any():
         raise StageError(f"the NeRF of {cameras} found no surface: no ray reached an opacity of 0.9; check the masks")
@@ -149,7 +151,7 @@ def train_nerf(
             write_depth(folder / "confidence_maps" / f"{name}.bin", confidence[index])
             normals = normals_from_depth(depths[index], views.intrinsics[index], 2, 0.03)
             write_normals(folder / "normal_maps" / f"{name}.bin", normals)
-        content |= _held_out_quality(views, rendered, folder / "renders")
+        content |= _held_out_quality(views, rendered, np.flatnonzero(measured), folder / "renders")
         saved = {"model": model.state(), "nerf_from_object": torch.from_numpy(nerf_from_object.matrix),
                  "names": views.names, "object_from_cam": torch.from_numpy(poses)}  # fmt: skip
         torch.save(saved, folder / "model.pt")
@@ -270,11 +272,11 @@ def _final_poses(
     return poses, nerf_from_object @ gauge, drift
 
 
-def _render_all(model: Model, photos: Photos, samples: int) -> list[Rendered]:
+def _render_all(model: Model, photos: Photos, samples: int, colored: NDArray[np.bool_]) -> list[Rendered]:
     where = dilate(photos.masks, 4)
     field, grid = model.field, model.occupancy
-    cameras = zip(photos.intrinsics, photos.rotation, photos.center, where)
-    return [render_view(field, grid, k, r, c, pixels, samples, 0.25) for k, r, c, pixels in cameras]
+    cameras = zip(photos.intrinsics, photos.rotation, photos.center, where, colored)
+    return [render_view(field, grid, k, r, c, pixels, samples, 0.25, show) for k, r, c, pixels, show in cameras]
 
 
 def _gated_depth(rendered: Rendered) -> NDArray[np.float32]:
@@ -309,10 +311,9 @@ def _confidence(
     return confidence
 
 
-def _held_out_quality(views: Views, rendered: list[Rendered], folder: Path) -> dict[str, Any]:
+def _held_out_quality(views: Views, rendered: list[Rendered], index: NDArray[np.int64], folder: Path) -> dict[str, Any]:
     """Quality on held-out photos (on all when none is held out), and their renders as PNG beside the photo's."""
     folder.mkdir()
-    index = np.flatnonzero(views.held_out) if views.held_out.any() else np.arange(len(views.names))
     rows = []
     for i in index:
         mask = torch.from_numpy(views.masks[i])

@@ -8,7 +8,6 @@ import torch
 from scenefuse.nerf import kernels
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import (
-    STEP_IN_CELLS,
     Prior,
     composite,
     composite_reference,
@@ -61,7 +60,7 @@ def test_uniform_marching_splits_the_occupied_length_evenly():
     grid = Occupancy(occupied, torch.zeros(8, 8, 8), occupied)
     origin, direction = torch.tensor([[-1.0, 0.51, 0.51]]), torch.tensor([[1.0, 0.0, 0.0]])
     drawn = march(origin, direction, grid, torch.full((1, 4), 0.5), 1.0, _no_prior(1))
-    step = STEP_IN_CELLS / 8
+    step = grid.step
     assert float(drawn.delta.sum()) == pytest.approx(0.5, abs=step)
     assert drawn.delta[0].tolist() == pytest.approx([float(drawn.delta.sum()) / 4] * 4, rel=1e-5)
     assert ((drawn.t > 1.25 - step) & (drawn.t < 1.75 + step)).all()
@@ -100,7 +99,7 @@ def test_marching_matches_the_reference():
     jitter = torch.rand(200, 12, generator=rng)
     prior = Prior(torch.rand(200, generator=rng) * 2, torch.full((200,), 0.1), torch.full((200,), 0.4))
     ours = march(origin, direction, grid, jitter, 0.3, prior)
-    t, delta, hit = march_reference(origin, direction, grid, STEP_IN_CELLS / 16, jitter, 0.3, prior)
+    t, delta, hit = march_reference(origin, direction, grid, jitter, 0.3, prior)
     assert ours.ray.tolist() == torch.nonzero(hit)[:, 0].tolist()
     # Rounding may put a single interval or sample on the other side of a boundary.
     close = ((ours.t - t[hit]).abs() < 1e-3) & ((ours.delta - delta[hit]).abs() < 1e-3)

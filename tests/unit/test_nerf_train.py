@@ -98,16 +98,11 @@ def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
 def test_training_finds_the_sphere(sphere):
     model, photos, cube, result = _train(sphere, steps=250)
     depths, masks = sphere[4], sphere[1]
-    rendered = render_view(
-        model.field,
-        model.occupancy,
-        photos.intrinsics[0],
-        photos.rotation[0],
-        photos.center[0],
-        photos.masks[0],
-        32,
-        0.25,
-    )
+    view = photos.intrinsics[0], photos.rotation[0], photos.center[0], photos.masks[0]
+    rendered = render_view(model.field, model.occupancy, *view, samples=32, uniform=0.25, colored=True)
+    assert float(rendered.color[photos.masks[0]].mean()) > 0.2
+    plain = render_view(model.field, model.occupancy, *view, samples=32, uniform=0.25, colored=False)
+    assert torch.equal(plain.depth, rendered.depth) and not plain.color.any()
     error = np.abs(rendered.depth.numpy() / cube.scale - depths[0])[masks[0]]
     assert np.median(error) < 0.01 * 2 * RADIUS
     picture = photos.images[0].float() / 255
