@@ -199,6 +199,7 @@ def march(
     origin,
     direction,
     alpha,
+    blocks_used,
     step,
     jitter,
     uniform_share,
@@ -215,8 +216,9 @@ def march(
     probability mass mixes a uniform part, the compositing weights of the grid's cached density, and the intervals
     near a depth prior; S equal shares of the mass give one sample each. Lengths are lengths of occupied ray.
 
-    origin, direction (R, 3); alpha (G, G, G): opacity of one interval, negative in empty cells; jitter (R, S) in
-    0..1; prior, prior_width, prior_share (R,); out_t, out_delta (R, S), out_hit (R,) uint8.
+    origin, direction (R, 3); alpha (G, G, G): opacity of one interval, negative in empty cells; blocks_used
+    (G / 4, G / 4, G / 4) uint8: whether any cell of the block is occupied (it stays in the cache, most of the cube is
+    empty); jitter (R, S) in 0..1; prior, prior_width, prior_share (R,); out_t, out_delta (R, S), out_hit (R,) uint8.
     """
     grid = alpha.shape[0]
     scale = np.float32(grid)
@@ -250,6 +252,8 @@ def march(
                 ix = min(max(int((origin[r, 0] + t * direction[r, 0]) * scale), 0), grid - 1)
                 iy = min(max(int((origin[r, 1] + t * direction[r, 1]) * scale), 0), grid - 1)
                 iz = min(max(int((origin[r, 2] + t * direction[r, 2]) * scale), 0), grid - 1)
+                if blocks_used[ix >> 2, iy >> 2, iz >> 2] == 0:
+                    continue
                 opacity = alpha[ix, iy, iz]
                 if opacity < ZERO:
                     continue

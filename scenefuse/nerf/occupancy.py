@@ -23,17 +23,21 @@ class Occupancy:
         density: (G, G, G) float32, cached density.
         occupied: (G, G, G) bool, cells that rays are sampled in.
         alpha: (G, G, G) float32, opacity of one marching step, -1 in cells that are not occupied.
+        blocks_used: (G / 4, G / 4, G / 4) uint8, 1 where a block of 4 x 4 x 4 cells has an occupied one.
     """
 
     hull: Tensor
     density: Tensor
     occupied: Tensor
     alpha: Tensor = dataclasses.field(init=False)
+    blocks_used: Tensor = dataclasses.field(init=False)
 
     def __post_init__(self) -> None:
-        """Opacities from densities."""
+        """What marching looks up, from densities and occupied cells."""
         opacity = 1 - torch.exp(-self.density * self.step)
         self.alpha = torch.where(self.occupied, opacity, torch.full_like(opacity, -1.0))
+        side = self.size // 4
+        self.blocks_used = self.occupied.view(side, 4, side, 4, side, 4).any(5).any(3).any(1).to(torch.uint8)
 
     @property
     def step(self) -> float:

@@ -57,7 +57,7 @@ def march(
         t, delta = torch.zeros(jitter.shape), torch.zeros(jitter.shape)
         hit = torch.zeros(len(jitter), dtype=torch.uint8)
         kernels.march(
-            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), _f32(occupancy.step), jitter.numpy(),
+            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), occupancy.blocks_used.numpy(), _f32(occupancy.step), jitter.numpy(),
             _f32(uniform), prior.distance.numpy(), prior.width.numpy(), prior.share.numpy(), t.numpy(), delta.numpy(),
             hit.numpy(),
         )  # fmt: skip
