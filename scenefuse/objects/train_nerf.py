@@ -74,7 +74,7 @@ def train_nerf(
         cameras: undistorted COLMAP workspace of the object.
         masks: folder of masks named like the photos, .png.
         prior: stage folder with depth_maps/ and confidence_maps/ (object units, along z), or none.
-        previous: folder of an earlier NeRF stage to go on from, or none to start afresh.
+        previous: folder of an earlier NeRF stage to go on from, with its poses, or none to start afresh.
         stage: output folder: model.pt, depth_maps/, confidence_maps/, normal_maps/, renders/ of held-out photos.
         report: output JSON.
         checkpoints: folder for training states; a killed run resumes from it.
@@ -97,6 +97,8 @@ def train_nerf(
     views = load_views(cameras, masks, settings.width_px, hold_out_every)
     training = np.flatnonzero(~views.held_out)
     earlier = None if previous is None else _read_model(previous / "model.pt")
+    if earlier is not None and earlier["names"] == views.names:
+        views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     nerf_from_object, hull = _volume(views, training, settings, earlier)
     photos = make_photos(views, nerf_from_object, prior, exact=settings.mask_band_px == 0)
     model = new_model(field, torch.from_numpy(hull), len(training), seed, chosen)

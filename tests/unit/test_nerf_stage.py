@@ -1,5 +1,7 @@
 """The NeRF stage on a tiny workspace: what it writes, and the sentences for bad input."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -90,6 +92,14 @@ def test_two_stages_and_the_cloud(workspace):
     cloud = read_json(workspace / "object.json")
     assert value(cloud, "points") > 200 and value(cloud, "up_in_camera_frame") == [0.0, 0.0, 1.0]
     assert np.shape(value(cloud, "nerf_from_object")) == (4, 4)
+
+
+def test_a_later_stage_starts_from_the_poses_of_the_earlier_one(workspace):
+    _run(workspace, "moved")
+    _run(workspace, "later", previous=workspace / "moved", schedule=replace(SCHEDULE, pose_learning_rate=0.0))
+    moved, later = (torch.load(workspace / stage / "model.pt", weights_only=True) for stage in ("moved", "later"))
+    assert torch.equal(moved["object_from_cam"], later["object_from_cam"])
+    assert not torch.equal(moved["object_from_cam"], torch.from_numpy(sphere_views()[3]))
 
 
 def test_a_missing_earlier_stage_is_named(workspace):
