@@ -57,9 +57,9 @@ def march(
         t, delta = torch.zeros(jitter.shape), torch.zeros(jitter.shape)
         hit = torch.zeros(len(jitter), dtype=torch.uint8)
         kernels.march(
-            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), occupancy.blocks_used.numpy(), _f32(occupancy.step), jitter.numpy(),
-            _f32(uniform), prior.distance.numpy(), prior.width.numpy(), prior.share.numpy(), t.numpy(), delta.numpy(),
-            hit.numpy(),
+            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), occupancy.blocks_used.numpy(),
+            _f32(occupancy.step), jitter.numpy(), _f32(uniform), prior.distance.numpy(), prior.width.numpy(),
+            prior.share.numpy(), t.numpy(), delta.numpy(), hit.numpy(),
         )  # fmt: skip
     ray = torch.nonzero(hit)[:, 0]
     return Samples(ray, t[ray], delta[ray])

@@ -1,4 +1,4 @@
-"""Hash encoding and training steps on the CPU, beside the same in plain PyTorch and beside nerfstudio's encoding.
+"""The NeRF's kernels and training steps on the CPU, beside the same in plain PyTorch and nerfstudio's encoding.
 
 make bench-nerf, or: python tests/benchmarks/nerf.py --repeats 3
 """
@@ -13,10 +13,13 @@ import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
 from scenefuse.nerf import kernels
+from scenefuse.nerf.adam import TableAdam
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.train import Schedule, new_model, train
+from scenefuse.nerf.occupancy import Occupancy
+from scenefuse.nerf.render import Prior, composite, march
+from scenefuse.nerf.train import Schedule, keep_memory, new_model, train
 from scenefuse.settings import build, shipped_with
 from scenefuse.stage import run
 
@@ -33,15 +36,69 @@ def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2) -> None:
     """
     torch.set_num_threads(threads)
     kernels.set_threads(threads)
+    keep_memory()
     print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward:")
     compare({name: median_seconds(step, repeats) for name, step in encodings().items()}, "s")
+    for title, step in kernel_steps().items():
+        print(f"{title}:")
+        compare(by_both(lambda: median_seconds(step, repeats)), "s")  # noqa: B023
+    print("Adam on the same table, a fifth of the rows touched:")
+    compare({name: median_seconds(step, repeats) for name, step in optimizers().items()}, "s")
     print("training, default field, 2304 rays a step:")
-    seconds = {}
-    for name, available in (("scenefuse", True), ("scenefuse in plain PyTorch", False)):
-        kernels.AVAILABLE, kept = available, kernels.AVAILABLE
-        seconds[name] = training_seconds(steps if available else max(4, steps // 10), threads)
-        kernels.AVAILABLE = kept
-    compare(seconds, "s a step")
+    compare(by_both(lambda: training_seconds(steps if kernels.AVAILABLE else max(4, steps // 10), threads)), "s a step")
+
+
+def by_both(measured: Callable[[], float]) -> dict[str, float]:
+    """The same with the kernels and in plain PyTorch."""
+    seconds = {"scenefuse": measured()}
+    kernels.AVAILABLE = False
+    seconds["scenefuse in plain PyTorch"] = measured()
+    kernels.AVAILABLE = True
+    return seconds
+
+
+def kernel_steps() -> dict[str, Callable[[], None]]:
+    """What the other kernels do in a training step, at its size."""
+    generator = torch.Generator().manual_seed(0)
+    rays, samples, cells = 2304, 32, 128
+    grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
+    shell = ((grid.norm(dim=0) - 0.6).abs() < 0.1).contiguous()
+    occupancy = Occupancy(shell, 50 * shell.float(), shell)
+    origin = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator)) * 2
+    direction = torch.nn.functional.normalize(torch.rand(rays, 3, generator=generator) - 0.5 - origin)
+    origin, none = origin + 0.5, torch.zeros(rays)
+    jitter, prior = torch.rand(rays, samples, generator=generator), Prior(none - 1, none, none)
+    sigma = torch.rand(rays, samples, generator=generator).requires_grad_()
+    rgb = torch.rand(rays, samples, 3, generator=generator).requires_grad_()
+    delta = torch.full((rays, samples), 0.05)
+    t = torch.cumsum(delta, 1)
+
+    def marching() -> None:
+        march(origin, direction, occupancy, jitter, 0.25, prior)
+
+    def compositing() -> None:
+        color, opacity, depth, distortion, _ = composite(sigma, rgb, t, delta)
+        (color.sum() + opacity.sum() + depth.sum() + distortion.sum()).backward()
+
+    return {
+        f"marching {rays} rays through {cells}^3 cells, {samples} samples": marching,
+        f"compositing {rays} x {samples} samples, forward and backward": compositing,
+    }
+
+
+def optimizers() -> dict[str, Callable[[], None]]:
+    """Steps of Adam on a table of which a fifth has gradients."""
+    generator = torch.Generator().manual_seed(0)
+    rows = hash_grid(LEVELS, LOG2_TABLE, COARSEST, FINEST).rows
+    ours, theirs = (torch.nn.Parameter(torch.zeros(rows, 2)) for _ in range(2))
+    gradient = torch.randn(rows, 2, generator=generator) * (torch.rand(rows, 1, generator=generator) < 0.2)
+    ours.grad, theirs.grad = gradient, gradient.clone()
+    sparse, dense = TableAdam(ours), torch.optim.Adam([theirs], lr=1e-3, fused=True)
+
+    def every_row() -> None:
+        dense.step()
+
+    return {"scenefuse": lambda: sparse.step(1e-3), "torch.optim.Adam, fused": every_row}
 
 
 def compare(seconds: dict[str, float], unit: str) -> None:
