@@ -1,7 +1,7 @@
-"""Train the depth-guided NeRF of one object: stages 2 and 4."""
+"""Train a NeRF of one object on posed photos on its own, without the workflow."""
 
-from scenefuse.objects.train_nerf import train_nerf
+from scenefuse.objects.nerf_alone import nerf_files
 from scenefuse.stage import run
 
 if __name__ == "__main__":
-    run(train_nerf)
+    run(nerf_files)

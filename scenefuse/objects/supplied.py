@@ -25,11 +25,7 @@ def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[
     """
     if folder is None or not folder.is_dir():
         raise StageError(f"the folder of supplied masks {folder} does not exist; set its path in config/objects.tsv")
-    files = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"):
-            stem = path.stem.removesuffix(".jpg").removesuffix(".JPG").removesuffix(".png")
-            files[stem.removesuffix("_mask")] = path
+    files = mask_files(folder)
     model = pycolmap.Reconstruction(sfm)
     originals = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
     masks = {}
@@ -40,7 +36,7 @@ def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[
         matte = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         if matte is None:
             raise StageError(f"the supplied mask {file} cannot be read; export it again as PNG")
-        masks[frame.name] = _undistorted(_matte(matte), originals[frame.name], frame)
+        masks[frame.name] = _undistorted(matte_of(matte), originals[frame.name], frame)
     if not masks:
         example = next(iter(files), "none")
         raise StageError(
@@ -51,7 +47,22 @@ def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[
     return masks
 
 
-def _matte(picture: NDArray[Any]) -> Mask:
+def mask_files(folder: Path) -> dict[str, Path]:
+    """The pictures of a folder by the stem of the photo they belong to: without the photo's ending and `_mask`.
+
+    Those in folders below it have the folders' names in front, joined by `_`.
+    """
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"):
+            stem = "_".join((*path.relative_to(folder).parts[:-1], path.stem))
+            for ending in (".jpg", ".JPG", ".jpeg", ".JPEG", ".png", ".PNG"):
+                stem = stem.removesuffix(ending)
+            files[stem.removesuffix("_mask")] = path
+    return files
+
+
+def matte_of(picture: NDArray[Any]) -> Mask:
     """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value."""
     if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
         channel = picture[..., 3]

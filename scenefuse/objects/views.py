@@ -48,7 +48,8 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
         cameras: workspace with images/ and sparse/, PINHOLE cameras.
         masks: folder of {name}.png, above 127 on the object.
         width_px: target width; photos are never enlarged.
-        hold_out_every: every n-th photo (in name order) is held out; 0 holds out none.
+        hold_out_every: every n-th photo (in name order) is held out, 0 holds out none; a file held_out.txt in
+            `cameras`, one name a line, says it instead.
 
     Raises:
         StageError: no photo has a mask, or sizes differ between photos.
@@ -67,7 +68,9 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
         camera = model.cameras[image.camera_id]
         scale = min(1.0, width_px / camera.width)
         size = (round(camera.width * scale), round(camera.height * scale))
-        picture = cv2.imread(str(cameras / "images" / image.name), cv2.IMREAD_COLOR)
+        # COLMAP's cameras belong to the pixels as they are stored, whatever the EXIF orientation says.
+        stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        picture = cv2.imread(str(cameras / "images" / image.name), stored)
         matte = cv2.imread(str(masks / f"{Path(image.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
         if picture is None or matte is None or matte.shape != picture.shape[:2]:
             raise StageError(f"{image.name}: photo and mask cannot be read or differ in size; rerun the masks stage")
@@ -84,7 +87,10 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
     if len({p.shape for p in pictures}) > 1:
         raise StageError(f"the photos in {cameras}/images have different sizes; use photos of one camera at one size")
     held_out = np.zeros(len(images), dtype=bool)
-    if hold_out_every > 0:
+    listed = cameras / "held_out.txt"
+    if listed.is_file():
+        held_out = np.isin([i.name for i in images], listed.read_text().splitlines())
+    elif hold_out_every > 0:
         held_out[hold_out_every // 2 :: hold_out_every] = True
     return Views(
         [i.name for i in images],

@@ -53,10 +53,10 @@ def _depth_row(photos: list[Path], masks: Path, stages: list[Path]) -> tuple[lis
     if not known:
         return [None] * len(stages), shown
     low, high = np.percentile(known[-1], [1, 99])
-    return [None if d is None else _depth_colors(d, float(low), float(high)) for d in inside], shown
+    return [None if d is None else depth_colors(d, float(low), float(high)) for d in inside], shown
 
 
-def _depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
+def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
     """(H, W, 3) colours of a depth map, near bright; pixels without a depth are light grey."""
     level = 1.0 - np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)
     picture = (colormaps["viridis"](level)[..., :3] * 255).astype(np.uint8)

@@ -257,8 +257,8 @@ rule stage2:
         options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
-        script=script("train_nerf.py"),
-        code=code("train_nerf.py"),
+        script=script("nerf_stage.py"),
+        code=code("nerf_stage.py"),
     message:
         "{wildcards.object}: stage 2, depth-guided NeRF"
     shell:
@@ -335,8 +335,8 @@ rule stage4:
         options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
-        script=script("train_nerf.py"),
-        code=code("train_nerf.py"),
+        script=script("nerf_stage.py"),
+        code=code("nerf_stage.py"),
     message:
         "{wildcards.object}: stage 4, final NeRF"
     shell:
