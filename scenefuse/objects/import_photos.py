@@ -49,6 +49,8 @@ def import_photos(
     Raises:
         StageError: what the readers say; photos without masks, unlike sizes, an unreadable file.
     """
+    if masks is not None and not masks.is_dir():
+        raise StageError(f"--masks {masks} is no folder; give the folder of the masks")
     photos, kind = find_posed_photos(data, images)
     files = {} if masks is None else mask_files(masks)
     source = "folder" if masks is not None else "named" if any(photo.mask for photo in photos) else "alpha"
@@ -123,9 +125,7 @@ def _straight(camera: pycolmap.Camera) -> bool:
     return camera.model_name in (*PERSPECTIVE, "FULL_OPENCV") and camera.is_undistorted()
 
 
-def _lenses(
-    photos: list[PosedPhoto], settings: UndistortSettings
-) -> list[tuple[pycolmap.Camera, pycolmap.Camera]]:
+def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[tuple[pycolmap.Camera, pycolmap.Camera]]:
     """Of every photo, its camera at its own size, and the PINHOLE camera it gets.
 
     Undistorted photos that had one size get one size: cameras calibrated photo by photo lose a few columns and rows at
@@ -156,19 +156,18 @@ def _lenses(
 
 def _read(file: Path) -> tuple[Picture, Picture | None]:
     """A photo as stored, whatever its EXIF orientation: (H, W, 3) BGR, and (H, W) alpha where it varies."""
-    picture = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if picture is None:
-        raise StageError(f"{file} is not a readable picture; export it again")
-    if picture.dtype != np.uint8:
-        picture = (picture / (np.iinfo(picture.dtype).max / 255.0) + 0.5).astype(np.uint8)
+    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+    if stored is None or stored.dtype not in (np.uint8, np.uint16):
+        raise StageError(f"{file} is not a readable picture of 8 or 16 bits; export it again")
+    picture = np.asarray(stored // 257 if stored.dtype == np.uint16 else stored, dtype=np.uint8)
     if picture.ndim == 2:
-        picture = cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR)
+        picture = np.repeat(picture[..., None], 3, axis=2)
     alpha = picture[..., 3] if picture.shape[2] == 4 and picture[..., 3].min() < 255 else None
     return np.ascontiguousarray(picture[..., :3]), alpha
 
 
 def _mask(file: Path | None, picture: Picture) -> Picture | None:
-    """A mask file as 0 or 255 at the photo's size; None without a file."""
+    """A mask file at the photo's size, 0 or 255 but where it was resampled; None without a file."""
     if file is None:
         return None
     matte = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
@@ -181,7 +180,7 @@ def _mask(file: Path | None, picture: Picture) -> Picture | None:
             "make masks of the photos as they are"
         )
     whole = matte_of(matte).astype(np.uint8) * 255
-    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+    return np.asarray(cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
 
 def _bled(picture: Picture, alpha: Picture) -> Picture:
@@ -211,7 +210,8 @@ def _write(file: Path, picture: Picture, settings: UndistortSettings) -> None:
 
 def _write_model(folder: Path, kept: list[tuple[PosedPhoto, str, pycolmap.Camera]]) -> None:
     """A COLMAP model of cameras and poses alone; photos with the same lens share a camera."""
-    model, known = pycolmap.Reconstruction(), {}
+    model = pycolmap.Reconstruction()
+    known: dict[tuple[float, ...], int] = {}
     for number, (photo, name, target) in enumerate(kept, start=1):
         lens = target.width, target.height, *target.params
         if lens not in known:

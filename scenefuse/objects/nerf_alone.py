@@ -1,4 +1,4 @@
-"""The NeRF on its own: posed photos in, a cloud, maps, held-out renders and their numbers out; the workflow's stages."""
+"""The NeRF on its own: posed photos in; a cloud, maps, held-out renders and numbers out, by the workflow's stages."""
 
 import shutil
 import time
@@ -116,13 +116,10 @@ def nerf_files(
             "seconds": quantity(round(time.perf_counter() - start, 1), "s"),
         },
     )
-    points = f"{value(cloud, 'points')} points" if cloud else f"none: {refused}"
-    print(
-        f"{value(nerf, 'measured_on')}: PSNR {value(nerf, 'psnr_held_out'):.2f} dB inside the mask, SSIM "
-        f"{value(nerf, 'ssim'):.3f}, silhouette {value(nerf, 'silhouette_iou'):.3f}, on {value(nerf, 'photos_measured')}"
-        f"\ncloud      {points}\nwritten    {', '.join(map(str, written))}",
-        flush=True,
-    )
+    quality = f"PSNR {value(nerf, 'psnr_held_out'):.2f} dB inside the masks, SSIM {value(nerf, 'ssim'):.3f}"
+    print(f"quality    {quality}, on {value(nerf, 'photos_measured')} {value(nerf, 'measured_on')}")
+    print(f"cloud      {value(cloud, 'points')} points" if cloud else f"cloud      none: {refused}")
+    print(f"written    {', '.join(map(str, written))}", flush=True)
     return 0 if refused is None else NO_CLOUD
 
 
@@ -136,9 +133,8 @@ def render_sheet(cameras: Path, masks: Path, stage: Path) -> Image:
         render = _rgb(stage / "renders" / f"{stem}.png")
         height, width = render.shape[:2]
         photo = cv2.resize(_rgb(files[stem]), (width, height), interpolation=cv2.INTER_AREA)
-        matte = cv2.imread(str(masks / f"{stem}.png"), cv2.IMREAD_GRAYSCALE)
-        matte = cv2.resize(matte, (width, height), interpolation=cv2.INTER_AREA)
-        cut_out = (photo * (matte[..., None] / 255.0) + 0.5).astype(np.uint8)
+        matte = cv2.resize(_rgb(masks / f"{stem}.png"), (width, height), interpolation=cv2.INTER_AREA)
+        cut_out = (photo * (matte / 255.0) + 0.5).astype(np.uint8)
         depth = read_depth(stage / "depth_maps" / f"{files[stem].name}.bin")
         known = depth[depth > 0]
         low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)

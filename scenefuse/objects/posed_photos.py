@@ -1,4 +1,4 @@
-"""Photos whose cameras another program found: COLMAP models, nerfstudio's transforms.json, Blender's transforms_train.json."""
+"""Photos whose cameras another program found: COLMAP, nerfstudio's transforms.json, Blender's transforms_train.json."""
 
 import json
 import os

@@ -1,0 +1,128 @@
+"""NeRF-synthetic Lego on the CPU: test PSNR over training time, on white and over whole pictures as in the literature.
+
+python tests/benchmarks/lego.py --data ../shared/data/lego
+"""
+
+import tempfile
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.quality import psnr, ssim
+from scenefuse.nerf.rays import Photos
+from scenefuse.nerf.render import render_view
+from scenefuse.nerf.train import Model, Schedule, new_model, train
+from scenefuse.objects.import_photos import import_photos
+from scenefuse.objects.train_nerf import NerfSettings, _volume, make_photos
+from scenefuse.objects.views import load_views
+from scenefuse.scenes.undistort import UndistortSettings
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import run
+
+GOALS_DB = (25, 28, 30, 32)
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def lego(
+    *,
+    data: Path,
+    config: Path = ROOT / "config/examples/lego.yaml",
+    every: float = 20.0,
+    few: int = 5,
+    threads: int = 2,
+    seed: int = 0,
+    pictures: Path | None = None,
+) -> None:
+    """Train, and print quality on the test views on the way and at the end; the time that measuring takes is left out.
+
+    Args:
+        data: folder with transforms_train.json and transforms_test.json.
+        config: settings that differ from the shipped ones.
+        every: seconds of training between two measurements.
+        few: test views of each measurement on the way; the last one takes all.
+        threads: CPU threads.
+        seed: of all random choices.
+        pictures: folder for renders beside photos, or none.
+    """
+    torch.set_num_threads(threads)
+    settings = shipped_with(config)["object"]
+    chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        places = {"cameras": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        import_photos(
+            data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["cameras"])
+        )
+        views = load_views(places["cameras"], places["mattes"], chosen["width_px"], 0)
+    start = time.perf_counter()
+    training, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
+    cube, hull = _volume(views, training, build(NerfSettings, chosen), None)
+    photos = make_photos(views, cube, None, exact=True)
+    schedule = build(Schedule, chosen)
+    model = new_model(build(FieldSettings, chosen), torch.from_numpy(hull), len(training), seed, "cpu")
+    print(
+        f"hull {hull.mean():.1%} of the cube in {time.perf_counter() - start:.1f} s, {schedule.steps} steps", flush=True
+    )
+    clock = Clock(every, model, photos.select(tested[:: max(1, len(tested) // few)]), chosen["render_samples"])
+    train(
+        model, photos.select(training), schedule, build(LossWeights, chosen), warm=False, seed=seed, threads=threads,
+        checkpoint=None, report=clock.tick, band_px=0,
+    )  # fmt: skip
+    seconds = clock.trained()
+    for goal in GOALS_DB:
+        first = next((second for second, quality in clock.history if quality >= goal), None)
+        print(f"{goal} dB: " + ("not reached" if first is None else f"after {first:.0f} s"))
+    quality, structure = measure(model, photos.select(tested), chosen["render_samples"], pictures)
+    print(f"{len(tested)} test views after {seconds:.0f} s: PSNR {quality:.2f} dB, SSIM {structure:.4f}", flush=True)
+
+
+class Clock:
+    """Measures on the way, at training's own progress lines, and leaves the time out that this takes."""
+
+    def __init__(self, every: float, model: Model, photos: Photos, samples: int) -> None:
+        self.every, self.model, self.photos, self.samples = every, model, photos, samples
+        self.start, self.lost, self.last = time.perf_counter(), 0.0, 0.0
+        self.history: list[tuple[float, float]] = []
+
+    def trained(self) -> float:
+        """Seconds of training so far."""
+        return time.perf_counter() - self.start - self.lost
+
+    def tick(self, line: str) -> None:
+        """Print a progress line, and quality when it is time."""
+        seconds = self.trained()
+        if seconds - self.last < self.every:
+            return
+        begin, self.last = time.perf_counter(), seconds
+        quality, _ = measure(self.model, self.photos, self.samples, None)
+        self.history.append((seconds, quality))
+        self.lost += time.perf_counter() - begin
+        print(f"{seconds:6.0f} s  {quality:.2f} dB on {len(self.photos)} test views | {line}", flush=True)
+
+
+def measure(model: Model, photos: Photos, samples: int, pictures: Path | None) -> tuple[float, float]:
+    """Mean PSNR and SSIM of whole pictures on white; every pixel is rendered, whatever the mask says."""
+    rows = []
+    for view in range(len(photos)):
+        everything = torch.ones(photos.masks.shape[1:], dtype=torch.bool)
+        camera = photos.intrinsics[view], photos.rotation[view], photos.center[view]
+        rendered = render_view(model.field, model.occupancy, *camera, everything, samples, 0.25)
+        matte = photos.mattes[view, ..., None].float() / 255.0
+        photo = photos.images[view].float() / 255.0 * matte + 1 - matte
+        picture = (rendered.color + 1 - rendered.opacity[..., None]).clamp(0, 1)
+        rows.append((psnr(picture, photo, everything), ssim(picture, photo, everything)))
+        if pictures is not None:
+            pictures.mkdir(parents=True, exist_ok=True)
+            both = (torch.cat([photo, picture], 1).numpy() * 255 + 0.5).astype(np.uint8)
+            cv2.imwrite(str(pictures / f"{view:03d}.png"), both[..., ::-1])
+    quality, structure = np.mean(rows, axis=0)
+    return float(quality), float(structure)
+
+
+if __name__ == "__main__":
+    run(lego)

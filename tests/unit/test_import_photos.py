@@ -1,0 +1,400 @@
+"""Posed photos of three formats: a known point lands on the known pixel in each, and bad input is one sentence."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import yaml
+from painted_sphere import CENTER, RADIUS, sphere_views
+from scipy.spatial.transform import Rotation
+
+from scenefuse.clouds import read_cloud
+from scenefuse.nerf.occupancy import visual_hull
+from scenefuse.nerf.rays import cube_from_cameras
+from scenefuse.objects.import_photos import import_photos
+from scenefuse.objects.nerf_alone import nerf_files
+from scenefuse.objects.views import load_views
+from scenefuse.scenes.undistort import UndistortSettings
+from scenefuse.stage import StageError, read_json, value
+
+ROOT = Path(__file__).resolve().parents[2]
+LEGO = ROOT.parent / "shared/data/lego"
+WIDTH, HEIGHT = 96, 64
+LENS = np.array([[80.0, 0, 50], [0, 84, 30], [0, 0, 1]])
+BENT = {"k1": -0.12, "k2": 0.02, "p1": 0.003, "p2": -0.002}
+SPOT = np.array([0.3, -0.2, 0.15])
+
+
+def poses(count=5):
+    """object_from_cam (4, 4) of cameras around the origin that look at it, one of them rolled; OpenCV axes."""
+    for i in range(count):
+        position = 3 * np.array([np.cos(1.1 * i), np.sin(1.1 * i), 0.3 + 0.2 * i])
+        z = -position / np.linalg.norm(position)
+        x = np.cross(z, [0.2 * (i == 2), 0, 1.0])
+        x /= np.linalg.norm(x)
+        yield np.vstack([np.column_stack([x, np.cross(z, x), z, position]), [0, 0, 0, 1]])
+
+
+def seen(pose, lens, bent=None):
+    """The pixel (centres at +0.5) on which a camera shows SPOT, by the definition of OpenCV's distortion."""
+    x, y, z = pose[:3, :3].T @ (SPOT - pose[:3, 3])
+    x, y = x / z, y / z
+    k = bent or dict.fromkeys(BENT, 0.0)
+    r2 = x * x + y * y
+    radial = 1 + k["k1"] * r2 + k["k2"] * r2 * r2
+    x, y = (
+        x * radial + 2 * k["p1"] * x * y + k["p2"] * (r2 + 2 * x * x),
+        y * radial + k["p1"] * (r2 + 2 * y * y) + 2 * k["p2"] * x * y,
+    )
+    return lens[0, 0] * x + lens[0, 2], lens[1, 1] * y + lens[1, 2]
+
+
+def blob(pixel, width=WIDTH, height=HEIGHT):
+    """A picture (H, W, 3) uint8 with a soft white blob on a pixel."""
+    v, u = np.indices((height, width)) + 0.5
+    near = np.exp(-((u - pixel[0]) ** 2 + (v - pixel[1]) ** 2) / (2 * 2.0**2))
+    return np.repeat((near * 255 + 0.5).astype(np.uint8)[..., None], 3, axis=2)
+
+
+def middle(picture):
+    """The brightness-weighted mean pixel of a picture."""
+    weight = picture.astype(np.float64)
+    v, u = np.indices(weight.shape) + 0.5
+    return np.array([(u * weight).sum(), (v * weight).sum()]) / weight.sum()
+
+
+def opengl(pose):
+    return (pose @ np.diag([1.0, -1, -1, 1])).tolist()
+
+
+def write(folder, i, picture, matte=None, ending=".png"):
+    folder.mkdir(parents=True, exist_ok=True)
+    whole = picture if matte is None else np.dstack([picture, matte])
+    cv2.imwrite(str(folder / f"{i:02d}{ending}"), whole)
+
+
+def ellipse(pixel):
+    """A mask (H, W), 0 or 255, around a pixel."""
+    v, u = np.indices((HEIGHT, WIDTH)) + 0.5
+    return np.where(((u - pixel[0]) / 9) ** 2 + ((v - pixel[1]) / 7) ** 2 < 1, 255, 0).astype(np.uint8)
+
+
+def nerfstudio(root, bent=None, masks=True, **extra):
+    """A folder with transforms.json, images/ and masks/."""
+    frames = []
+    for i, pose in enumerate(poses()):
+        pixel = seen(pose, LENS, bent)
+        write(root / "images", i, blob(pixel))
+        write(root / "masks", i, ellipse(pixel))
+        frame = {"file_path": f"images/{i:02d}.png", "transform_matrix": opengl(pose)}
+        frames.append(frame | ({"mask_path": f"masks/{i:02d}.png"} if masks else {}))
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": LENS[0, 0], "fl_y": LENS[1, 1], "cx": LENS[0, 2], "cy": LENS[1, 2]}
+    content = lens | (bent or {}) | {"camera_model": "OPENCV", "frames": frames} | extra
+    (root / "transforms.json").write_text(json.dumps(content))
+    return root
+
+
+def blender(root):
+    """A folder with transforms_train.json and transforms_test.json; alpha, file_path without ending."""
+    angle, lens = 0.9, np.array([[0.5 * WIDTH / np.tan(0.45), 0, WIDTH / 2], [0, 0, HEIGHT / 2], [0, 0, 1]])
+    lens[1, 1] = lens[0, 0]
+    for split, chosen in (("train", (0, 1, 2)), ("test", (3, 4))):
+        frames = []
+        for i, pose in enumerate(poses()):
+            if i in chosen:
+                pixel = seen(pose, lens)
+                write(root / split, i, blob(pixel), blob(pixel)[..., 0])
+                frames.append({"file_path": f"./{split}/{i:02d}", "rotation": 0.1, "transform_matrix": opengl(pose)})
+        (root / f"transforms_{split}.json").write_text(json.dumps({"camera_angle_x": angle, "frames": frames}))
+    return root
+
+
+def colmap(root, bent=None, sparse="sparse/0"):
+    """A COLMAP folder as COLMAP's own programs write it, and masks/ beside it."""
+    (root / sparse).mkdir(parents=True)
+    rows = []
+    for i, pose in enumerate(poses()):
+        pixel = seen(pose, LENS, bent)
+        write(root / "images/walk", i, blob(pixel))
+        write(root / "masks/walk", i, ellipse(pixel))
+        back = np.linalg.inv(pose)
+        numbers = *np.roll(Rotation.from_matrix(back[:3, :3]).as_quat(), 1), *back[:3, 3]
+        rows.append(f"{i + 1} {' '.join(f'{n:.15g}' for n in numbers)} 1 walk/{i:02d}.png\n\n")
+    lens = f"{LENS[0, 0]} {LENS[1, 1]} {LENS[0, 2]} {LENS[1, 2]}"
+    model = f"OPENCV {WIDTH} {HEIGHT} {lens} {' '.join(map(str, bent.values()))}" if bent else ""
+    (root / sparse / "cameras.txt").write_text(f"1 {model or f'PINHOLE {WIDTH} {HEIGHT} {lens}'}\n")
+    (root / sparse / "images.txt").write_text("".join(rows))
+    (root / sparse / "points3D.txt").write_text("")
+    return root
+
+
+def imported(data, out, images=None, masks=None):
+    import_photos(
+        data=data,
+        images=images,
+        masks=masks,
+        cameras=out / "cameras",
+        mattes=out / "masks",
+        report=out / "photos.json",
+        settings=UndistortSettings(1600, 97),
+    )
+    return load_views(out / "cameras", out / "masks", WIDTH, 0), read_json(out / "photos.json")
+
+
+def misses(views):
+    """Distances in pixels between where a camera says that SPOT is and where its photo, and its mask, show it."""
+    for picture, matte, lens, pose in zip(views.images, views.mattes, views.intrinsics, views.object_from_cam):
+        x = lens @ pose[:3, :3].T @ (SPOT - pose[:3, 3])
+        yield [np.linalg.norm(middle(p) - x[:2] / x[2]) for p in (picture[..., 0], matte)]
+
+
+@pytest.mark.parametrize("bent", [None, BENT], ids=["pinhole", "distorted"])
+@pytest.mark.parametrize("form", ["nerfstudio", "colmap"])
+def test_a_known_point_lands_on_its_pixel(tmp_path, form, bent):
+    if form == "nerfstudio":
+        views, report = imported(nerfstudio(tmp_path / "in", bent), tmp_path)
+    else:
+        data = colmap(tmp_path / "in", bent)
+        views, report = imported(data, tmp_path, masks=data / "masks")
+    assert len(views.names) == 5 and value(report, "undistorted") == (5 if bent else 0)
+    assert np.max([*misses(views)]) < 0.15
+    assert np.abs(views.object_from_cam - np.stack([*poses()])).max() < 1e-9
+    assert set(np.unique(views.mattes)) == {0, 255} or bent
+
+
+def test_blender_reads_alpha_as_it_is_and_holds_the_test_photos_out(tmp_path):
+    views, report = imported(blender(tmp_path / "in"), tmp_path)
+    assert views.names == ["test_03.png", "test_04.png", "train_00.png", "train_01.png", "train_02.png"]
+    assert views.held_out.tolist() == [True, True, False, False, False]
+    assert np.max([*misses(views)], axis=0)[1] < 0.05
+    alpha = cv2.imread(str(tmp_path / "in/test/03.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(views.mattes[0], alpha[..., 3]) and len(np.unique(views.mattes[0])) > 20
+    opaque = alpha[..., 3] > 0
+    assert np.array_equal(views.images[0][opaque], alpha[..., 2::-1][opaque])
+    assert views.images[0][~opaque].min() > 0, "transparent pixels have the colour of their neighbours"
+    assert value(report, "masks_exact") is True and value(report, "format") == "Blender"
+
+
+def test_smaller_copies_of_the_photos_serve(tmp_path):
+    data = colmap(tmp_path / "in", sparse="sparse")
+    for i, pose in enumerate(poses()):
+        u, v = seen(pose, LENS)
+        write(data / "images_2/walk", i, blob((u / 2, v / 2), WIDTH // 2, HEIGHT // 2))
+    views, _ = imported(data, tmp_path, images=data / "images_2", masks=data / "masks")
+    assert views.images.shape[1:3] == (HEIGHT // 2, WIDTH // 2) and np.max([*misses(views)]) < 0.15
+
+
+def test_an_exif_orientation_turns_no_photo(tmp_path):
+    from PIL import Image
+
+    data = nerfstudio(tmp_path / "in")
+    for path in (data / "images").iterdir():
+        picture = Image.open(path).copy()
+        tags = picture.getexif()
+        tags[0x0112] = 6
+        picture.save(path, exif=tags)
+    views, _ = imported(data, tmp_path)
+    assert np.max([*misses(views)]) < 0.15
+
+
+def test_cameras_calibrated_photo_by_photo_come_out_at_one_size(tmp_path):
+    data = nerfstudio(tmp_path / "in", BENT)
+    content = json.loads((data / "transforms.json").read_text())
+    for i, (frame, pose) in enumerate(zip(content["frames"], poses())):
+        own = BENT | {"k1": -0.12 - 0.02 * i}
+        frame |= own
+        write(data / "images", i, blob(seen(pose, LENS, own)))
+    (data / "transforms.json").write_text(json.dumps(content))
+    views, _ = imported(data, tmp_path)
+    model = pycolmap.Reconstruction(tmp_path / "cameras/sparse")
+    assert model.num_cameras() == 5 and len({(c.width, c.height) for c in model.cameras.values()}) == 1
+    assert np.max([*misses(views)]) < 0.15
+
+
+def test_photos_without_a_mask_are_left_out_and_named(tmp_path):
+    data = colmap(tmp_path / "in")
+    (data / "masks/walk/03.png").unlink()
+    (data / "masks/walk/01.png").rename(data / "masks/walk/01.png.png")
+    views, report = imported(data, tmp_path, masks=data / "masks")
+    assert len(views.names) == 4 and value(report, "left_out_without_mask") == ["walk_03.png"]
+
+
+def test_held_out_photos_that_the_json_names(tmp_path):
+    data = nerfstudio(tmp_path / "in", test_filenames=["images/01.png"], val_filenames=["images/04.png"])
+    views, report = imported(data, tmp_path)
+    assert views.held_out.tolist() == [False, True, False, False, True]
+    assert value(report, "held_out_by_the_data") == ["01.png", "04.png"]
+
+
+def edit(**changes):
+    """A change of transforms.json: of its first frame where a name begins with frame_."""
+
+    def apply(root):
+        content = json.loads((root / "transforms.json").read_text())
+        for key, new in changes.items():
+            if key.startswith("frame_"):
+                content["frames"][0][key.removeprefix("frame_")] = new
+            else:
+                content[key] = new
+        (root / "transforms.json").write_text(json.dumps(content))
+
+    return apply
+
+
+def shrink(file, size):
+    return lambda root: cv2.imwrite(str(root / file), np.full((*size, 3), 255, np.uint8))
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda root: (root / "transforms.json").unlink(), "no cameras in a known format"),
+        (lambda root: (root / "transforms.json").write_text("{"), "no readable JSON"),
+        (lambda root: (root / "transforms.json").write_text("[]"), "no list of frames"),
+        (lambda root: (root / "images/02.png").unlink(), r"frame 2 .*02.png does not exist"),
+        (lambda root: (root / "images/02.png").write_text("no picture"), "02.png is not a readable picture"),
+        (lambda root: (root / "masks/02.png").write_text("no picture"), "the mask .*02.png is not a readable picture"),
+        (edit(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not read; undistort"),
+        (edit(frame_camera_model="EQUIRECTANGULAR"), r"frame 0 .*EQUIRECTANGULAR is not read"),
+        (edit(k4=0.1), "distortion with k4 is not read"),
+        (edit(fl_x=None), "no focal length; give fl_x"),
+        (edit(fl_x=-80), "focal length has to be positive"),
+        (edit(fl_x="wide"), "have to be numbers"),
+        (edit(frame_transform_matrix=[[1, 0], [0, 1]]), "has to be 4 x 4 numbers"),
+        (edit(frame_transform_matrix=np.diag([2.0, 2, 2, 1]).tolist()), "is no rotation"),
+        (edit(frame_transform_matrix=np.diag([1.0, 1, -1, 1]).tolist()), "is no rotation"),
+        (edit(frame_file_path="images/01.png"), "two photos .* are both called 01"),
+        (shrink("images/02.png", (64, 64)), "02.png has 64 x 64 pixels, but its camera 96 x 64"),
+        (shrink("masks/02.png", (64, 64)), "the mask .*02.png has 64 x 64 pixels, but its photo 96 x 64"),
+        (edit(frames=[]), "no list of frames"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, damage, words):
+    damage(nerfstudio(tmp_path / "in"))
+    with pytest.raises(StageError, match=words):
+        imported(tmp_path / "in", tmp_path)
+    assert not (tmp_path / "cameras").exists() and not (tmp_path / "masks").exists()
+
+
+def test_no_masks_says_what_to_give(tmp_path):
+    data = nerfstudio(tmp_path / "in", masks=False)
+    with pytest.raises(StageError, match="no masks; give a folder of masks with --masks"):
+        imported(data, tmp_path)
+    for path in (data / "masks").iterdir():
+        path.rename(path.with_stem(f"other{path.stem}"))
+    with pytest.raises(StageError, match="match no photo: 5 masks .*other00.png"):
+        imported(data, tmp_path, masks=data / "masks")
+
+
+def test_a_colmap_model_without_its_photos_asks_for_them(tmp_path):
+    data = colmap(tmp_path / "in")
+    (data / "images").rename(data / "elsewhere")
+    with pytest.raises(StageError, match="5 of 5 photos .* give their folder with --images"):
+        imported(data, tmp_path, masks=data / "masks")
+    views, _ = imported(data, tmp_path, images=data / "elsewhere", masks=data / "masks")
+    assert len(views.names) == 5
+    (data / "sparse/0/cameras.txt").write_text("1 PINHOLE")
+    with pytest.raises(StageError, match="not a readable COLMAP model"):
+        imported(data, tmp_path, images=data / "elsewhere", masks=data / "masks")
+
+
+QUICK = {
+    "nerf_alone": {"epochs": 4},
+    "hold_out_every": 12,
+    "nerf": {"levels": 6, "log2_table": 12, "coarsest": 8, "finest": 64, "width": 16, "width_px": 48, "device": "cpu"}
+    | {"rays_per_epoch": 80 * 512, "images_per_batch": 8, "rays_per_image": 64, "occupancy_cells": 32}
+    | {"learning_rate": 1e-2, "grid_learning_rate": 2e-2, "warmup_epochs": 0.2, "hull_tolerance": 0, "agreement": 0.03},
+    "cloud": {"min_views": 2, "agreement": 0.05, "min_confidence": 0, "through_share": 0.5, "mask_share": 0.3}
+    | {"spacing": 0.01, "outlier_deviations": 4},
+}
+
+
+@pytest.fixture
+def quick(tmp_path):
+    (tmp_path / "quick.yaml").write_text(yaml.safe_dump({"object": QUICK}))
+    return tmp_path / "quick.yaml"
+
+
+def sphere_on_disk(root, form):
+    """The painted sphere as transforms_train.json with alpha, or as a COLMAP model with masks."""
+    images, masks, k, object_from_cam, _ = sphere_views(24)
+    frames, rows = [], []
+    for i, (image, mask, pose) in enumerate(zip(images, masks, object_from_cam)):
+        matte = mask.astype(np.uint8) * 255
+        write(root / "images", i, image[..., ::-1], matte if form == "blender" else None)
+        write(root / "masks", i, matte)
+        frames.append({"file_path": f"images/{i:02d}", "transform_matrix": opengl(pose)})
+        back = np.linalg.inv(pose)
+        numbers = *np.roll(Rotation.from_matrix(back[:3, :3]).as_quat(), 1), *back[:3, 3]
+        rows.append(f"{i + 1} {' '.join(f'{n:.15g}' for n in numbers)} 1 {i:02d}.png\n\n")
+    if form == "blender":
+        content = {"camera_angle_x": 2 * np.arctan(0.5 * 48 / k[0, 0, 0]), "frames": frames}
+        (root / "transforms_train.json").write_text(json.dumps(content))
+    else:
+        (root / "sparse").mkdir()
+        (root / "sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
+        (root / "sparse/images.txt").write_text("".join(rows))
+        (root / "sparse/points3D.txt").write_text("")
+    return root
+
+
+@pytest.mark.parametrize("form", ["blender", "colmap"])
+def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
+    data, out = sphere_on_disk(tmp_path / "in", form), tmp_path / "out"
+    masks = data / "masks" if form == "colmap" else None
+    assert nerf_files(data=data, out=out, masks=masks, config=quick) == 0
+    report = read_json(out / "report.json")
+    assert value(report["nerf"], "photos_measured") == 2 and value(report["nerf"], "psnr_held_out") > 15
+    assert value(report, "settings").get("mask_band_px") == (0 if form == "blender" else 2)
+    distance = np.linalg.norm(read_cloud(out / "object.ply").points - CENTER, axis=1)
+    assert np.median(np.abs(distance - RADIUS)) < 0.1
+    assert sorted(p.name for p in out.iterdir()) == sorted(
+        ["cameras", "masks", "nerf", "object.ply", "renders.png", "report.json", "steps"]
+    )
+    assert (out / "renders.png").stat().st_size > 5000
+
+
+def test_a_nerf_without_a_cloud_ends_with_three_and_the_reason(tmp_path, quick):
+    settings = yaml.safe_load(quick.read_text())
+    settings["object"]["cloud"] |= {"min_confidence": 1, "min_views": 12}
+    quick.write_text(yaml.safe_dump(settings))
+    data = sphere_on_disk(tmp_path / "in", "blender")
+    command = [sys.executable, ROOT / "scripts/train_nerf.py", "--data", data, "--config", quick, "--out", "out"]
+    done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 3, done.stderr
+    assert "no surface found" in value(read_json(tmp_path / "out/report.json"), "no_cloud_because")
+    assert not (tmp_path / "out/object.ply").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"data": Path("nowhere")}, "does not exist; give a folder with sparse/"),
+        ({"images": Path("images")}, "goes with a COLMAP model"),
+        ({"out": Path("file.txt")}, "is a file"),
+        ({"masks": Path("none")}, "--masks none is no folder"),
+        ({"config": Path("typo.yaml")}, "unknown key 'epoch'; did you mean 'epochs'"),
+    ],
+)
+def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    nerfstudio(tmp_path / "in")
+    Path("file.txt").write_text("")
+    Path("typo.yaml").write_text("object: {nerf_alone: {epoch: 3}}")
+    with pytest.raises(StageError, match=words):
+        nerf_files(**({"data": Path("in"), "out": Path("out")} | options))
+    assert not Path("out").exists()
+
+
+@pytest.mark.skipif(not LEGO.is_dir(), reason="only where the Lego photos are")
+def test_lego_masks_agree_on_a_hull(tmp_path):
+    views, _ = imported(LEGO, tmp_path)
+    assert views.held_out.sum() == 25 and len(views.names) == 125
+    some = np.flatnonzero(~views.held_out)[::5]
+    data = views.masks[some], views.intrinsics[some], views.object_from_cam[some]
+    assert visual_hull(*data, cube_from_cameras(*data), 64, 0.0).mean() > 0.01
