@@ -108,7 +108,7 @@ def train_nerf(
         hull_before = model.occupancy.hull
         model.occupancy = Occupancy(hull_before, earlier["model"]["density"].to(chosen), hull_before)
         model.field.level_weight.fill_(1.0)
-    key = _key(field, schedule, losses, settings, seed, hold_out_every, chosen, photos, earlier)
+    key = _key(field, schedule, losses, settings, seed, views.held_out.tolist(), chosen, photos, earlier)
     checkpoint = checkpoints / key / "state.pt"
     kernel = "numba" if kernels.AVAILABLE and chosen == "cpu" else "torch"
     print(

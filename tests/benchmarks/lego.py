@@ -73,12 +73,15 @@ def lego(
         model, photos.select(training), schedule, build(LossWeights, chosen), warm=False, seed=seed, threads=threads,
         checkpoint=None, report=clock.tick, band_px=0,
     )  # fmt: skip
-    seconds = clock.trained()
+    seconds, cpu = clock.trained()
     for goal in GOALS_DB:
-        first = next((second for second, quality in clock.history if quality >= goal), None)
-        print(f"{goal} dB: " + ("not reached" if first is None else f"after {first:.0f} s"))
+        first = next((f"after {wall:.0f} s" for wall, quality in clock.history if quality >= goal), "not reached")
+        print(f"{goal} dB {first}")
     quality, structure = measure(model, photos.select(tested), chosen["render_samples"], pictures)
-    print(f"{len(tested)} test views after {seconds:.0f} s: PSNR {quality:.2f} dB, SSIM {structure:.4f}", flush=True)
+    print(
+        f"{len(tested)} test views after {seconds:.0f} s ({cpu:.0f} s CPU): PSNR {quality:.2f} dB, SSIM {structure:.4f}",
+        flush=True,
+    )
 
 
 class Clock:
@@ -86,23 +89,26 @@ class Clock:
 
     def __init__(self, every: float, model: Model, photos: Photos, samples: int) -> None:
         self.every, self.model, self.photos, self.samples = every, model, photos, samples
-        self.start, self.lost, self.last = time.perf_counter(), 0.0, 0.0
+        self.start, self.last = np.array([time.perf_counter(), time.process_time()]), 0.0
         self.history: list[tuple[float, float]] = []
 
-    def trained(self) -> float:
-        """Seconds of training so far."""
-        return time.perf_counter() - self.start - self.lost
+    def trained(self) -> tuple[float, float]:
+        """Seconds of training so far: wall time and CPU time of all threads."""
+        wall, cpu = np.array([time.perf_counter(), time.process_time()]) - self.start
+        return float(wall), float(cpu)
 
     def tick(self, line: str) -> None:
-        """Print a progress line, and quality when it is time."""
-        seconds = self.trained()
-        if seconds - self.last < self.every:
+        """Print a progress line and the quality, when it is time."""
+        wall, cpu = self.trained()
+        if wall - self.last < self.every:
             return
-        begin, self.last = time.perf_counter(), seconds
+        self.last = wall
         quality, _ = measure(self.model, self.photos, self.samples, None)
-        self.history.append((seconds, quality))
-        self.lost += time.perf_counter() - begin
-        print(f"{seconds:6.0f} s  {quality:.2f} dB on {len(self.photos)} test views | {line}", flush=True)
+        self.history.append((wall, quality))
+        self.start += np.array(self.trained()) - (wall, cpu)
+        print(
+            f"{wall:5.0f} s ({cpu:5.0f} s CPU)  {quality:.2f} dB on {len(self.photos)} test views | {line}", flush=True
+        )
 
 
 def measure(model: Model, photos: Photos, samples: int, pictures: Path | None) -> tuple[float, float]:

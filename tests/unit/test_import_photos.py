@@ -167,6 +167,18 @@ def test_a_known_point_lands_on_its_pixel(tmp_path, form, bent):
     assert set(np.unique(views.mattes)) == {0, 255} or bent
 
 
+def test_a_fisheye_of_colmap_is_straightened(tmp_path):
+    lens = pycolmap.Camera(model="OPENCV_FISHEYE", width=WIDTH, height=HEIGHT, params=[60, 61, 50, 30, 0.02, 0, 0, 0])
+    data = colmap(tmp_path / "in")
+    (data / "sparse/0/cameras.txt").write_text(f"1 OPENCV_FISHEYE {WIDTH} {HEIGHT} {' '.join(map(str, lens.params))}\n")
+    for i, pose in enumerate(poses()):
+        pixel = lens.img_from_cam(pose[:3, :3].T @ (SPOT - pose[:3, 3]))
+        write(data / "images/walk", i, blob(pixel))
+        write(data / "masks/walk", i, ellipse(pixel))
+    views, report = imported(data, tmp_path, masks=data / "masks")
+    assert value(report, "undistorted") == 5 and np.max([*misses(views)]) < 0.15
+
+
 def test_blender_reads_alpha_as_it_is_and_holds_the_test_photos_out(tmp_path):
     views, report = imported(blender(tmp_path / "in"), tmp_path)
     assert views.names == ["test_03.png", "test_04.png", "train_00.png", "train_01.png", "train_02.png"]
