@@ -79,8 +79,7 @@ def lego(
         print(f"{goal} dB {first}")
     quality, structure = measure(model, photos.select(tested), chosen["render_samples"], pictures)
     print(
-        f"{len(tested)} test views after {seconds:.0f} s ({cpu:.0f} s CPU): PSNR {quality:.2f} dB, SSIM {structure:.4f}",
-        flush=True,
+        f"{len(tested)} test views after {seconds:.0f} s ({cpu:.0f} s CPU): PSNR {quality:.2f} dB, SSIM {structure:.4f}"
     )
 
 
