@@ -19,6 +19,7 @@ Picture = NDArray[np.uint8]
 
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
+BLEED_PX = 16
 
 
 def import_photos(
@@ -184,11 +185,11 @@ def _mask(file: Path | None, picture: Picture) -> Picture | None:
 
 
 def _bled(picture: Picture, alpha: Picture) -> Picture:
-    """Transparent pixels get the colour of the nearest other one, so that resampling mixes no background in."""
+    """Transparent pixels near others take the nearest one's colour, so that resampling mixes no background in."""
     if not alpha.any():
         return picture
-    rows, columns = ndimage.distance_transform_edt(alpha == 0, return_distances=False, return_indices=True)
-    return picture[rows, columns]
+    far, (rows, columns) = ndimage.distance_transform_edt(alpha == 0, return_indices=True)
+    return np.where(far[..., None] <= BLEED_PX, picture[rows, columns], 0).astype(np.uint8)
 
 
 def _straightened(

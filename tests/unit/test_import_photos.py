@@ -188,7 +188,8 @@ def test_blender_reads_alpha_as_it_is_and_holds_the_test_photos_out(tmp_path):
     assert np.array_equal(views.mattes[0], alpha[..., 3]) and len(np.unique(views.mattes[0])) > 20
     opaque = alpha[..., 3] > 0
     assert np.array_equal(views.images[0][opaque], alpha[..., 2::-1][opaque])
-    assert views.images[0][~opaque].min() > 0, "transparent pixels have the colour of their neighbours"
+    beside = cv2.dilate(opaque.astype(np.uint8), np.ones((3, 3))).astype(bool) & ~opaque
+    assert views.images[0][beside].min() > 0, "transparent pixels have the colour of their neighbours"
     assert value(report, "masks_exact") is True and value(report, "format") == "Blender"
 
 
