@@ -116,7 +116,7 @@ def measure(model: Model, photos: Photos, samples: int, pictures: Path | None) -
     for view in range(len(photos)):
         everything = torch.ones(photos.masks.shape[1:], dtype=torch.bool)
         camera = photos.intrinsics[view], photos.rotation[view], photos.center[view]
-        rendered = render_view(model.field, model.occupancy, *camera, everything, samples, 0.25)
+        rendered = render_view(model.field, model.occupancy, *camera, everything, samples, 0.25, True)
         matte = photos.mattes[view, ..., None].float() / 255.0
         photo = photos.images[view].float() / 255.0 * matte + 1 - matte
         picture = (rendered.color + 1 - rendered.opacity[..., None]).clamp(0, 1)
