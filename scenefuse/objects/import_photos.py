@@ -13,7 +13,7 @@ from scenefuse.gravity import estimate_up
 from scenefuse.objects.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.objects.supplied import mask_files, matte_of
 from scenefuse.scenes.undistort import UndistortSettings
-from scenefuse.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, value, write_json
 
 Picture = NDArray[np.uint8]
 
@@ -54,7 +54,7 @@ def import_photos(
         raise StageError(f"--masks {masks} is no folder; give the folder of the masks")
     photos, kind = find_posed_photos(data, images)
     files = {} if masks is None else mask_files(masks)
-    source = "folder" if masks is not None else "named" if any(photo.mask for photo in photos) else "alpha"
+    exact = masks is None and not any(photo.mask for photo in photos)
     lenses = _lenses(photos, settings)
     kept: list[tuple[PosedPhoto, str, pycolmap.Camera]] = []
     with atomic_directory(cameras) as workspace, atomic_directory(mattes) as folder:
@@ -62,18 +62,19 @@ def import_photos(
         (workspace / "sparse").mkdir()
         for photo, (lens, target) in zip(photos, lenses):
             picture, alpha = _read(photo.file)
-            mask_file = files.get(Path(photo.name).stem) if source == "folder" else photo.mask
-            matte = _mask(mask_file, picture) if source != "alpha" else alpha
+            file = photo.mask if masks is None else files.get(Path(photo.name).stem)
+            matte = alpha if exact else _mask(file, picture)
             if matte is None:
                 continue
-            stem, ending = Path(photo.name).stem, Path(photo.name).suffix
-            if source != "alpha" and _straight(lens):
+            stem, jpeg = Path(photo.name).stem, Path(photo.name).suffix.lower() in (".jpg", ".jpeg")
+            if exact:
+                picture = _bled(picture, matte)
+            if _straight(lens) and not exact:
                 name = photo.name
                 shutil.copyfile(photo.file, workspace / "images" / name)
             else:
-                name = photo.name if source != "alpha" and ending.lower() in (".jpg", ".jpeg") else f"{stem}.png"
-                whole = _bled(picture, matte) if source == "alpha" else picture
-                _write(workspace / "images" / name, _straightened(whole, lens, target, settings), settings)
+                name = photo.name if jpeg and not exact else f"{stem}.png"
+                _write(workspace / "images" / name, _straightened(picture, lens, target, settings), settings)
             _write(folder / f"{stem}.png", _straightened(matte, lens, target, settings), settings)
             kept.append((photo, name, target))
         if not kept:
@@ -82,29 +83,35 @@ def import_photos(
         held_out = [name for photo, name, _ in kept if photo.held_out]
         if held_out:
             (workspace / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))
-    left_out = sorted({photo.name for photo in photos} - {photo.name for photo, _, _ in kept})
-    poses = np.stack([photo.object_from_cam for photo, _, _ in kept])
-    up, cue = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
-    bent = sum(not _straight(lens) for lens, _ in lenses)
-    words = {"folder": f"{masks}", "named": "the masks that the data name", "alpha": "the photos' alpha channel"}
+    source = "the photos' alpha channel" if exact else str(masks or "the masks that the data name")
     content = {
         "format": quantity(kind, ""),
-        "photos": quantity(len(kept), "1"),
-        "undistorted": quantity(bent, "1"),
-        "masks_from": quantity(words[source], ""),
-        "masks_exact": quantity(source == "alpha", ""),
-        "left_out_without_mask": quantity(left_out, ""),
+        "masks_from": quantity(source, ""),
+        "masks_exact": quantity(exact, ""),
         "held_out_by_the_data": quantity(held_out, ""),
+        **_described(photos, lenses, kept),
+    }
+    write_json(report, content)
+    left_out = value(content, "left_out_without_mask")
+    print(
+        f"{len(kept)} photos ({kind}), {value(content, 'undistorted')} undistorted, masks from {source}"
+        + (f"; {len(left_out)} left out without a mask, {left_out[0]} for one" if left_out else ""),
+        flush=True,
+    )
+
+
+def _described(photos, lenses, kept):  # type: ignore[no-untyped-def]
+    """What was read, as quantities: counts, sizes, photos left out, which way is up."""
+    poses = np.stack([photo.object_from_cam for photo, _, _ in kept])
+    up, cue = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
+    return {
+        "photos": quantity(len(kept), "1"),
+        "left_out_without_mask": quantity(sorted({p.name for p in photos} - {p.name for p, _, _ in kept}), ""),
+        "undistorted": quantity(sum(not _straight(lens) for lens, _ in lenses), "1"),
         "sizes_px": quantity(sorted({(target.width, target.height) for _, _, target in kept}), "px"),
         "up_in_camera_frame": quantity(up, "1"),
         "up_cue": quantity(cue, ""),
     }
-    write_json(report, content)
-    print(
-        f"{len(kept)} photos ({kind}), {bent} undistorted, masks from {words[source]}"
-        + (f"; {len(left_out)} left out without a mask, {left_out[0]} for one" if left_out else ""),
-        flush=True,
-    )
 
 
 def _no_masks(data: Path, photos: list[PosedPhoto], masks: Path | None, files: dict[str, Path]) -> str:
