@@ -1,5 +1,6 @@
 """The demo's scene and objects judged against the demo's truth; nothing else in the project reads the truth."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +94,62 @@ def evaluate_scene(
     _print(result)
 
 
+@dataclass(frozen=True)
+class ObjectTruth:
+    """An object of the demo as it truly is, and the photos of its model placed in the truth; lengths in metres.
+
+    Attributes:
+        diagonal: of its bounding box.
+        middle: (3,) of its bounding box.
+        mesh: its surface.
+        rest: terrain and clutter.
+        everything: ray caster of the object, as mesh 0, and all else that stands there.
+        orbit: the true cameras.
+        posed: the photos of its model.
+        fit: of their cameras to the true ones.
+        surface: (N, 3) points spread over its surface.
+        seen: (N,) those that any photo of the orbit sees.
+    """
+
+    diagonal: float
+    middle: Array
+    mesh: Mesh
+    rest: Mesh
+    everything: Any
+    orbit: Cameras
+    posed: PosedModel
+    fit: CameraFit
+    surface: Array
+    seen: NDArray[np.bool_]
+
+
+def read_object_truth(cameras: Path, truth_scene: Path, truth_object: Path, samples: int, seed: int) -> ObjectTruth:
+    """The truth of an object and the poses of its model in it; arguments and errors as in `evaluate_object`."""
+    orbit = read_cameras(truth_object / "cameras.json")
+    extent = read_json(truth_object / "cameras.json")["object"]
+    mesh, rest = read_mesh(truth_object / "mesh.ply"), read_mesh(truth_scene / "meshes" / "world.ply")
+    others = [
+        read_mesh(path)
+        for path in sorted((truth_scene / "meshes").glob("*.ply"))
+        if path.stem not in ("world", truth_object.name)
+    ]
+    everything = cast_together([mesh, rest, *others])
+    posed = read_posed(cameras / "sparse", orbit)
+    surface = sample_surface(mesh, samples, seed)
+    return ObjectTruth(
+        float(value(extent, "diagonal")),
+        np.array(value(extent, "middle")),
+        mesh,
+        rest,
+        everything,
+        orbit,
+        posed,
+        fit_cameras(posed, orbit),
+        surface,
+        np.asarray(visible(everything, orbit, surface, _HIDDEN)[1].any(0)),
+    )
+
+
 def evaluate_object(
     *,
     cameras: Path,
@@ -139,48 +196,38 @@ def evaluate_object(
     Raises:
         StageError: a truth file is missing, or knows fewer than three of the model's photos.
     """
-    orbit, flight = read_cameras(truth_object / "cameras.json"), read_cameras(truth_scene / "cameras.json")
-    extent = read_json(truth_object / "cameras.json")["object"]
-    diagonal, middle = float(value(extent, "diagonal")), np.array(value(extent, "middle"))
-    mesh, rest = read_mesh(truth_object / "mesh.ply"), read_mesh(truth_scene / "meshes" / "world.ply")
-    others = [
-        read_mesh(path)
-        for path in sorted((truth_scene / "meshes").glob("*.ply"))
-        if path.stem not in ("world", truth_object.name)
-    ]
-    everything = cast_together([mesh, rest, *others])
-    posed = read_posed(cameras / "sparse", orbit)
-    fit = fit_cameras(posed, orbit)
-    truth_from_object = fit.truth_from_model
+    known = read_object_truth(cameras, truth_scene, truth_object, samples, seed)
+    orbit, mesh, diagonal = known.orbit, known.mesh, known.diagonal
+    truth_from_object = known.fit.truth_from_model
     truth_from_scene = Sim3.from_matrix(np.array(value(read_json(scene_evaluation), "truth_from_scene")))
 
-    surface = sample_surface(mesh, samples, seed)
-    by_orbit = visible(everything, orbit, surface, _HIDDEN)[1].any(0)
-    by_any = by_orbit | visible(everything, flight, surface, _HIDDEN)[1].any(0)
+    flight = read_cameras(truth_scene / "cameras.json")
+    by_any = known.seen | visible(known.everything, flight, known.surface, _HIDDEN)[1].any(0)
+    to_find = known.surface[known.seen]
     object_points = read_cloud(cloud).points
     result: dict[str, Any] = {
         "diagonal": quantity(diagonal, "m"),
-        **_mask_results(masks, posed, truth_object / "masks", orbit),
-        **_camera_results(fit, len(orbit.names)),
-        "camera_position_over_diagonal": quantity(float(np.median(fit.position)) / diagonal, "1"),
-        **_depth_results(stages, posed, truth_from_object, everything, diagonal, max_photos),
-        **_cloud_results(truth_from_object.apply(object_points), mesh, surface[by_orbit], diagonal, samples, seed),
+        **_mask_results(masks, known.posed, truth_object / "masks", orbit),
+        **_camera_results(known.fit, len(orbit.names)),
+        "camera_position_over_diagonal": quantity(float(np.median(known.fit.position)) / diagonal, "1"),
+        **depth_results(stages, known, max_photos),
+        **cloud_results(truth_from_object.apply(object_points), known, samples, seed),
     }
     true = truth_from_scene.inverse() @ truth_from_object
-    middle_in_object = truth_from_object.inverse().apply(middle)
+    middle_in_object = truth_from_object.inverse().apply(known.middle)
     scene_diagonal = diagonal / truth_from_scene.scale
 
     def judged(path: Path) -> dict[str, Any]:
         return _arm_results(
             read_json(path), true, middle_in_object, scene_diagonal, truth_from_scene, object_points, mesh,
-            surface[by_orbit], diagonal, samples, seed,
+            to_find, diagonal, samples, seed,
         )  # fmt: skip
 
     arm_results = {path.parent.name: judged(path) for path in arms}
     result |= next(iter(arm_results.values()), {})
     if witness is not None:
         result |= {f"witness_{name}": entry for name, entry in judged(witness).items() if name != "status"}
-    result |= _scene_results(before, after, truth_from_scene, mesh, rest, surface[by_any], diagonal)
+    result |= _scene_results(before, after, truth_from_scene, mesh, known.rest, known.surface[by_any], diagonal)
     result |= {"tau": quantity(0.01 * diagonal, "m"), "arms": arm_results}
     write_json(evaluation, result)
     _print(result)
@@ -232,10 +279,9 @@ def _mask_results(masks: Path, posed: PosedModel, true_masks: Path, orbit: Camer
     }
 
 
-def _depth_results(
-    stages: list[Path], posed: PosedModel, truth_from_object: Sim3, scene: Any, diagonal: float, max_photos: int
-) -> dict[str, Any]:
+def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int) -> dict[str, Any]:
     """Depth errors of every stage over pixels that truly show the object; a missing depth is outside the 1 %."""
+    posed, truth_from_object = known.posed, known.fit.truth_from_model
     chosen = np.unique(np.linspace(0, len(posed.names) - 1, min(max_photos, len(posed.names))).astype(int))
     result: dict[str, Any] = {}
     for stage in stages:
@@ -245,11 +291,12 @@ def _depth_results(
             if not path.is_file():
                 continue
             depth = read_depth(path)
-            true, hit = true_depth(scene, posed, int(k), truth_from_object, (depth.shape[1], depth.shape[0]))
+            size = depth.shape[1], depth.shape[0]
+            true, hit = true_depth(known.everything, posed, int(k), truth_from_object, size)
             on_object = hit == 0
             pixels += int(on_object.sum())
             valid = on_object & (depth > 0)
-            errors.append(np.abs(depth[valid] * truth_from_object.scale - true[valid]) / diagonal)
+            errors.append(np.abs(depth[valid] * truth_from_object.scale - true[valid]) / known.diagonal)
         error = np.concatenate(errors)
         result |= {
             f"{stage.name}_depth_error": quantity(float(np.median(error)) if len(error) else None, "diagonals"),
@@ -259,12 +306,10 @@ def _depth_results(
     return result
 
 
-def _cloud_results(
-    points: Array, mesh: Mesh, surface: Array, diagonal: float, samples: int, seed: int
-) -> dict[str, Any]:
+def cloud_results(points: Array, known: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
     """Accuracy, completeness and F-scores of the object's cloud, in the truth's frame."""
-    to_mesh = distances(mesh.caster(), _draw(points, samples, seed)) / diagonal
-    to_cloud = nearest(surface, points) / diagonal
+    to_mesh = distances(known.mesh.caster(), _draw(points, samples, seed)) / known.diagonal
+    to_cloud = nearest(known.surface[known.seen], points) / known.diagonal
     result = {
         "cloud_accuracy_median": quantity(100 * float(np.median(to_mesh)), "% of the diagonal"),
         "cloud_accuracy_90": quantity(100 * float(np.quantile(to_mesh, 0.9)), "% of the diagonal"),
