@@ -1,0 +1,214 @@
+"""What each part of the four stages is worth: the demo's objects again without it, over seeds, judged by the truth.
+
+make demo; then python tests/benchmarks/object_ablation.py --results results --objects house --seeds 3
+"""
+
+import tempfile
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+import torch
+
+from scenefuse.clouds import read_cloud
+from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.truth import belongs_to_object, distances
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.quality import psnr
+from scenefuse.nerf.train import Schedule
+from scenefuse.objects.cloud import CloudSettings, object_cloud
+from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.train_nerf import NerfSettings, train_nerf
+from scenefuse.objects.views import load_views
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import StageError, run, value
+
+OTHER_POSE_RATE = 5e-4
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What differs from the full recipe."""
+
+    nerf: dict[str, Any] = field(default_factory=dict)
+    masks: bool = True
+    prior: bool = True
+    feedback: bool = True
+    long: bool = False
+    """stage 2 alone, with stage 4's epochs added"""
+
+
+def arms(settings: dict[str, Any]) -> dict[str, Arm]:
+    """All arms; that of the poses takes what the settings do not."""
+    refined = settings["nerf"]["pose_learning_rate"] > 0
+    other = 0.0 if refined else OTHER_POSE_RATE
+    return {
+        "full": Arm(),
+        "no_masks": Arm(masks=False),
+        "no_depth": Arm(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
+        "no_relative_depth": Arm(nerf={"rank_weight": 0}),
+        "no_feedback": Arm(feedback=False),
+        "poses_of_sfm" if refined else "poses_refined": Arm(nerf={"pose_learning_rate": other}),
+        "no_adaptive_grid": Arm(nerf={"edge_boost": 0}),
+        "stage2_longer": Arm(long=True),
+    }
+
+
+def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[str, Any], photos: int) -> dict[str, Any]:
+    """Stages 2 to 4 and the cloud of one object again, from the workflow's cameras, masks and stage 1, and measured."""
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary)
+        masks = folder / "masks" if arm.masks else white(folder / "masks", work / "masks")
+        inputs: dict[str, Any] = {"cameras": folder / "cameras", "masks": masks}
+        common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
+
+        def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
+            own = settings["nerf"] | arm.nerf | {"epochs": epochs}
+            train_nerf(
+                **inputs, **common, prior=prior if arm.prior else None, previous=previous, stage=work / f"stage{stage}",
+                report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
+                schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
+            )  # fmt: skip
+
+        early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
+        nerf(2, folder / "stage1", None, early + late if arm.long else early)
+        prior = folder / "stage1"
+        if arm.feedback and arm.prior and not arm.long:
+            prior = work / "stage3"
+            refine_depth(
+                **inputs, **common, previous=folder / "stage1", rendered=work / "stage2", stage=prior,
+                report=work / "stage3.json", settings=build(FeedbackSettings, settings["stage3"]),
+            )  # fmt: skip
+        if not arm.long:
+            nerf(4, prior, work / "stage2", late)
+        last = work / ("stage2" if arm.long else "stage4")
+        seconds = time.monotonic() - start
+        depth = depth_results([work / "stage2", last], truth, photos)
+        return {
+            "depth_2_pct": 100 * value(depth, "stage2_depth_error"),
+            "depth_4_pct": 100 * value(depth, f"{last.name}_depth_error"),
+            "within_4": value(depth, f"{last.name}_depth_within_1pct"),
+            "psnr_2": held_out_psnr(folder, work / "stage2", settings),
+            "psnr_4": held_out_psnr(folder, last, settings),
+            **cloud(folder, inputs, last, truth, settings, seed),
+            "seconds": seconds,
+        }
+
+
+def cloud(
+    folder: Path, inputs: dict[str, Any], last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
+) -> dict[str, Any]:
+    """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
+    path = last.with_name("object.ply")
+    try:
+        object_cloud(
+            **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "cameras.json",
+            cloud=path, report=path.with_suffix(".json"), settings=build(CloudSettings, settings["cloud"]), seed=seed,
+        )  # fmt: skip
+    except StageError as error:
+        print(f"no cloud: {error}", flush=True)
+        return {"accuracy_pct": np.nan, "f_05": 0.0, "f_1": 0.0, "f_1_cut": 0.0}
+    points = truth.fit.truth_from_model.apply(read_cloud(path).points)
+    low, high = truth.surface.min(0), truth.surface.max(0)
+    to_object, to_rest = (distances(mesh.caster(), points) for mesh in (truth.mesh, truth.rest))
+    own = belongs_to_object(points, to_object, to_rest, low, high, 0.05 * truth.diagonal)
+    whole, cut = (cloud_results(p, truth, len(truth.surface), seed) for p in (points, points[own]))
+    return {
+        "accuracy_pct": value(whole, "cloud_accuracy_median"),
+        "f_05": value(whole, "cloud_f_score_05pct"),
+        "f_1": value(whole, "cloud_f_score_1pct"),
+        "f_1_cut": value(cut, "cloud_f_score_1pct"),
+    }
+
+
+def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> float:
+    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every arm."""
+    views = load_views(folder / "cameras", folder / "masks", settings["nerf"]["width_px"], settings["hold_out_every"])
+    scores = []
+    for index in np.flatnonzero(views.held_out):
+        render = cv2.imread(str(stage / "renders" / f"{Path(views.names[index]).stem}.png"))[..., ::-1].copy()
+        pictures = (torch.from_numpy(p).float() / 255 for p in (render, views.images[index]))
+        scores.append(psnr(*pictures, torch.from_numpy(views.masks[index])))
+    return float(np.mean(scores))
+
+
+def white(masks: Path, folder: Path) -> Path:
+    """Masks of the same photos in which everything is the object."""
+    folder.mkdir()
+    for path in masks.glob("*.png"):
+        cv2.imwrite(str(folder / path.name), np.full_like(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), 255))
+    return folder
+
+
+def object_ablation(
+    *,
+    results: Path = Path("results"),
+    objects: tuple[str, ...] = ("house", "balloon", "sculpture"),
+    seeds: int = 3,
+    only: tuple[str, ...] = (),
+    settings: Path | None = None,
+) -> None:
+    """Print mean and spread of every arm over seeds as Markdown; all runs go to bench/object_ablation.tsv.
+
+    Stage 1 is the workflow's in every arm. `no_masks` calls everything the object, for the NeRF and for the cloud;
+    its cloud thus holds the surroundings, which `F 1 %, cut` leaves out. `no_depth` has no prior at all, `no_feedback`
+    takes stage 1's depth in stage 4. Depth errors are medians over pixels that truly show the object.
+
+    Args:
+        results: folder of a finished demo.
+        objects: of the demo.
+        seeds: 0 to this.
+        only: these arms; none for all.
+        settings: laid over the shipped ones, or none.
+    """
+    shipped = shipped_with(settings)
+    own, judge = shipped["object"], shipped["evaluation"]["object"]
+    out = results / "bench/object_ablation.tsv"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    chosen = {name: arm for name, arm in arms(own).items() if not only or name in only}
+    for name in objects:
+        folder, known = results / "objects" / name, results / "demo/demo/truth"
+        truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], shipped["seed"])
+        for arm in chosen:
+            for seed in range(seeds):
+                print(f"{name} {arm} {seed}", flush=True)
+                measured = one(folder, truth, chosen[arm], seed, own, judge["max_photos"])
+                rows.append({"object": name, "arm": arm, "seed": seed} | measured)
+                pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
+    print_table(pd.DataFrame(rows), seeds)
+
+
+HEAD = {
+    "depth_2_pct": "depth error after stage 2 (%)",
+    "depth_4_pct": "after stage 4 (%)",
+    "within_4": "within 1 %",
+    "psnr_2": "PSNR, stage 2 (dB)",
+    "psnr_4": "stage 4 (dB)",
+    "accuracy_pct": "cloud accuracy (%)",
+    "f_05": "F 0.5 %",
+    "f_1": "F 1 %",
+    "f_1_cut": "F 1 %, cut",
+    "seconds": "seconds",
+}
+
+
+def print_table(table: pd.DataFrame, seeds: int) -> None:
+    groups = table.groupby(["object", "arm"], sort=False)[list(HEAD)]
+    means, spreads = groups.mean(), groups.std().fillna(0)
+    print(f"\nMean ± standard deviation over {seeds} seeds; lengths in % of the object's diagonal.\n")
+    print("| object | arm | " + " | ".join(HEAD.values()) + " |")
+    print("|---|---|" + "---|" * len(HEAD))
+    for key in means.index:
+        cells = [f"{means.loc[key, c]:.3g} ± {spreads.loc[key, c]:.1g}" for c in HEAD]
+        print(f"| {key[0]} | `{key[1]}` | " + " | ".join(cells) + " |")
+
+
+if __name__ == "__main__":
+    run(object_ablation)

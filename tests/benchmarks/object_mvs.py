@@ -1,0 +1,188 @@
+"""The demo's objects by dense multi-view stereo alone, on the same photos and masks, beside the four stages.
+
+make demo; then python tests/benchmarks/object_mvs.py --results results
+"""
+
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from scenefuse.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
+from scenefuse.maps import read_depth, read_normals, write_depth
+from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.nerf.agreement import compare
+from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths
+from scenefuse.objects.views import Views, load_views
+from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
+from scenefuse.scenes.plane_sweep import DepthSettings
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import StageError, read_json, run, value
+
+# Depth maps: the scene's settings; those made for an orbit; the same, keeping what matches less well.
+DEPTH: dict[str, dict[str, Any]] = {
+    "scene": {},
+    "orbit": {"min_angle_deg": 4, "planes": 128, "sweep_reduction": 1, "window_px": 9},
+    "orbit_complete": {"min_angle_deg": 4, "planes": 128, "sweep_reduction": 1, "window_px": 9, "min_score": 0.3},
+}
+# Their fusion: COLMAP's as for the scene; stricter, since the photos are near; looser; that of the object's cloud.
+FUSION: dict[str, dict[str, Any] | None] = {
+    "scene": {},
+    "strict": {"max_depth_error": 0.005, "max_reprojection_px": 1},
+    "two_photos": {"min_photos": 2},
+    "object": None,
+}
+STAGES = ("stage1", "stage2", "stage3", "stage4", "object_cloud")
+
+
+def mask_depths(depth: Path, views: Views) -> None:
+    """Depths off the mask are no object's."""
+    for name, mask in zip(views.names, views.masks):
+        path = depth / "depth_maps" / f"{name}.bin"
+        if path.is_file():
+            write_depth(path, np.where(mask, read_depth(path), 0).astype(np.float32))
+
+
+def fused(
+    folder: Path, depth: Path, report: Path, views: Views, own: dict[str, Any], over: dict[str, Any] | None
+) -> Cloud:
+    """The maps as one cloud, in which no point is off more masks than the object's cloud allows."""
+    settings = build(CloudSettings, own["cloud"])
+    if over is None:
+        read = [(f"{name}.bin", np.zeros(mask.shape, np.float32)) for name, mask in zip(views.names, views.masks)]
+        depths = np.stack([read_depth(p) if (p := depth / "depth_maps" / n).is_file() else z for n, z in read])
+        normals = np.stack(
+            [read_normals(p) if (p := depth / "normal_maps" / n).is_file() else np.stack([z] * 3, -1) for n, z in read]
+        )
+        return fuse_depths(views, views.object_from_cam, depths, (depths > 0).astype(np.float32), normals, settings)[0]
+    path = depth.with_name("fused.ply")
+    fuse_depth_maps(
+        workspace=folder / "cameras", depth=[depth], depth_reports=[report], cloud=path,
+        report=path.with_suffix(".json"), settings=build(FusionSettings, own["dense_cloud"] | over),
+    )  # fmt: skip
+    cloud = read_cloud(path)
+    grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for m in views.masks])
+    nothing = np.zeros(grown.shape, np.float32)
+    said = compare(cloud.points, -1, nothing, grown, views.intrinsics, views.object_from_cam, 0.0)
+    return cloud[said.off_mask <= settings.mask_share * len(grown)]
+
+
+def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures: Path) -> list[dict[str, Any]]:
+    """Every way to make depth maps with every way to fuse them."""
+    own = settings["object"] | {key: settings["scene"][key] for key in ("depth_maps", "dense_cloud")}
+    width, cloud_settings = own["nerf"]["width_px"], build(CloudSettings, own["cloud"])
+    views = load_views(folder / "cameras", folder / "masks", width, 0)
+    step = cloud_settings.spacing * value(read_json(folder / "object.json"), "diagonal")
+    judge, rows = settings["evaluation"]["object"], []
+    for maps, over in DEPTH.items():
+        with tempfile.TemporaryDirectory() as temporary:
+            depth, report = Path(temporary) / maps, Path(temporary) / "depth.json"
+            start, began = time.monotonic(), os.times()
+            estimate_depth_maps(
+                workspace=folder / "cameras", chunk=0, chunks=1, backend=own["depth_maps"]["backend"],
+                settings=build(DepthSettings, own["depth_maps"] | {"max_image_size_px": width} | over),
+                seed=settings["seed"], depth=depth, report=report,
+            )  # fmt: skip
+            mask_depths(depth, views)
+            wall, cpu = time.monotonic() - start, used(began)
+            errors = depth_results([depth], truth, judge["max_photos"])
+            for fusion, changes in FUSION.items():
+                start, began = time.monotonic(), os.times()
+                try:
+                    cloud = fused(folder, depth, report, views, own, changes)
+                except StageError as error:
+                    print(f"{maps}, {fusion}: {error}", flush=True)
+                    continue
+                cloud = voxel_downsample(cloud, step)
+                cloud = clean(cloud, cloud_settings.outlier_deviations, cloud_settings.min_component, step)
+                seconds, work = wall + time.monotonic() - start, cpu + used(began)
+                write_cloud(pictures / f"{folder.name}_{maps}_{fusion}.ply", cloud)
+                rows.append(
+                    {"object": folder.name, "method": "mvs", "maps": maps, "fusion": fusion}
+                    | {"depth_pct": 100 * (value(errors, f"{maps}_depth_error") or np.nan)}
+                    | {"within_1pct": value(errors, f"{maps}_depth_within_1pct")}
+                    | judged(cloud, truth, judge["samples"], settings["seed"])
+                    | {"seconds": seconds, "cpu_seconds": work}
+                )
+                print(rows[-1], flush=True)
+    return rows
+
+
+def used(began: os.times_result) -> float:
+    """Processor seconds of this process since then."""
+    now = os.times()
+    return now.user + now.system - began.user - began.system
+
+
+def judged(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
+    found = cloud_results(truth.fit.truth_from_model.apply(cloud.points), truth, samples, seed)
+    return {
+        "points": len(cloud),
+        "accuracy_pct": value(found, "cloud_accuracy_median"),
+        "accuracy_90_pct": value(found, "cloud_accuracy_90"),
+        "complete_05": value(found, "cloud_completeness_05pct"),
+        "complete_1": value(found, "cloud_completeness_1pct"),
+        "f_05": value(found, "cloud_f_score_05pct"),
+        "f_1": value(found, "cloud_f_score_1pct"),
+    }
+
+
+def four_stages(results: Path, name: str, truth: ObjectTruth, settings: dict[str, Any]) -> dict[str, Any]:
+    """The workflow's cloud, judged alike, and the time of its stages."""
+    folder, judge = results / "objects" / name, settings["evaluation"]["object"]
+    times = [pd.read_csv(results / f"benchmarks/{stage}/{name}.tsv", sep="\t").iloc[-1] for stage in STAGES]
+    errors = depth_results([folder / "stage4"], truth, judge["max_photos"])
+    return (
+        {"object": name, "method": "four stages", "maps": "stage4", "fusion": "object"}
+        | {"depth_pct": 100 * value(errors, "stage4_depth_error")}
+        | {"within_1pct": value(errors, "stage4_depth_within_1pct")}
+        | judged(read_cloud(folder / "object.ply"), truth, judge["samples"], settings["seed"])
+        | {"seconds": sum(t["s"] for t in times), "cpu_seconds": sum(t["cpu_time"] for t in times)}
+    )
+
+
+def object_mvs(
+    *,
+    results: Path = Path("results"),
+    objects: tuple[str, ...] = ("house", "balloon", "sculpture"),
+    settings: Path | None = None,
+) -> None:
+    """Print the clouds of multi-view stereo and of the four stages; all trials go to bench/object_mvs.tsv.
+
+    Multi-view stereo is the scene's own (plane sweep and slanted refinement, or COLMAP's patch-match with CUDA;
+    COLMAP's fusion) at the width of the NeRF, on all photos; its depths off the mask are dropped before fusion, its
+    points off the masks after, and it is thinned and cleaned like the object's cloud. The best trial by F at 1 % is
+    marked.
+
+    Args:
+        results: folder of a finished demo.
+        objects: of the demo.
+        settings: laid over the shipped ones, or none.
+    """
+    chosen, rows = shipped_with(settings), []
+    out = results / "bench/object_mvs.tsv"
+    (out.parent / "object_mvs").mkdir(parents=True, exist_ok=True)
+    judge, known = chosen["evaluation"]["object"], results / "demo/demo/truth"
+    for name in objects:
+        folder = results / "objects" / name
+        truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], chosen["seed"])
+        rows += [four_stages(results, name, truth, chosen)]
+        rows += trials(folder, truth, chosen, out.parent / "object_mvs")
+        pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
+    table = pd.DataFrame(rows)
+    best = table[table.method == "mvs"].groupby("object").f_1.idxmax()
+    columns = list(table.columns[4:])
+    print("\n| object | method | " + " | ".join(columns) + " |\n|---|---|" + "---|" * len(columns))
+    for index, row in table.iterrows():
+        method = row.method if row.method != "mvs" else f"MVS: {row.maps}, {row.fusion}"
+        method += " (its best)" if index in set(best) else ""
+        print(f"| {row.object} | {method} | " + " | ".join(f"{row[c]:.3g}" for c in columns) + " |")
+
+
+if __name__ == "__main__":
+    run(object_mvs)
