@@ -107,7 +107,7 @@ def make_masks(
         StageError: prompts, weights or masks are missing or wrong; too few good masks.
     """
     cv2.setNumThreads(threads())
-    frames, sparse = _read_frames(cameras)
+    frames, sparse = read_frames(cameras)
     up = np.array(value(read_json(cameras_json), "up_in_camera_frame"), dtype=np.float64)
     without: dict[str, str] = {}
     if method == "supplied":
@@ -222,7 +222,7 @@ def _judged(masks: list[Mask], frames: list[Frame], target: Target, settings: Ma
     return _Made(masks, scores, dropped, hull)
 
 
-def _read_frames(cameras: Path) -> tuple[list[Frame], Array]:
+def read_frames(cameras: Path) -> tuple[list[Frame], Array]:
     """The photos of an undistorted workspace in name order, and the (P, 3) sparse points."""
     try:
         model = pycolmap.Reconstruction(cameras / "sparse")

@@ -1,0 +1,72 @@
+"""Judge the masks of config/examples/alexander by the supplied ones, after that workflow has run; GrabCut beside SAM 2.
+
+python tests/benchmarks/alexander.py --results results --given data/alexander/masks
+"""
+
+import tempfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+
+from scenefuse.metrics.truth import mask_iou
+from scenefuse.objects.masks import MaskSettings, make_masks, read_frames
+from scenefuse.objects.supplied import supplied_masks
+from scenefuse.settings import ROOT, build, shipped_with
+from scenefuse.stage import read_json, run, value
+
+EXAMPLE = ROOT / "config/examples/alexander"
+WRONG = {"DSC05138.JPG"}
+"""The supplied mask of this photo is another photo's."""
+
+
+def alexander(*, results: Path, given: Path) -> None:
+    """Print the IoU of the masks with the supplied ones, and the NeRF's quality; all to bench/alexander.tsv.
+
+    The supplied masks are undistorted like the photos. A photo that a method leaves out counts for neither its mean
+    nor its median, and is counted beside them. GrabCut runs here, with the same prompts and cameras.
+
+    Args:
+        results: the results folder of the workflow.
+        given: folder of supplied masks.
+    """
+    folder, shipped = results / "objects/alexander", shipped_with(EXAMPLE / "config.yaml")
+    frames, _ = read_frames(folder / "cameras")
+    supplied = supplied_masks(given, folder / "sfm", frames)
+    with tempfile.TemporaryDirectory() as temporary:
+        work = Path(temporary)
+        make_masks(
+            cameras=folder / "cameras", cameras_json=folder / "cameras.json", sfm=folder / "sfm",
+            photos=folder / "photos.json", method="grabcut", prompts=EXAMPLE / "prompts.tsv", supplied=None,
+            sam2_encoder=None, sam2_decoder=None, settings=build(MaskSettings, shipped["object"]["masks"]),
+            seed=shipped["seed"], masks=work / "masks", contact_sheet=results / "bench/alexander_grabcut.png",
+            report=work / "masks.json",
+        )  # fmt: skip
+        rows = []
+        for method, masks in (("sam2", folder / "masks"), ("grabcut", work / "masks")):
+            for name in sorted(set(supplied) - WRONG):
+                mask = cv2.imread(str(masks / f"{Path(name).stem}.png"), cv2.IMREAD_GRAYSCALE)
+                iou = np.nan if mask is None else mask_iou(mask > 127, supplied[name])
+                rows.append({"method": method, "photo": name, "iou": iou})
+    table = pd.DataFrame(rows)
+    table.to_csv(results / "bench/alexander.tsv", sep="\t", index=False, float_format="%.4f")
+    for method, part in table.groupby("method", sort=False):
+        known = part.dropna()
+        worst = known.sort_values("iou").head(5)
+        listed = ", ".join(f"{photo} {iou:.3f}" for photo, iou in zip(worst.photo, worst.iou))
+        print(
+            f"{method}: {len(known)} of {len(part)} photos, IoU mean {known.iou.mean():.3f}, "
+            f"median {known.iou.median():.3f}, above 0.95 in {(known.iou > 0.95).sum()}; least: {listed}"
+        )
+    for stage in ("stage2", "stage4"):
+        report = read_json(folder / f"{stage}.json")
+        print(
+            f"{stage}: held-out PSNR inside the mask {value(report, 'psnr_held_out'):.2f} dB, SSIM "
+            f"{value(report, 'ssim'):.3f}, silhouettes' IoU {value(report, 'silhouette_iou'):.3f}, "
+            f"{value(report, 'photos_measured')} photos"
+        )
+
+
+if __name__ == "__main__":
+    run(alexander)

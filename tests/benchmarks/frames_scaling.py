@@ -1,0 +1,195 @@
+"""What more photos cost: time and memory of the four stages and the cloud of a demo object with 100, 200, 400 photos.
+
+python tests/benchmarks/frames_scaling.py --work results/bench/frames --frames 100 200 400
+"""
+
+import importlib
+import os
+import resource
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from functools import wraps
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pycolmap
+
+from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.demo.capture import OrbitSettings, render_object
+from scenefuse.metrics.truth import read_mesh, sample_surface
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.train import Schedule
+from scenefuse.objects.cloud import CloudSettings, object_cloud
+from scenefuse.objects.depth import DepthSettings, train_depth
+from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.train_nerf import NerfSettings, train_nerf
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import quantity, run, write_json
+
+# Functions of a stage whose share is listed by itself: module, function -> part.
+PARTS = {
+    ("scenefuse.objects.depth", "load_views"): "loading",
+    ("scenefuse.objects.depth", "network_inputs"): "plane sweep",
+    ("scenefuse.objects.depth", "train_networks"): "training",
+    ("scenefuse.objects.feedback", "load_views"): "loading",
+    ("scenefuse.objects.feedback", "network_inputs"): "plane sweep",
+    ("scenefuse.objects.feedback", "train_networks"): "training",
+    ("scenefuse.objects.train_nerf", "load_views"): "loading",
+    ("scenefuse.objects.train_nerf", "make_photos"): "loading",
+    ("scenefuse.objects.train_nerf", "_volume"): "visual hull",
+    ("scenefuse.objects.train_nerf", "train"): "training",
+    ("scenefuse.objects.train_nerf", "_render_all"): "rendering",
+    ("scenefuse.objects.train_nerf", "_confidence"): "confidence",
+    ("scenefuse.objects.cloud", "load_views"): "loading",
+    ("scenefuse.objects.cloud", "_maps"): "loading",
+    ("scenefuse.objects.cloud", "fuse_depths"): "fusion",
+}
+
+
+def workspace(photos: Path, truth: Path, chosen: list[int], folder: Path, seed: int) -> None:
+    """An undistorted workspace, its report and masks from the capture's true cameras: only the cost is measured."""
+    cameras = read_cameras(truth / "cameras.json")
+    for name in ("images", "sparse"):
+        (folder / "cameras" / name).mkdir(parents=True)
+    (folder / "masks").mkdir()
+    model, k = pycolmap.Reconstruction(), cameras.intrinsics
+    pinhole = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=cameras.width, height=cameras.height, params=pinhole, camera_id=1)
+    )
+    few = Cameras(
+        [cameras.names[i] for i in chosen], k, cameras.width, cameras.height,
+        cameras.cam_from_world[chosen], cameras.centres[chosen],
+    )  # fmt: skip
+    mesh = read_mesh(truth / "mesh.ply")
+    points = sample_surface(mesh, 4000, seed)
+    pixels, seen = visible(mesh.caster(), few, points, 0.02)
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in points]
+    for index, name in enumerate(few.names):
+        rows = np.flatnonzero(seen[index])
+        image = pycolmap.Image(
+            name=name, camera_id=1, image_id=index + 1, points2D=[pycolmap.Point2D(p) for p in pixels[index, rows]]
+        )
+        turn = few.cam_from_world[index]
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([turn, -turn @ few.centres[index]])))
+        for place, row in enumerate(rows):
+            tracks[row].append(pycolmap.TrackElement(index + 1, place))
+        (folder / "cameras/images" / name).symlink_to((photos / name).resolve())
+        mask = f"{Path(name).stem}.png"
+        (folder / "masks" / mask).symlink_to((truth / "masks" / mask).resolve())
+    for point, track in zip(points, tracks):
+        if len(track) > 1:
+            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    model.write_binary(folder / "cameras/sparse")
+    write_json(folder / "cameras.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
+
+
+def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str, float]:
+    """Run one stage in this process: processor seconds of it and of its parts, and the process's largest memory."""
+    spent: dict[str, float] = {}
+    for (module, function), label in PARTS.items():
+        home = importlib.import_module(module)
+        setattr(home, function, timed(getattr(home, function), label, spent))
+    inputs: dict[str, Any] = {"cameras": folder / "cameras", "masks": folder / "masks"}
+    common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
+
+    def nerf(number: int, prior: int, previous: Path | None) -> None:
+        settings = own["nerf"] | own[f"stage{number}"]
+        train_nerf(
+            **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
+            report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
+            schedule=build(Schedule, settings), losses=build(LossWeights, settings),
+            settings=build(NerfSettings, settings),
+        )  # fmt: skip
+
+    start, began = time.monotonic(), os.times()
+    if part == "stage1":
+        train_depth(
+            **inputs, **common, stage=folder / part, report=folder / "stage1.json",
+            pose_source=own["stage1"]["pose_source"], settings=build(DepthSettings, own["stage1"]),
+        )  # fmt: skip
+    elif part == "stage2":
+        nerf(2, 1, None)
+    elif part == "stage3":
+        refine_depth(
+            **inputs, **common, previous=folder / "stage1", rendered=folder / "stage2", stage=folder / part,
+            report=folder / "stage3.json", settings=build(FeedbackSettings, own["stage3"]),
+        )  # fmt: skip
+    elif part == "stage4":
+        nerf(4, 3, folder / "stage2")
+    else:
+        object_cloud(
+            **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
+            cameras_report=folder / "cameras.json", cloud=folder / "object.ply", report=folder / "object.json",
+            settings=build(CloudSettings, own["cloud"]),
+        )  # fmt: skip
+    now = os.times()
+    total = now.user + now.system - began.user - began.system
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    rest = {"rest": total - sum(spent.values())}
+    return {"total": total, "wall": time.monotonic() - start, "memory_gib": memory} | spent | rest
+
+
+def timed(function: Callable[..., Any], label: str, spent: dict[str, float]) -> Callable[..., Any]:
+    """The same function, its processor seconds added to `spent`."""
+
+    @wraps(function)
+    def measured(*args: Any, **named: Any) -> Any:
+        began = os.times()
+        try:
+            return function(*args, **named)
+        finally:
+            now = os.times()
+            spent[label] = spent.get(label, 0.0) + now.user + now.system - began.user - began.system
+
+    return measured
+
+
+def frames_scaling(
+    *, work: Path, name: str = "sculpture", frames: tuple[int, ...] = (100, 200, 400), settings: Path | None = None
+) -> None:
+    """Print processor seconds and memory by number of photos; all go to frames_scaling.tsv in the work folder.
+
+    Cameras, sparse points and masks are the capture's true ones, since only the cost is measured. An epoch of a NeRF
+    stage is a number of rays, whatever the number of photos. The exponent e says that the cost grows like photos^e,
+    from the fewest to the most: up to 1 is no faster than the photos.
+
+    Args:
+        work: folder for capture and results; a capture that is there is used again.
+        name: object of the demo.
+        frames: numbers of photos, each taken evenly from the largest capture.
+        settings: laid over the shipped ones, or none.
+    """
+    shipped = shipped_with(settings)
+    own, seed, most = shipped["object"], shipped["seed"], max(frames)
+    photos, truth = work / f"photos_{name}_{most}", work / f"truth_{name}_{most}"
+    if not truth.is_dir():
+        orbit = replace(build(OrbitSettings, shipped["demo"]["orbit"]), views=most, supersampling=1)
+        render_object(name=name, photos=photos, truth=truth, settings=orbit, seed=seed)
+    rows: list[dict[str, Any]] = []
+    for count in frames:
+        folder = work / f"{name}_{count}_{os.getpid()}"
+        workspace(photos, truth, [k * most // count for k in range(count)], folder, seed)
+        for part in ("stage1", "stage2", "stage3", "stage4", "cloud"):
+            with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+                found = pool.submit(measure, part, folder, own, seed).result()
+            rows += [{"stage": part, "photos": count, "what": what, "value": v} for what, v in found.items()]
+            pd.DataFrame(rows).to_csv(work / "frames_scaling.tsv", sep="\t", index=False, float_format="%.4g")
+    table = pd.DataFrame(rows).pivot_table(index=["stage", "what"], columns="photos", values="value", sort=False)
+    print("\n| stage | processor seconds of | " + " | ".join(f"{n} photos" for n in table) + " | e |")
+    print("|---|---|" + "---|" * (len(table.columns) + 1))
+    for (stage, what), row in table.iterrows():
+        first, last = max(row.iloc[0], 1e-3), max(row.iloc[-1], 1e-3)
+        exponent = np.log(last / first) / np.log(max(frames) / min(frames)) if len(frames) > 1 else np.nan
+        label = {"memory_gib": "(memory, GiB)", "wall": "(seconds of wall time)"}.get(what, what)
+        print(f"| {stage} | {label} | " + " | ".join(f"{v:.3g}" for v in row) + f" | {exponent:.2f} |")
+
+
+if __name__ == "__main__":
+    run(frames_scaling)
