@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 
+MOST_VIEWS = 64
+"""Views that a view is compared with at most: what more photos cost then grows with them, not with their square."""
+
 
 @dataclass(frozen=True)
 class Agreement:
@@ -19,6 +22,7 @@ class Agreement:
         hidden: (N,) views for which the point is behind their surface.
         off_mask: (N,) views in whose picture the point lies off the mask.
         mean: (N, 3) mean of the point and the points that agree with it.
+        compared: number of other views that were asked.
     """
 
     agree: NDArray[np.int32]
@@ -26,6 +30,26 @@ class Agreement:
     hidden: NDArray[np.int32]
     off_mask: NDArray[np.int32]
     mean: Floats
+    compared: int
+
+
+def others(view: int, frame_from_cam: Floats) -> NDArray[np.int64]:
+    """Indices of the views that `view` is compared with: all others, of many the near ones and ever fewer farther off.
+
+    Near views see the same surface, far ones see it from another side and have it in their outline.
+
+    Args:
+        view: index of a view.
+        frame_from_cam: (V, 4, 4).
+    """
+    centres = frame_from_cam[:, :3, 3]
+    order = np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable")
+    order = order[order != view]
+    if len(order) <= MOST_VIEWS:
+        return np.sort(order)
+    step = np.arange(MOST_VIEWS)
+    spare = len(order) - MOST_VIEWS
+    return np.sort(order[step + np.floor(spare * (step / (MOST_VIEWS - 1)) ** 2).astype(np.int64)])
 
 
 def back_project(
@@ -47,7 +71,7 @@ def compare(
     frame_from_cam: Floats,
     tolerance: float,
 ) -> Agreement:
-    """Project points of one view into all others and compare depths.
+    """Project points of one view into the others (of many, `others`) and compare depths.
 
     Args:
         points: (N, 3) in the cameras' common frame.
@@ -62,9 +86,8 @@ def compare(
     agree, through, hidden, off_mask = (np.zeros(count, np.int32) for _ in range(4))
     total = points.copy()
     height, width = depths.shape[1:]
-    for other in range(len(depths)):
-        if other == view:
-            continue
+    asked = others(view, frame_from_cam)
+    for other in asked:
         pose, k = frame_from_cam[other], intrinsics[other]
         in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
         z = in_camera[:, 2]
@@ -86,7 +109,7 @@ def compare(
         total[confirmed] += (
             in_camera[confirmed] * (measured[same] / z[confirmed])[:, None] @ pose[:3, :3].T + pose[:3, 3]
         )
-    return Agreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None])
+    return Agreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(asked))
 
 
 def normals_from_depth(

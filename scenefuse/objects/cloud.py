@@ -138,7 +138,7 @@ def fuse_depths(
         said = compare(points, index, depths, grown, views.intrinsics, poses, settings.agreement * diagonal)
         seen = said.agree + said.through
         keep = (said.agree + 1 >= settings.min_views) & (said.through <= settings.through_share * seen)
-        keep &= said.off_mask <= settings.mask_share * (len(depths) - 1)
+        keep &= said.off_mask <= settings.mask_share * said.compared
         rows, columns = rows[keep], columns[keep]
         turned = normals[index, rows, columns] @ poses[index, :3, :3].T.astype(np.float32)
         towards = poses[index, :3, 3] - said.mean[keep]

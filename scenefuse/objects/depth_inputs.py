@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
@@ -166,7 +167,9 @@ def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> 
     rays = centres - middle
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
-    shared = np.array([[len(np.intersect1d(a, b)) for b in seen] for a in seen])
+    photo = np.repeat(np.arange(len(seen)), [len(ids) for ids in seen])
+    observed = csr_matrix((np.ones(len(photo)), (photo, np.concatenate(seen))), shape=(len(seen), len(views.sparse)))
+    shared = (observed @ observed.T).toarray()
     score = (shared + 1.0) * np.exp(-(((angle - BEST_ANGLE_DEG) / BEST_ANGLE_DEG) ** 2))
     score[:, views.held_out] = -1.0
     np.fill_diagonal(score, -2.0)

@@ -1,6 +1,7 @@
 """The posed, masked photos of one object as arrays: what all four training stages work on."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import cv2
@@ -35,7 +36,7 @@ class Views:
     sparse: NDArray[np.float64]
     tracks: list[NDArray[np.int64]]
 
-    @property
+    @cached_property
     def masks(self) -> NDArray[np.bool_]:
         """(V, H, W), True where a pixel is mostly object."""
         return self.mattes > 127

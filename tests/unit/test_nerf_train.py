@@ -5,7 +5,7 @@ import pytest
 import torch
 from painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
-from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
+from scenefuse.nerf.agreement import MOST_VIEWS, back_project, compare, normals_from_depth, others
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import visual_hull
@@ -182,3 +182,18 @@ def test_plain_pytorch_trains_like_the_kernels(sphere, monkeypatch):
     plain = _train(sphere, steps=6)[3]
     for name in ("color", "depth", "mask", "distortion"):
         assert plain[name] == pytest.approx(with_kernels[name], rel=0.02)
+
+
+def test_of_many_views_the_near_ones_and_fewer_far_ones_are_asked():
+    def ring(count):
+        angle = 2 * np.pi * np.arange(count) / count
+        poses = np.tile(np.eye(4), (count, 1, 1))
+        poses[:, :2, 3] = np.column_stack([np.cos(angle), np.sin(angle)])
+        return poses
+
+    assert others(7, ring(40)).tolist() == [k for k in range(40) if k != 7]
+    asked = others(7, ring(400))
+    assert len(asked) == len(set(asked)) == MOST_VIEWS
+    away = np.abs((asked - 7 + 200) % 400 - 200)
+    assert away.min() == 1 and away.max() == 200
+    assert (away <= 10).sum() > (away >= 180).sum() > 0
