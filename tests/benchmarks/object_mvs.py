@@ -24,8 +24,8 @@ from scenefuse.scenes.plane_sweep import DepthSettings
 from scenefuse.settings import build, shipped_with
 from scenefuse.stage import StageError, read_json, run, value
 
-# Depth maps: the scene's settings, and a smaller window. Of nine variants on the house at half the width (score, window,
-# angle, sources, best sources, planes, smoothness) only the window changed much.
+# Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,
+# window, angle, sources, best sources) only the window changed much.
 DEPTH: dict[str, dict[str, Any]] = {"window 7": {}, "window 5": {"window_px": 5}}
 # Their fusion: COLMAP's as for the scene; stricter, since the photos are near; the same with two photos instead of
 # three; and that of the object's cloud.
