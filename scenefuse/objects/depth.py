@@ -1,9 +1,9 @@
 """Stage 1 of an object: self-supervised depth and pose networks, and a depth map with a confidence for every photo."""
 
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ from scenefuse.objects.depth_training import Recipe, Supervision, key_of, predic
 from scenefuse.objects.self_supervision import sample
 from scenefuse.objects.views import Views, load_views
 from scenefuse.stage import atomic_directory, quantity, threads, write_json
-from scenefuse.transforms import fit_sim3, rotation_angle_deg
+from scenefuse.transforms import rotation_angle_deg
 
 Content = dict[str, Any]
 
@@ -64,26 +64,23 @@ def train_depth(
     report: Path,
     checkpoints: Path,
     settings: DepthSettings,
-    pose_source: Literal["sfm", "network"],
     hold_out_every: int,
     seed: int,
 ) -> None:
     """Train the depth and pose networks on one object's photos and write a depth map for each photo.
 
-    The networks and losses are those of Monodepth2 (method N10), trained from scratch. With poses from SfM the depth
-    network corrects a first disparity made of SfM points and a plane sweep, and the pose network learns beside it from
-    detached depth; with `network` nothing of the SfM but the intrinsics is used in training, and the pose network's
-    chain over neighbouring photos, in name order, is compared with SfM. Depth maps are along z, in object (SfM) units,
-    aligned to the SfM points of their photo by a robust scale and shift (N1), 0 off the object.
+    The networks and losses are those of Monodepth2 (method N10), trained from scratch. The depth network corrects a
+    first disparity made of sparse points and a plane sweep, and the pose network learns beside it from detached depth.
+    Depth maps are along z, in object units, aligned to the sparse points of their photo by a robust scale and shift
+    (N1), 0 off the object.
 
     Args:
-        cameras: undistorted COLMAP workspace of the object.
+        cameras: undistorted COLMAP workspace of the object, with poses of SfM or those found without it (N11).
         masks: folder of masks named like the photos, .png.
         stage: output folder: depth_maps/{photo}.bin, confidence_maps/{photo}.bin (0..1) and networks.pt.
-        report: output JSON: residuals at SfM points, losses, consistency, pose errors, seconds.
+        report: output JSON: residuals at sparse points, losses, consistency, errors of the pose network, seconds.
         checkpoints: folder for training states; a killed run resumes from it.
         settings: of the training.
-        pose_source: whose poses warp one photo into another.
         hold_out_every: every n-th photo is not trained on; 0 holds out none.
         seed: of weights, batches and sources.
 
@@ -95,10 +92,7 @@ def train_depth(
     crops = crop_to_object(load_views(cameras, masks, settings.width_px, hold_out_every), settings.crop_px)
     views = crops.views
     frames = make_frames(views, settings.sources, device())
-    from_network = pose_source == "network"
-    if from_network:
-        frames = replace(frames, sources=neighbours_in_order(frames))
-    inputs, first, interpolated = network_inputs(frames, settings.sweep_planes, not from_network)
+    inputs, first, interpolated = network_inputs(frames, settings.sweep_planes)
     print(f"{len(views.names)} photos, depth {frames.near:.4g} to {frames.far:.4g}, inputs ready", flush=True)
     depth_network, pose_network = make_networks(inputs.shape[1], frames)
     recipe = Recipe(
@@ -109,19 +103,18 @@ def train_depth(
         warmup_epochs=settings.warmup_epochs,
         ssim_weight=settings.ssim_weight,
         smoothness_weight=settings.smoothness_weight,
-        anchor_weight=0.0 if from_network else settings.anchor_weight,
+        anchor_weight=settings.anchor_weight,
         target_weight=0.0,
         coarse_share=0.3,
-        poses_from_network=from_network,
     )
-    key = key_of("stage 1", settings, pose_source, seed, frames.images, frames.masks, frames.object_from_cam, first)
+    key = key_of("stage 1", settings, seed, frames.images, frames.masks, frames.object_from_cam, first)
     checkpoint = checkpoints / key / "state.pt"
     supervision = Supervision(inputs, first)
     losses = train_networks(depth_network, pose_network, frames, supervision, recipe, checkpoint, seed)
     raw = predict(depth_network, frames, inputs, first)
     depth = align_maps(raw, frames, seed)
     tolerance = settings.consistency_tolerance * frames.diagonal
-    agreement = agreement_between_views(depth, make_frames(views, settings.sources, device()), tolerance)
+    agreement = agreement_between_views(depth, frames, tolerance)
     content: Content = {
         "photos": quantity(len(views.names), "1"),
         "photos_held_out": quantity(int(views.held_out.sum()), "1"),
@@ -132,7 +125,6 @@ def train_depth(
         "diagonal": quantity(frames.diagonal, "object units"),
         "parameters": quantity(parameters(depth_network, pose_network), "1"),
         "device": quantity(str(frames.images.device), ""),
-        "pose_source": quantity(pose_source, ""),
         "residual_between_points": quantity(
             held_out_residual(depth_from_disparity(interpolated, frames.near, frames.far), frames), "1"
         ),
@@ -144,11 +136,11 @@ def train_depth(
         "residual_per_photo": quantity(_residual_per_photo(depth, frames, views), "1"),
         **consistency_quantities(agreement, frames),
         **loss_quantities(losses),
-        **_pose_quantities(pose_network, frames, views, chained=from_network),
+        **_pose_quantities(pose_network, frames, views),
     }
     with atomic_directory(stage) as folder:
         write_maps(folder, crops, depth * frames.masks, agreement.confidence)
-        save_networks(folder / "networks.pt", depth_network, pose_network, settings, pose_source)
+        save_networks(folder / "networks.pt", depth_network, pose_network, settings)
     content["seconds"] = quantity(round(time.monotonic() - start, 1), "s")
     write_json(report, content)
     checkpoint.unlink(missing_ok=True)
@@ -171,20 +163,6 @@ def make_networks(channels: int, frames: Frames) -> tuple[DepthNetwork, PoseNetw
     """Fresh networks on the frames' device; the pose network counts in typical distances to the object."""
     where = frames.images.device
     return DepthNetwork(channels).to(where), PoseNetwork((frames.near * frames.far) ** 0.5).to(where)
-
-
-def neighbours_in_order(frames: Frames) -> Tensor:
-    """(V, 2) the trained photos before and after each photo in name order; the ends take their two nearest."""
-    trained = np.flatnonzero(frames.trained)
-    rows = []
-    for index in range(len(frames.trained)):
-        others = trained[trained != index]
-        before, after = others[others < index], others[others > index]
-        nearest = (
-            [*before[-1:], *after[:1]] if len(before) and len(after) else others[np.argsort(abs(others - index))[:2]]
-        )
-        rows.append(nearest)
-    return torch.as_tensor(np.array(rows), device=frames.images.device)
 
 
 def align_maps(raw: Tensor, frames: Frames, seed: int) -> Tensor:
@@ -232,12 +210,9 @@ def write_maps(folder: Path, crops: Crops, depth: Tensor, confidence: Tensor) ->
         write_depth(folder / "confidence_maps" / f"{name}.bin", crops.paste(index, confidence[index, 0].cpu().numpy()))
 
 
-def save_networks(
-    path: Path, depth: DepthNetwork, pose: PoseNetwork, settings: DepthSettings, pose_source: str
-) -> None:
+def save_networks(path: Path, depth: DepthNetwork, pose: PoseNetwork, settings: DepthSettings) -> None:
     """What stage 3 continues from."""
-    state = {"depth": depth.state_dict(), "pose": pose.state_dict(), "settings": asdict(settings)}
-    torch.save({**state, "pose_source": pose_source}, path)
+    torch.save({"depth": depth.state_dict(), "pose": pose.state_dict(), "settings": asdict(settings)}, path)
 
 
 def print_residuals(content: Content) -> None:
@@ -253,14 +228,11 @@ def _residual_per_photo(depth: Tensor, frames: Frames, views: Views) -> dict[str
 
 
 @torch.no_grad()
-def _pose_quantities(network: PoseNetwork, frames: Frames, views: Views, chained: bool) -> Content:
-    """The pose network against SfM: relative rotations and directions, and the chained trajectory after a Sim3 fit."""
+def _pose_quantities(network: PoseNetwork, frames: Frames, views: Views) -> Content:
+    """The pose network's relative rotations and translations against those that it learned from."""
     small = small_photos(frames)
     order = np.flatnonzero(frames.trained)
-    if chained:
-        pairs = np.column_stack([order[1:], order[:-1]])
-    else:
-        pairs = np.column_stack([order, frames.sources[order, 0].cpu().numpy()])
+    pairs = np.column_stack([order, frames.sources[order, 0].cpu().numpy()])
     target, source = torch.as_tensor(pairs).T
     found = network(small[target], small[source]).double().cpu().numpy()
     poses = views.object_from_cam
@@ -268,32 +240,8 @@ def _pose_quantities(network: PoseNetwork, frames: Frames, views: Views, chained
     turned = [rotation_angle_deg(a[:3, :3] @ b[:3, :3].T) for a, b in zip(found, true)]
     moved = [rotation_angle_deg(b[:3, :3]) for b in true]
     off = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1) / np.linalg.norm(true[:, :3, 3], axis=1)
-    content = {
+    return {
         "pose_network_rotation_error_deg": quantity(float(np.median(turned)), "deg"),
         "pose_network_rotation_to_find_deg": quantity(float(np.median(moved)), "deg"),
         "pose_network_translation_error": quantity(float(np.median(off)), "1"),
     }
-    if not chained:
-        return content
-    chain = [np.eye(4)]
-    for source_from_target in found:
-        chain.append(chain[-1] @ source_from_target)
-    centres = np.array([pose[:3, 3] for pose in chain])
-    truth = poses[order][:, :3, 3]
-    try:
-        object_from_chain = fit_sim3(centres, truth)
-    except ValueError:
-        return content
-    errors = np.linalg.norm(object_from_chain.apply(centres) - truth, axis=1)
-    content["trajectory_error"] = quantity(float(np.sqrt(np.mean(errors**2))), "object units")
-    content["trajectory_error_over_extent"] = quantity(
-        float(np.sqrt(np.mean(errors**2)) / np.linalg.norm(np.ptp(truth, axis=0))), "1"
-    )
-    placed = {}
-    for index, pose in zip(order, chain):
-        object_from_cam = np.eye(4)
-        object_from_cam[:3, :3] = object_from_chain.rotation @ pose[:3, :3]
-        object_from_cam[:3, 3] = object_from_chain.apply(pose[:3, 3])
-        placed[views.names[index]] = object_from_cam.tolist()
-    content["object_from_cam_by_network"] = quantity(placed, "object units")
-    return content

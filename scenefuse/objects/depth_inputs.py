@@ -101,13 +101,12 @@ def make_frames(views: Views, sources: int, device: torch.device) -> Frames:
     )
 
 
-def network_inputs(frames: Frames, planes: int, use_sfm: bool) -> tuple[Tensor, Tensor, Tensor]:
+def network_inputs(frames: Frames, planes: int) -> tuple[Tensor, Tensor, Tensor]:
     """The network's input channels and the disparity it starts from.
 
     Args:
         frames: the photos.
         planes: depth hypotheses of the plane sweep; 0 leaves the sweep out.
-        use_sfm: False gives colour, mask and rays only, and a flat first disparity.
 
     Returns:
         (V, 9, H, W) inputs: colour (3), mask, ray (2), disparity between SfM points, sweep disparity, sweep score;
@@ -116,12 +115,11 @@ def network_inputs(frames: Frames, planes: int, use_sfm: bool) -> tuple[Tensor, 
     count, _, height, width = frames.images.shape
     flat = torch.full((count, 1, height, width), 0.5, device=frames.images.device)
     ray = points_in_cam(torch.ones_like(flat), frames.intrinsics)[:, :2].view(count, 2, height, width)
-    interpolated, swept, score = flat, flat, torch.zeros_like(flat)
-    if use_sfm:
-        interpolated = torch.cat([_between_points(frames, index) for index in range(count)])
-        if planes > 0:
-            pairs = [_sweep(frames, index, planes) for index in range(count)]
-            swept, score = torch.cat([d for d, _ in pairs]), torch.cat([s for _, s in pairs])
+    interpolated = torch.cat([_between_points(frames, index) for index in range(count)])
+    swept, score = flat, torch.zeros_like(flat)
+    if planes > 0:
+        pairs = [_sweep(frames, index, planes) for index in range(count)]
+        swept, score = torch.cat([d for d, _ in pairs]), torch.cat([s for _, s in pairs])
     trust = (score**4) / (score**4 + 0.3**4)
     first = interpolated + trust * (swept - interpolated)
     colour = (frames.images * 2.0 - 1.0) * frames.masks

@@ -42,7 +42,6 @@ class Recipe:
         anchor_weight: weight of the relative depth error at SfM points.
         target_weight: weight of the relative depth error against a target map.
         coarse_share: share of the steps that compare photos at half size.
-        poses_from_network: warp with the pose network's poses instead of SfM's.
     """
 
     epochs: int
@@ -55,7 +54,6 @@ class Recipe:
     anchor_weight: float
     target_weight: float
     coarse_share: float
-    poses_from_network: bool
 
 
 @dataclass(frozen=True)
@@ -186,20 +184,13 @@ def _losses(
     sources = frames.sources[chosen][:, columns]
     small = small_photos(frames)
     first_pair = frames.sources[chosen, int(columns[0])]
-    if recipe.poses_from_network:
-        pairs = [pose_network(small[chosen], small[of]) for of in sources.T]
-        photometric, counts = _reprojection(
-            frames, recipe, scale, chosen, sources, columns, depth, torch.stack(pairs, 1)
-        )
-        pose_loss = depth.new_zeros(())
-    else:
-        moves = frames.source_from_target(chosen[:, None], sources)
-        photometric, counts = _reprojection(frames, recipe, scale, chosen, sources, columns, depth, moves)
-        guess = pose_network(small[chosen], small[first_pair])[:, None]
-        error, seen = _reprojection(
-            frames, recipe, scale, chosen, first_pair[:, None], columns[:1], depth.detach(), guess, auto_mask=False
-        )
-        pose_loss = masked_mean(error, seen) + _pose_error(guess[:, 0], moves[:, 0], pose_network.unit)
+    moves = frames.source_from_target(chosen[:, None], sources)
+    photometric, counts = _reprojection(frames, recipe, scale, chosen, sources, columns, depth, moves)
+    guess = pose_network(small[chosen], small[first_pair])[:, None]
+    error, seen = _reprojection(
+        frames, recipe, scale, chosen, first_pair[:, None], columns[:1], depth.detach(), guess, auto_mask=False
+    )
+    pose_loss = masked_mean(error, seen) + _pose_error(guess[:, 0], moves[:, 0], pose_network.unit)
     mask = frames.masks[chosen]
     parts = {
         "photometric": masked_mean(photometric, counts),

@@ -95,11 +95,10 @@ def refine_depth(
     prepare_torch(seed)
     state = _load_networks(previous / "networks.pt")
     before = DepthSettings(**state["settings"])
-    use_sfm = state["pose_source"] == "sfm"
     crops = crop_to_object(load_views(cameras, masks, before.width_px, hold_out_every), before.crop_px)
     views = crops.views
     frames = make_frames(views, before.sources, device())
-    inputs, _, _ = network_inputs(frames, before.sweep_planes, use_sfm)
+    inputs, _, _ = network_inputs(frames, before.sweep_planes)
     depth_network, pose_network = make_networks(inputs.shape[1], frames)
     depth_network.load_state_dict(state["depth"])
     pose_network.load_state_dict(state["pose"])
@@ -121,10 +120,9 @@ def refine_depth(
         warmup_epochs=settings.warmup_epochs,
         ssim_weight=before.ssim_weight,
         smoothness_weight=before.smoothness_weight,
-        anchor_weight=before.anchor_weight if use_sfm else 0.0,
+        anchor_weight=before.anchor_weight,
         target_weight=settings.target_weight,
         coarse_share=0.0,
-        poses_from_network=False,
     )
     key = key_of("stage 3", settings, before, seed, frames.images, inputs, first, weight, *depth_network.parameters())
     checkpoint = checkpoints / key / "state.pt"
@@ -151,7 +149,7 @@ def refine_depth(
     }
     with atomic_directory(stage) as folder:
         write_maps(folder, crops, depth, agreement.confidence)
-        save_networks(folder / "networks.pt", depth_network, pose_network, before, state["pose_source"])
+        save_networks(folder / "networks.pt", depth_network, pose_network, before)
     content["seconds"] = quantity(round(time.monotonic() - start, 1), "s")
     write_json(report, content)
     checkpoint.unlink(missing_ok=True)
@@ -282,6 +280,6 @@ def _load_networks(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StageError(f"{path} does not exist; run stage 1 first")
     state = torch.load(path, weights_only=True)
-    if not {"depth", "pose", "settings", "pose_source"} <= set(state):
+    if not {"depth", "pose", "settings"} <= set(state):
         raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
     return state

@@ -224,20 +224,20 @@ def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
     views, truth = plane_views()
     frames = make_frames(views, 4, torch.device("cpu"))
     assert not np.isin(np.flatnonzero(views.held_out), frames.sources.numpy()).any()
-    _, first, _ = network_inputs(frames, 16, True)
+    _, first, _ = network_inputs(frames, 16)
     depth = depth_from_disparity(first, frames.near, frames.far).numpy()[:, 0]
     error = np.abs(depth - truth)[views.masks] / frames.diagonal
     assert np.median(error) < 0.005
 
 
 def _recipe() -> Recipe:
-    return Recipe(2, 2, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.0, 0.3, False)
+    return Recipe(2, 2, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.0, 0.3)
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
     views, _ = plane_views(6)
     frames = make_frames(views, 3, torch.device("cpu"))
-    inputs, first, _ = network_inputs(frames, 0, True)
+    inputs, first, _ = network_inputs(frames, 0)
 
     def train(checkpoint, stop_at=None):
         torch.manual_seed(0)
@@ -265,8 +265,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
         assert torch.equal(a, b)
 
 
-@pytest.mark.parametrize("source", ["sfm", "network"])
-def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkeypatch, source):
+def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkeypatch):
     views, truth = plane_views()
     monkeypatch.setattr(stage, "load_views", lambda *_: views)
     stage.train_depth(
@@ -276,7 +275,6 @@ def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkey
         report=tmp_path / "stage1.json",
         checkpoints=tmp_path / "checkpoints",
         settings=_settings(),
-        pose_source=source,
         hold_out_every=8,
         seed=0,
     )
@@ -290,14 +288,10 @@ def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkey
         confident.append(confidence[views.masks[index]])
     assert (tmp_path / "stage1" / "networks.pt").is_file()
     assert not list((tmp_path / "checkpoints").rglob("state.pt"))
-    if source == "sfm":
-        assert np.median(np.concatenate(errors)) < 0.01
-        assert report["residual_after_alignment"]["value"] < 0.01
-        assert report["consistent_share"]["value"] > 0.7
-        assert np.concatenate(confident).mean() > 0.6
-    else:
-        assert report["trajectory_error_over_extent"]["value"] >= 0
-        assert len(report["object_from_cam_by_network"]["value"]) == 7
+    assert np.median(np.concatenate(errors)) < 0.01
+    assert report["residual_after_alignment"]["value"] < 0.01
+    assert report["consistent_share"]["value"] > 0.7
+    assert np.concatenate(confident).mean() > 0.6
 
 
 def test_too_few_points_or_photos_is_one_sentence():

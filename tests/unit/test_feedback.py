@@ -42,7 +42,6 @@ def stage1(tmp_path, monkeypatch):
         report=tmp_path / "stage1.json",
         checkpoints=tmp_path / "checkpoints",
         settings=depth.DepthSettings(64, 56, 4, 16, 1, 1, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.01),
-        pose_source="sfm",
         hold_out_every=8,
         seed=0,
     )

@@ -6,10 +6,16 @@
 #           results/objects/{object}/sfm/, sfm.json                    cameras and sparse points
 #           results/objects/{object}/cameras/, cameras.json            undistorted photos with pinhole cameras
 #           results/objects/{object}/masks/, masks.json, masks.png     where the object is in each photo
+#           results/objects/{object}/poses/, poses.json                the same with poses found without SfM, for pose_source network
 #           results/objects/{object}/stage1/ .. stage4/, stage1.json   depth and pose networks; NeRF; feedback; NeRF
 #           results/objects/{object}/object.ply, object.json           the cloud
 
 
+STAGE1 = dict(config["object"]["stage1"])
+# The workspace that the training stages read; both have the same photos, and poses in the same frame.
+POSED = {"sfm": "results/objects/{object}/cameras", "network": "results/objects/{object}/poses"}[
+    STAGE1.pop("pose_source")
+]
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
@@ -196,11 +202,42 @@ rule masks:
         " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"
 
 
-rule stage1:
-    """Self-supervised depth and pose networks (paper 3.2 and 4.2.2, stage 1)."""
+rule poses:
+    """Camera poses without SfM, for pose_source network (paper 3.2; N11)."""
     input:
         cameras="results/objects/{object}/cameras",
         cameras_json="results/objects/{object}/cameras.json",
+    output:
+        posed=directory("results/objects/{object}/poses"),
+        report="results/objects/{object}/poses.json",
+    log:
+        "results/logs/poses/{object}.log",
+    benchmark:
+        "results/benchmarks/poses/{object}.tsv"
+    conda:
+        "../../envs/training.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
+        gpu=config["gpu"],
+    params:
+        options=flags(config["object"]["poses"]),
+        seed=config["seed"],
+        script=script("poses.py"),
+        code=code("poses.py"),
+    message:
+        "{wildcards.object}: poses without SfM"
+    shell:
+        "exec python {params.script} --cameras {input.cameras} --posed {output.posed} --report {output.report}"
+        " --seed {params.seed} {params.options} &> {log}"
+
+
+rule stage1:
+    """Self-supervised depth and pose networks (paper 3.2 and 4.2.2, stage 1)."""
+    input:
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
     output:
@@ -218,7 +255,7 @@ rule stage1:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["stage1"] | HELD_OUT),
+        options=flags(STAGE1 | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
         script=script("depth.py"),
@@ -233,8 +270,8 @@ rule stage1:
 rule stage2:
     """Depth-guided NeRF (stage 2)."""
     input:
-        cameras="results/objects/{object}/cameras",
-        cameras_json="results/objects/{object}/cameras.json",
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         depth="results/objects/{object}/stage1",
@@ -270,8 +307,8 @@ rule stage2:
 rule stage3:
     """Feedback: depth rendered by the NeRF refines the networks (stage 3)."""
     input:
-        cameras="results/objects/{object}/cameras",
-        cameras_json="results/objects/{object}/cameras.json",
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         previous="results/objects/{object}/stage1",
@@ -309,8 +346,8 @@ rule stage3:
 rule stage4:
     """The NeRF again, guided by the refined depth (stage 4)."""
     input:
-        cameras="results/objects/{object}/cameras",
-        cameras_json="results/objects/{object}/cameras.json",
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         depth="results/objects/{object}/stage3",
@@ -348,8 +385,8 @@ rule stage4:
 rule object_cloud:
     """Fuse the NeRF's depth maps into the object's cloud."""
     input:
-        cameras="results/objects/{object}/cameras",
-        cameras_json="results/objects/{object}/cameras.json",
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         stage="results/objects/{object}/stage4",

@@ -40,7 +40,7 @@ rule evaluate_scene:
 rule evaluate_object:
     """Judge an object whose truth is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
     input:
-        cameras="results/objects/{object}/cameras",
+        cameras=POSED,
         masks="results/objects/{object}/masks",
         stages=expand(
             "results/objects/{object}/stage{stage}",

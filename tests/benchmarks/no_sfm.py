@@ -1,0 +1,124 @@
+"""The demo's objects without any structure from motion: poses, stages 1 to 4 and the cloud from frames and masks.
+
+PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --out results/bench/no_sfm
+
+Taken from a finished demo are the frames and, as a person's own, the masks. The focal length is the one in the photos'
+EXIF, as COLMAP reads it (without EXIF its guess, 1.2 times the longer side). Only the last step, which judges the
+trajectory and the cloud, reads the truth; it aligns by the cameras' centres alone.
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+
+from scenefuse.clouds import read_cloud
+from scenefuse.metrics.evaluation import cloud_results, read_object_truth
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.train import Schedule
+from scenefuse.objects.cloud import CloudSettings, object_cloud
+from scenefuse.objects.depth import DepthSettings, train_depth
+from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.poses import PoseSettings, find_poses
+from scenefuse.objects.train_nerf import NerfSettings, train_nerf
+from scenefuse.settings import build, shipped_with
+from scenefuse.stage import quantity, run, value, write_json
+
+
+def workspace(frames: Path, masks: Path, folder: Path) -> None:
+    """An undistorted workspace that knows no poses: the photos, their EXIF's focal length, and masks of their size."""
+    for name in ("cameras/images", "cameras/sparse", "masks"):
+        (folder / name).mkdir(parents=True, exist_ok=True)
+    model = pycolmap.Reconstruction()
+    for number, path in enumerate(sorted(p for p in frames.iterdir() if not p.name.startswith(".")), 1):
+        guess = pycolmap.infer_camera_from_image(path)
+        params = [guess.mean_focal_length()] * 2 + [guess.width / 2, guess.height / 2]
+        size = {"width": guess.width, "height": guess.height}
+        model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size))
+        image = pycolmap.Image(name=path.name, camera_id=number, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+        shutil.copy(path, folder / "cameras/images" / path.name)
+        mask = cv2.imread(str(masks / f"{path.stem}.png"), cv2.IMREAD_GRAYSCALE)
+        if mask is not None:
+            # the workflow's masks are those of undistorted photos, a pixel smaller here
+            cv2.imwrite(str(folder / "masks" / f"{path.stem}.png"), cv2.resize(mask, (guess.width, guess.height)))
+    model.write(folder / "cameras/sparse")
+
+
+def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, seed: int) -> None:
+    """All stages from a workspace to the cloud, as the workflow runs them."""
+    find_poses(
+        cameras=folder / "cameras", posed=folder / "poses", report=folder / "poses.json",
+        settings=build(PoseSettings, settings["poses"]), seed=seed,
+    )  # fmt: skip
+    inputs: dict[str, Any] = {"cameras": folder / "poses", "masks": folder / "masks"}
+    common = {"checkpoints": folder / "checkpoints", "hold_out_every": hold_out_every, "seed": seed}
+
+    def outputs(name: str) -> dict[str, Path]:
+        return {"stage": folder / name, "report": folder / f"{name}.json"}
+
+    def nerf(name: str, prior: str, previous: Path | None) -> None:
+        own = settings["nerf"] | settings[name]
+        train_nerf(
+            **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
+            field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
+            settings=build(NerfSettings, own),
+        )  # fmt: skip
+
+    train_depth(**inputs, **common, **outputs("stage1"), settings=build(DepthSettings, settings["stage1"]))
+    nerf("stage2", "stage1", None)
+    refine_depth(
+        **inputs, **common, **outputs("stage3"), previous=folder / "stage1", rendered=folder / "stage2",
+        settings=build(FeedbackSettings, settings["stage3"]),
+    )  # fmt: skip
+    nerf("stage4", "stage3", folder / "stage2")
+    object_cloud(
+        **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
+        cloud=folder / "object.ply", report=folder / "object.json", settings=build(CloudSettings, settings["cloud"]),
+        seed=seed,
+    )  # fmt: skip
+
+
+def no_sfm(
+    *,
+    results: Path = Path("results"),
+    out: Path = Path("results/bench/no_sfm"),
+    objects: tuple[str, ...] = ("house", "balloon", "sculpture"),
+    settings: Path | None = None,
+) -> None:
+    """Reconstruct and judge; truth.json of each object's folder holds what is printed.
+
+    Args:
+        results: folder of a finished demo.
+        out: output folder.
+        objects: of the demo.
+        settings: laid over the shipped ones, or none.
+    """
+    chosen = shipped_with(settings)
+    own, seed, samples = chosen["object"], chosen["seed"], chosen["evaluation"]["object"]["samples"]
+    truth = results / "demo/demo/truth"
+    for name in objects:
+        source, folder = results / "objects" / name, out / name
+        workspace(source / "frames", source / "masks", folder)
+        reconstruct(folder, own, own["hold_out_every"], seed)
+        known = read_object_truth(folder / "poses", truth / "scene", truth / name, samples, seed)
+        extent = float(np.linalg.norm(np.ptp(known.orbit.centres[known.posed.true], axis=0)))
+        points = known.fit.truth_from_model.apply(read_cloud(folder / "object.ply").points)
+        measured = {
+            "photos": quantity(len(known.orbit.names), "1"),
+            "photos_with_pose": quantity(len(known.posed.names), "1"),
+            "trajectory_error_over_extent": quantity(float(np.sqrt(np.mean(known.fit.position**2))) / extent, "1"),
+            "rotation_error_median_deg": quantity(float(np.median(known.fit.rotation_deg)), "degrees"),
+            "rotation_error_max_deg": quantity(float(known.fit.rotation_deg.max()), "degrees"),
+            **cloud_results(points, known, samples, seed),
+        }
+        write_json(folder / "truth.json", measured)
+        print(f"{name}: " + ", ".join(f"{key} {value(measured, key):.5g}" for key in measured), flush=True)
+
+
+if __name__ == "__main__":
+    run(no_sfm)
