@@ -116,6 +116,7 @@ def train_depth(
     tolerance = settings.consistency_tolerance * frames.diagonal
     agreement = agreement_between_views(depth, frames, tolerance)
     content: Content = {
+        "workspace": quantity(cameras.name, ""),
         "photos": quantity(len(views.names), "1"),
         "photos_held_out": quantity(int(views.held_out.sum()), "1"),
         "width_px": quantity(crops.masks.shape[2], "px"),

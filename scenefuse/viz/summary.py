@@ -33,7 +33,7 @@ WIDTH = 100
 _COLUMNS = ("value", "null", "scene")
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "witness.reason")
-_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "kept", "kernels")
+_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "workspace", "kept", "kernels")
 
 
 def write_summary(

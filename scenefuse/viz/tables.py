@@ -230,6 +230,8 @@ def collect(folder: Path, arms: list[str], logs: Path, scene: str = "", scene_ga
     """
     there, gap = unbroken(folder, _OBJECT_FILES)
     stages = read_fields(folder, [*there, *([] if gap else ["witness.json"])])
+    if find(stages, "stage1.workspace") == "poses":
+        stages |= read_fields(folder, ["poses.json"])
     who = folder.name
     if not gap and scene_gap:
         gap, who = f"{scene_gap} of the scene {scene}", scene

@@ -273,3 +273,12 @@ def test_a_page_without_a_summary_is_refused(tmp_path):
     with pytest.raises(StageError, match="write the summary first"):
         write_report(summary=tmp_path, scenes=[], objects=[], title="x", report=tmp_path / "report.html")
     assert not (tmp_path / "report.html").exists()
+
+
+def test_the_text_names_photos_without_a_pose_where_poses_are_not_those_of_sfm(results):
+    house = results / "objects/house"
+    write_json(house / "poses.json", {"not_registered": quantity(["a.jpg"], "")})
+    assert "a.jpg" not in (summarise(results) / "summary.txt").read_text()
+    write_json(house / "stage1.json", {"workspace": quantity("poses", "")})
+    text = (summarise(results) / "summary.txt").read_text()
+    assert "stage1.workspace poses" in text and "poses.not_registered: a.jpg" in text
