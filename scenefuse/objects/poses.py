@@ -101,7 +101,9 @@ def find_poses(
     start = time.monotonic()
     prepare_torch(seed)
     with atomic_directory(posed) as folder:
-        shutil.copytree(cameras, folder, ignore=shutil.ignore_patterns("sparse"), dirs_exist_ok=True)
+        shutil.copytree(
+            cameras, folder, ignore=shutil.ignore_patterns("sparse", ".snakemake_timestamp"), dirs_exist_ok=True
+        )
         (folder / "sparse").mkdir()
         content = _find(read_workspace(cameras), folder / "sparse", settings)
     write_json(report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
@@ -151,6 +153,7 @@ def _find(workspace: Workspace, folder: Path, settings: PoseSettings) -> Content
     sound = [pair for pair in sound if pair.first in group]
     refined = refine(closed, link(features, sound), settings.refine_focal)
     seen = np.bincount(refined.tracks.photo, minlength=len(together)) >= settings.min_matches
+    _check(np.flatnonzero(seen), features, settings.min_matches)
     object_from_chain = _frame(refined, seen, joined.object_from_cam)
     _write_model(folder, joined, features, refined, seen, object_from_chain)
     posed = {joined.names[index] for index in np.flatnonzero(seen)}
@@ -224,7 +227,13 @@ def _frame(refined: Refined, seen: NDArray[np.bool_], known: Array | None) -> Si
     """object_from_chain: SfM's frame where there is one, else z up and a median depth of 1."""
     poses = refined.object_from_cam[seen]
     if known is not None:
-        return fit_sim3(poses[:, :3, 3], known[seen, :3, 3])
+        try:
+            return fit_sim3(poses[:, :3, 3], known[seen, :3, 3])
+        except ValueError as error:
+            raise StageError(
+                f"the poses cannot be brought into SfM's frame: {error}; walk around the object instead of past it, "
+                "or set object.stage1.pose_source to sfm"
+            ) from None
     up, _ = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
     offset = refined.points[refined.tracks.point] - refined.object_from_cam[refined.tracks.photo, :3, 3]
     depth = np.median((offset * refined.object_from_cam[refined.tracks.photo, :3, 2]).sum(1))
