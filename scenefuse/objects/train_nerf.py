@@ -153,7 +153,8 @@ def train_nerf(
             write_depth(folder / "confidence_maps" / f"{name}.bin", confidence[index])
             normals = normals_from_depth(depths[index], views.intrinsics[index], 2, 0.03)
             write_normals(folder / "normal_maps" / f"{name}.bin", normals)
-        content |= _held_out_quality(views, rendered, np.flatnonzero(measured), folder / "renders")
+        exact = settings.mask_band_px == 0
+        content |= _held_out_quality(views, rendered, np.flatnonzero(measured), folder / "renders", exact)
         saved = {"model": model.state(), "nerf_from_object": torch.from_numpy(nerf_from_object.matrix),
                  "names": views.names, "object_from_cam": torch.from_numpy(poses)}  # fmt: skip
         torch.save(saved, folder / "model.pt")
@@ -313,18 +314,23 @@ def _confidence(
     return confidence
 
 
-def _held_out_quality(views: Views, rendered: list[Rendered], index: NDArray[np.int64], folder: Path) -> dict[str, Any]:
-    """Quality on held-out photos (on all when none is held out), and their renders as PNG beside the photo's."""
+def _held_out_quality(
+    views: Views, rendered: list[Rendered], index: NDArray[np.int64], folder: Path, exact: bool
+) -> dict[str, Any]:
+    """Quality on held-out photos (on all when none is held out), and their renders as PNG beside the photo's.
+
+    Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background.
+    """
     folder.mkdir()
     rows = []
     for i in index:
         mask = torch.from_numpy(views.masks[i])
         photo = torch.from_numpy(views.images[i]).float() / 255.0
         picture, everything = rendered[i].color.clamp(0, 1), torch.ones_like(mask)
-        masked = photo * mask[..., None]
+        masked = photo * (torch.from_numpy(views.mattes[i]) / 255.0 if exact else mask)[..., None]
         rows.append(
             (
-                psnr(picture, photo, mask),
+                psnr(picture, masked, mask),
                 psnr(picture, masked, everything),
                 ssim(picture, masked, dilate(mask[None], 5)[0]),
                 silhouette_iou(rendered[i].opacity, mask),

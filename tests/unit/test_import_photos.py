@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 import yaml
 from painted_sphere import CENTER, RADIUS, sphere_views
 from scipy.spatial.transform import Rotation
@@ -16,8 +17,10 @@ from scipy.spatial.transform import Rotation
 from scenefuse.clouds import read_cloud
 from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.rays import cube_from_cameras
+from scenefuse.nerf.render import Rendered
 from scenefuse.objects.import_photos import import_photos
 from scenefuse.objects.nerf_alone import nerf_files
+from scenefuse.objects.train_nerf import _held_out_quality
 from scenefuse.objects.views import load_views
 from scenefuse.scenes.undistort import UndistortSettings
 from scenefuse.stage import StageError, read_json, value
@@ -324,6 +327,15 @@ def test_a_colmap_model_without_its_photos_asks_for_them(tmp_path):
     (data / "sparse/0/cameras.txt").write_text("1 PINHOLE")
     with pytest.raises(StageError, match="not a readable COLMAP model"):
         imported(data, tmp_path, images=data / "elsewhere", masks=data / "masks")
+
+
+def test_a_perfect_render_of_a_grey_matte_scores_as_perfect(tmp_path):
+    views, _ = imported(blender(tmp_path / "in"), tmp_path)
+    opacity = torch.from_numpy(views.mattes).float() / 255
+    colors = torch.from_numpy(views.images).float() / 255 * opacity[..., None]
+    perfect = [Rendered(c, o, o, o) for c, o in zip(colors, opacity)]
+    quality = _held_out_quality(views, perfect, np.array([0, 1]), tmp_path / "renders", exact=True)
+    assert value(quality, "psnr_held_out") > 80 and value(quality, "psnr_held_out_masked_photo") > 80
 
 
 QUICK = {
