@@ -118,12 +118,13 @@ def cloud(
     low, high = truth.surface.min(0), truth.surface.max(0)
     to_object, to_rest = (distances(mesh.caster(), points) for mesh in (truth.mesh, truth.rest))
     own = belongs_to_object(points, to_object, to_rest, low, high, 0.05 * truth.diagonal)
-    whole, cut = (cloud_results(p, truth, len(truth.surface), seed) for p in (points, points[own]))
+    whole = cloud_results(points, truth, len(truth.surface), seed)
+    cut = value(cloud_results(points[own], truth, len(truth.surface), seed), "cloud_f_score_1pct") if own.any() else 0.0
     return {
         "accuracy_pct": value(whole, "cloud_accuracy_median"),
         "f_05": value(whole, "cloud_f_score_05pct"),
         "f_1": value(whole, "cloud_f_score_1pct"),
-        "f_1_cut": value(cut, "cloud_f_score_1pct"),
+        "f_1_cut": cut,
     }
 
 
