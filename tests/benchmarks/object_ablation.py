@@ -49,7 +49,7 @@ def arms(settings: dict[str, Any]) -> dict[str, Arm]:
     other = 0.0 if refined else OTHER_POSE_RATE
     return {
         "full": Arm(),
-        "no_masks": Arm(masks=False),
+        "no_masks": Arm(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
         "no_depth": Arm(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
         "no_relative_depth": Arm(nerf={"rank_weight": 0}),
         "no_feedback": Arm(feedback=False),
