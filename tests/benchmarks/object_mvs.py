@@ -74,9 +74,8 @@ def fused(
 def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures: Path) -> list[dict[str, Any]]:
     """Every way to make depth maps with every way to fuse them."""
     own = settings["object"] | {key: settings["scene"][key] for key in ("depth_maps", "dense_cloud")}
-    width, cloud_settings = own["nerf"]["width_px"], build(CloudSettings, own["cloud"])
+    width = own["nerf"]["width_px"]
     views = load_views(folder / "cameras", folder / "masks", width, 0)
-    step = cloud_settings.spacing * value(read_json(folder / "object.json"), "diagonal")
     judge, rows = settings["evaluation"]["object"], []
     for maps, over in DEPTH.items():
         with tempfile.TemporaryDirectory() as temporary:
@@ -97,8 +96,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
                 except StageError as error:
                     print(f"{maps}, {fusion}: {error}", flush=True)
                     continue
-                cloud = voxel_downsample(cloud, step)
-                cloud = clean(cloud, cloud_settings.outlier_deviations, cloud_settings.min_component, step)
+                cloud = cleaned(cloud, folder, own)
                 seconds, work = wall + time.monotonic() - start, cpu + used(began)
                 write_cloud(pictures / f"{folder.name}_{maps}_{fusion}.ply".replace(" ", "_"), cloud)
                 rows.append(
@@ -110,6 +108,31 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
                 )
                 print(rows[-1], flush=True)
     return rows
+
+
+def early_stages(folder: Path, truth: ObjectTruth, settings: dict[str, Any]) -> list[dict[str, Any]]:
+    """The maps of stages 1 and 3, fused and cleaned as the object's cloud: what the NeRF adds to them."""
+    own, judge, rows = settings["object"], settings["evaluation"]["object"], []
+    for stage in ("stage1", "stage3"):
+        depth = folder / stage
+        width = read_depth(next(iter(sorted((depth / "depth_maps").glob("*.bin"))))).shape[1]
+        views = load_views(folder / "cameras", folder / "masks", width, 0)
+        cloud = cleaned(fused(folder, depth, depth, views, own, None), folder, own)
+        errors = depth_results([depth], truth, judge["max_photos"])
+        rows.append(
+            {"object": folder.name, "method": "stage 1 alone" if stage == "stage1" else "stages 1 to 3"}
+            | {"maps": stage, "fusion": "object", "depth_pct": 100 * value(errors, f"{stage}_depth_error")}
+            | {"within_1pct": value(errors, f"{stage}_depth_within_1pct")}
+            | judged(cloud, truth, judge["samples"], settings["seed"])
+        )
+    return rows
+
+
+def cleaned(cloud: Cloud, folder: Path, own: dict[str, Any]) -> Cloud:
+    """Thinned and cleaned like the object's cloud."""
+    settings = build(CloudSettings, own["cloud"])
+    step = settings.spacing * value(read_json(folder / "object.json"), "diagonal")
+    return clean(voxel_downsample(cloud, step), settings.outlier_deviations, settings.min_component, step)
 
 
 def used(began: os.times_result) -> float:
@@ -156,7 +179,7 @@ def object_mvs(
     Multi-view stereo is the scene's own (plane sweep and slanted refinement, or COLMAP's patch-match with CUDA;
     COLMAP's fusion) at the width of the NeRF, on all photos; its depths off the mask are dropped before fusion, its
     points off the masks after, and it is thinned and cleaned like the object's cloud. The best trial by F at 1 % is
-    marked.
+    marked. Beside them stand clouds of the maps of stages 1 and 3, made in the same way.
 
     Args:
         results: folder of a finished demo.
@@ -170,7 +193,7 @@ def object_mvs(
     for name in objects:
         folder = results / "objects" / name
         truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], chosen["seed"])
-        rows += [four_stages(results, name, truth, chosen)]
+        rows += [four_stages(results, name, truth, chosen), *early_stages(folder, truth, chosen)]
         rows += trials(folder, truth, chosen, out.parent / "object_mvs")
         pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
     table = pd.DataFrame(rows)
