@@ -14,6 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
 from scenefuse.maps import read_depth, read_normals
 from scenefuse.nerf.agreement import back_project, compare
+from scenefuse.objects.photo_refinement import refine_by_photos
 from scenefuse.objects.views import Views, load_views
 from scenefuse.stage import StageError, quantity, read_json, threads, write_json
 
@@ -22,6 +23,12 @@ from scenefuse.stage import StageError, quantity, read_json, threads, write_json
 class CloudSettings:
     """How rendered depth maps become one cloud."""
 
+    refine_reach_px: float
+    """how far a rendered depth may move, in the other photos, to where they match best; 0 leaves depths as rendered"""
+    refine_window_px: int
+    """side of the matching window, odd"""
+    refine_min_score: float
+    """least mean correlation of the best matches; below it the rendered depth stays"""
     min_views: int
     """views that must agree on a point, its own included"""
     agreement: float
@@ -54,6 +61,8 @@ def object_cloud(
 ) -> None:
     """Fuse a NeRF stage's depth maps into the object's cloud (method N13), in the object's camera (SfM) frame.
 
+    Rendered depths are first moved to where the photos match best, where they match (`refine_by_photos`).
+
     Args:
         cameras: undistorted COLMAP workspace of the object.
         masks: folder of masks named like the photos, .png.
@@ -69,6 +78,7 @@ def object_cloud(
         StageError: a map is missing, or no point passes the gates.
     """
     cv2.setNumThreads(threads())
+    torch.set_num_threads(threads())
     saved = torch.load(stage / "model.pt", weights_only=True) if (stage / "model.pt").is_file() else None
     if saved is None:
         raise StageError(f"{stage}/model.pt does not exist; run the NeRF stage first")
@@ -80,6 +90,10 @@ def object_cloud(
         raise StageError(f"{stage} was made from other photos than {cameras} holds now; run the NeRF stage again")
     poses = saved["object_from_cam"].numpy()
     depths, confidence, normals = _maps(stage, views, settings.min_confidence)
+    refined_share = 0.0
+    if settings.refine_reach_px > 0:
+        limits = settings.refine_reach_px, settings.refine_window_px, settings.refine_min_score
+        depths, refined_share = refine_by_photos(views, poses, depths, *limits)
     raw, diagonal = fuse_depths(views, poses, depths, confidence, normals, settings)
     if len(raw) < 100:
         raise StageError(
@@ -92,6 +106,7 @@ def object_cloud(
     write_cloud(cloud, cleaned)
     content = {
         "points": quantity(len(cleaned), "1"),
+        "refined_share": quantity(refined_share, "1"),
         "points_before_thinning": quantity(len(raw), "1"),
         "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
         "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),

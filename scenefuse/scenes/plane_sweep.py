@@ -15,7 +15,11 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from numpy.typing import NDArray
+from scipy import ndimage
 from torch import Tensor
+
+# Less than this is no better match: smooth surfaces match nearly everywhere.
+MIN_GAIN = 0.02
 
 
 @dataclass(frozen=True)
@@ -118,6 +122,38 @@ def estimate_depth(
     good = (score >= settings.min_score) & (inverse > 0.5 / far)
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
+
+
+def refine_depth(
+    reference: Photo, sources: list[Photo], depth: NDArray[np.float32], reach_px: float, settings: DepthSettings,
+    device: str,
+) -> DepthEstimate:  # fmt: skip
+    """A depth map that is nearly right, moved to where the photos match best; 0 where they match nowhere near it.
+
+    Args:
+        reference: the photo of the depth map, at its size.
+        sources: photos that overlap it, at about the same scale.
+        depth: (H, W) along z, 0 for none.
+        reach_px: how far a pixel may move in the source photos, pixels.
+        settings: see DepthSettings; of these best_sources, window_px and min_score.
+        device: a PyTorch device, "cpu" or "cuda".
+    """
+    known = depth > 0
+    rows, columns = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
+    first = torch.from_numpy(1 / depth[rows, columns]).to(device)
+    low, high = float(first.min()), float(first.max()) * 1.001
+    matcher = _Matcher(reference, sources, settings, device)
+    step = reach_px * (high - low) / max(matcher.shift_per_inverse_depth(low, high), 1e-6)
+    inverse, _ = _refine(matcher, first, step / 2, low, high)
+    inverse, score = _refine(matcher, inverse, step / 4, low, high)
+    inverse, slopes = _local_planes(inverse, score)
+    inverse, score = _refine_once(matcher, inverse[None], step / 8)
+    normals = _normals(inverse, slopes, reference.intrinsics)
+    gain = score - matcher.score(first[None])[0]
+    good = (score >= settings.min_score) & (gain >= MIN_GAIN) & ((inverse - first).abs() <= step)
+    good &= torch.from_numpy(known).to(device)
+    moved = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
+    return DepthEstimate(moved.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
 
 class _Matcher:

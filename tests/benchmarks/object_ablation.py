@@ -96,9 +96,15 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
             "within_4": value(depth, f"{last.name}_depth_within_1pct"),
             "psnr_2": held_out_psnr(folder, work / "stage2", settings),
             "psnr_4": held_out_psnr(folder, last, settings),
-            **cloud(folder, inputs, last, truth, settings, seed),
+            **cloud(folder, inputs, last, truth, settings["cloud"], seed),
+            **as_rendered(cloud(folder, inputs, last, truth, settings["cloud"] | {"refine_reach_px": 0}, seed)),
             "seconds": seconds,
         }
+
+
+def as_rendered(measures: dict[str, Any]) -> dict[str, Any]:
+    """The measures of a cloud of depths that photos did not refine, under their own names."""
+    return {f"{name}_rendered": measures[name] for name in ("accuracy_pct", "f_05", "f_1")}
 
 
 def cloud(
@@ -109,7 +115,7 @@ def cloud(
     try:
         object_cloud(
             **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "cameras.json",
-            cloud=path, report=path.with_suffix(".json"), settings=build(CloudSettings, settings["cloud"]), seed=seed,
+            cloud=path, report=path.with_suffix(".json"), settings=build(CloudSettings, settings), seed=seed,
         )  # fmt: skip
     except StageError as error:
         print(f"no cloud: {error}", flush=True)

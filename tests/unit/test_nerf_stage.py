@@ -88,7 +88,7 @@ def test_two_stages_and_the_cloud(workspace):
         cameras_report=workspace / "cameras.json",
         cloud=workspace / "object.ply",
         report=workspace / "object.json",
-        settings=CloudSettings(2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
+        settings=CloudSettings(0.0, 5, 0.6, 2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
         seed=0,
     )
     cloud = read_json(workspace / "object.json")

@@ -9,7 +9,7 @@ from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths, object_cl
 from scenefuse.objects.views import Views
 from scenefuse.stage import StageError
 
-SETTINGS = CloudSettings(3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
+SETTINGS = CloudSettings(0.0, 5, 0.6, 3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
 
 
 def _views():

@@ -1,0 +1,77 @@
+"""Rendered depth moved to where the photos match best: the NeRF says where the surface is, the photos how exactly."""
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scenefuse.objects.views import Views
+from scenefuse.scenes.plane_sweep import DepthSettings, Photo, refine_depth
+
+SOURCES, BEST_SOURCES, BEST_ANGLE_DEG = 8, 3, 15.0
+
+
+def refine_by_photos(
+    views: Views,
+    poses: NDArray[np.float64],
+    depths: NDArray[np.float32],
+    reach_px: float,
+    window_px: int,
+    min_score: float,
+) -> tuple[NDArray[np.float32], float]:
+    """Depth maps (V, H, W) with every pixel moved along its ray to the best match, and the share that was.
+
+    Windows of a photo are matched with those of the eight photos that see the object from about 15 degrees aside; the
+    best three count (`scenefuse.scenes.plane_sweep`). A pixel whose match is poor, hardly better than where it was, or
+    farther off than the reach, keeps its rendered depth.
+
+    Args:
+        views: photos and intrinsics at the maps' size.
+        poses: (V, 4, 4) object_from_cam that the maps were rendered with.
+        depths: (V, H, W) along z, 0 for none.
+        reach_px: how far a pixel may move in the other photos, pixels.
+        window_px: side of the matching window, odd.
+        min_score: least mean NCC of the best three.
+    """
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    settings = DepthSettings(0, SOURCES, BEST_SOURCES, 0, 1, window_px, 0.0, min_score, 0.0, False)
+    photos = [_photo(views, poses, index) for index in range(len(depths))]
+    sources = _sources(poses, depths, views.intrinsics)
+    moved, count = depths.copy(), 0
+    for index, depth in enumerate(depths):
+        rows, columns = np.nonzero(depth > 0)
+        if len(rows) == 0:
+            continue
+        pad = 2 * window_px
+        top, left = max(rows.min() - pad, 0), max(columns.min() - pad, 0)
+        part = np.s_[top : rows.max() + pad + 1, left : columns.max() + pad + 1]
+        whole = photos[index]
+        cut = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]]) @ whole.intrinsics
+        reference = Photo(np.ascontiguousarray(whole.gray[part]), cut, whole.cam_from_world)
+        found = refine_depth(reference, [photos[s] for s in sources[index]], depth[part], reach_px, settings, device)
+        moved[index][part] = np.where(found.depth > 0, found.depth, depth[part])
+        count += int((found.depth > 0).sum())
+    return moved, count / max(int((depths > 0).sum()), 1)
+
+
+def _photo(views: Views, poses: NDArray[np.float64], index: int) -> Photo:
+    gray = cv2.cvtColor(views.images[index], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
+    return Photo(gray, views.intrinsics[index], np.linalg.inv(poses[index])[:3])
+
+
+def _sources(
+    poses: NDArray[np.float64], depths: NDArray[np.float32], intrinsics: NDArray[np.float64]
+) -> NDArray[np.int64]:
+    """(V, S) the photos that look at the middle of what all see from about 15 degrees beside each photo."""
+    centres, middles = poses[:, :3, 3], []
+    for depth, k, pose in zip(depths, intrinsics, poses):
+        rows, columns = np.nonzero(depth > 0)
+        if len(rows):
+            pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5, 1.0])
+            middles.append(pose[:3, :3] @ (np.linalg.inv(k) @ pixel * np.median(depth[rows, columns])) + pose[:3, 3])
+    rays = centres - np.median(middles, axis=0)
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
+    score = -np.abs(angle - BEST_ANGLE_DEG)
+    np.fill_diagonal(score, -np.inf)
+    return np.argsort(-score, axis=1, kind="stable")[:, : min(SOURCES, len(poses) - 1)]

@@ -1,0 +1,66 @@
+"""Depths moved by matching: a known plane with wrong depths comes back; without texture they stay as they were."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from test_depth import plane_views
+
+from scenefuse.nerf.agreement import back_project
+from scenefuse.objects.photo_refinement import refine_by_photos
+
+
+def _wrong(truth, share=0.05):
+    """True depths with a smooth error of up to a share of them."""
+    waves = np.sin(np.arange(truth.shape[2]) / 15)[None, None] * np.cos(np.arange(truth.shape[1]) / 12)[None, :, None]
+    return (truth * (1 + share * waves)).astype(np.float32)
+
+
+def _speckled(views, truth):
+    """The same views of the plane, painted with fine speckles."""
+    speckles = cv2.GaussianBlur(np.random.default_rng(0).random((400, 400)).astype(np.float32), (0, 0), 2.0)
+    speckles = (speckles - speckles.min()) / np.ptp(speckles) * 255
+    images = []
+    for depth, k, pose in zip(truth, views.intrinsics, views.object_from_cam):
+        rows, columns = np.indices(depth.shape).reshape(2, -1)
+        points = back_project(depth.ravel().astype(np.float64), k, pose, rows, columns).reshape(*depth.shape, 3)
+        place = ((points[..., :2] + 1) * 199.5).astype(np.float32)
+        images.append(cv2.remap(speckles, place[..., 0], place[..., 1], cv2.INTER_LINEAR).astype(np.uint8))
+    return replace(views, images=np.repeat(np.stack(images)[..., None], 3, axis=3))
+
+
+def test_wrong_depths_of_a_textured_plane_come_back():
+    views, truth = plane_views(count=8, width=160, height=120)
+    views = _speckled(views, truth)
+    wrong = _wrong(truth)
+    refined, share = refine_by_photos(views, views.object_from_cam, wrong, 8.0, 5, 0.6)
+    known = truth > 0
+    error = [np.median(np.abs(d - truth)[known] / truth[known]) for d in (wrong, refined)]
+    assert error[1] < 0.2 * error[0]
+    assert share > 0.5 and not refined[~known].any()
+
+
+def test_smooth_surfaces_are_left_alone():
+    views, truth = plane_views(count=8, width=160, height=120)
+    depths = truth.astype(np.float32)
+    refined, share = refine_by_photos(views, views.object_from_cam, depths, 8.0, 5, 0.6)
+    assert share < 0.05
+    assert np.quantile(np.abs(refined - depths)[truth > 0] / truth[truth > 0], 0.9) < 1e-6
+
+
+def test_depths_stay_where_nothing_can_be_matched():
+    views, truth = plane_views(count=8, width=96, height=72)
+    plain = replace(views, images=np.full_like(views.images, 120))
+    wrong = _wrong(truth)
+    refined, share = refine_by_photos(plain, plain.object_from_cam, wrong, 8.0, 5, 0.6)
+    assert share == 0 and np.array_equal(refined, wrong)
+
+
+def test_no_depth_moves_farther_than_its_reach():
+    views, truth = plane_views(count=8, width=160, height=120)
+    views = _speckled(views, truth)
+    far_off = np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
+    refined, _ = refine_by_photos(views, views.object_from_cam, far_off, 1.0, 5, 0.6)
+    moved = np.abs(1 / refined[truth > 0] - 1 / far_off[truth > 0])
+    baseline = np.linalg.norm(np.diff(views.object_from_cam[:, :3, 3], axis=0), axis=1).min()
+    assert moved.max() < 4.0 / (views.intrinsics[0, 0, 0] * baseline)
