@@ -183,8 +183,8 @@ def object_ablation(
     for name in objects:
         folder, known = results / "objects" / name, results / "demo/demo/truth"
         truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], shipped["seed"])
-        for arm in chosen:
-            for seed in range(seeds):
+        for seed in range(seeds):
+            for arm in chosen:
                 print(f"{name} {arm} {seed}", flush=True)
                 measured = one(folder, truth, chosen[arm], seed, own, judge["max_photos"])
                 rows.append({"object": name, "arm": arm, "seed": seed} | measured)
@@ -202,6 +202,9 @@ HEAD = {
     "f_05": "F 0.5 %",
     "f_1": "F 1 %",
     "f_1_cut": "F 1 %, cut",
+    "accuracy_pct_rendered": "as rendered: accuracy (%)",
+    "f_05_rendered": "F 0.5 %",
+    "f_1_rendered": "F 1 %",
     "seconds": "seconds",
 }
 
