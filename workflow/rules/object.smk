@@ -13,9 +13,10 @@
 
 STAGE1 = dict(config["object"]["stage1"])
 # The workspace that the training stages read; both have the same photos, and poses in the same frame.
-POSED = {"sfm": "results/objects/{object}/cameras", "network": "results/objects/{object}/poses"}[
-    STAGE1.pop("pose_source")
-]
+POSED = {
+    "sfm": "results/objects/{object}/cameras",
+    "network": "results/objects/{object}/poses",
+}[STAGE1.pop("pose_source")]
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
