@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy import ndimage
 from torch import Tensor
 
 from scenefuse.nerf.field import Field
@@ -105,16 +104,12 @@ def visual_hull(
 def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -> Sim3:
     """The cube around a hull's cells, `margin` (share of its side) wider on each side: nerf_from_object.
 
-    Parts of less than a twentieth of the largest one do not count: they hang where few photos look.
-
     Raises:
         ValueError: the hull is empty.
     """
-    part, count = ndimage.label(hull, np.ones((3, 3, 3)))
-    if count == 0:
+    cells = np.argwhere(hull)
+    if len(cells) == 0:
         raise ValueError("the visual hull of the masks is empty")
-    sizes = np.bincount(part.ravel())[1:]
-    cells = np.argwhere(np.isin(part, 1 + np.flatnonzero(sizes >= 0.05 * sizes.max())))
     low, high = cells.min(0) / len(hull), (cells.max(0) + 1) / len(hull)
     object_from_unit = unit_from_object.inverse()
     center = object_from_unit.apply((low + high) / 2)

@@ -68,9 +68,7 @@ def test_two_stages_and_the_cloud(workspace):
     _run(workspace, "stage4", previous=workspace / "stage2")
     report = read_json(workspace / "stage4.json")
     assert value(report, "started_from_previous") is True
-    # A grey disc of the photos' mean colour has 9 dB; ten photos of 48 pixels do not carry much farther.
-    assert value(report, "psnr_held_out") > 12 and value(report, "psnr_training") > 17
-    assert value(report, "silhouette_iou") > 0.8
+    assert value(report, "psnr_held_out") > 15 and value(report, "silhouette_iou") > 0.8
     assert value(report, "photos_measured") == 2 and value(report, "pose_refinement") is True
     depth = read_depth(workspace / "stage4/depth_maps/00.png.bin")
     truth = sphere_views()[4][0]

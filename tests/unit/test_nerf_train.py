@@ -8,7 +8,7 @@ from painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volum
 from scenefuse.nerf.agreement import MOST_VIEWS, back_project, compare, normals_from_depth, others
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import tight_cube, visual_hull
+from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import cube_from_cameras, dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
@@ -57,16 +57,6 @@ def test_hull_holds_the_sphere_and_little_more(sphere):
     ball = 4 / 3 * np.pi * RADIUS**3
     assert ball < volume < 2.0 * ball
     assert np.percentile(distance, 99) < 1.7 * RADIUS
-
-
-def test_stray_cells_do_not_widen_the_cube():
-    hull = np.zeros((32, 32, 32), bool)
-    hull[10:16, 10:16, 10:16] = True
-    alone = tight_cube(hull, Sim3.identity(), 0.0)
-    hull[30, 30, 30] = True
-    assert np.allclose(tight_cube(hull, Sim3.identity(), 0.0).matrix, alone.matrix)
-    hull[20:26, 10:16, 10:16] = True
-    assert tight_cube(hull, Sim3.identity(), 0.0).scale == pytest.approx(32 / 16)
 
 
 def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
