@@ -14,8 +14,8 @@ BETAS, EPSILON = (0.9, 0.99), 1e-15
 class TableAdam:
     """Adam (Kingma and Ba 2015) on a (T, 2) table, skipping rows whose gradient is exactly zero.
 
-    A step touches a small part of a large table; the others keep their values and their moments (Mueller et al. 2022,
-    section 4), which saves most of the memory traffic.
+    A step touches a small part of a large table; the other rows keep their values and their moments (Mueller et al.
+    2022, section 4).
     """
 
     def __init__(self, table: Tensor) -> None:

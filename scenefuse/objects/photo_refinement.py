@@ -49,8 +49,8 @@ def refine_by_photos(
         cut = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]]) @ whole.intrinsics
         reference = Photo(np.ascontiguousarray(whole.gray[part]), cut, whole.cam_from_world)
         found = refine_depth(reference, [photos[s] for s in sources[index]], depth[part], reach_px, settings, device)
-        moved[index][part] = np.where(found.depth > 0, found.depth, depth[part])
-        count += int((found.depth > 0).sum())
+        moved[index][part] = np.where(found > 0, found, depth[part])
+        count += int((found > 0).sum())
     return moved, count / max(int((depths > 0).sum()), 1)
 
 

@@ -127,7 +127,7 @@ def estimate_depth(
 def refine_depth(
     reference: Photo, sources: list[Photo], depth: NDArray[np.float32], reach_px: float, settings: DepthSettings,
     device: str,
-) -> DepthEstimate:  # fmt: skip
+) -> NDArray[np.float32]:  # fmt: skip
     """A depth map that is nearly right, moved to where the photos match best; 0 where they match nowhere near it.
 
     Args:
@@ -146,14 +146,12 @@ def refine_depth(
     step = reach_px * (high - low) / max(matcher.shift_per_inverse_depth(low, high), 1e-6)
     inverse, _ = _refine(matcher, first, step / 2, low, high)
     inverse, score = _refine(matcher, inverse, step / 4, low, high)
-    inverse, slopes = _local_planes(inverse, score)
+    inverse, _ = _local_planes(inverse, score)
     inverse, score = _refine_once(matcher, inverse[None], step / 8)
-    normals = _normals(inverse, slopes, reference.intrinsics)
     gain = score - matcher.score(first[None])[0]
     good = (score >= settings.min_score) & (gain >= MIN_GAIN) & ((inverse - first).abs() <= step)
     good &= torch.from_numpy(known).to(device)
-    moved = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
-    return DepthEstimate(moved.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
+    return torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse)).cpu().numpy()
 
 
 class _Matcher:
