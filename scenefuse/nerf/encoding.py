@@ -94,7 +94,7 @@ class _Encode(torch.autograd.Function):
             )
         if ctx.needs_input_grad[1]:
             boost = np.ones(len(positions), np.float32) if ctx.boost is None else ctx.boost.numpy()
-            g_table = torch.from_numpy(np.zeros(table.shape, np.float32))
+            g_table = torch.empty_like(table)
             kernels.encode_backward(
                 positions,
                 gradient,

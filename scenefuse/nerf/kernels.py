@@ -1,4 +1,4 @@
-"""CPU kernels in Numba for the hash grid, ray marching and compositing.
+"""CPU kernels in Numba for the hash grid and ray marching.
 
 Each one has a plain PyTorch twin beside its caller, which tests compare against and which runs on other devices or
 where Numba is not installed. Loops are arranged so that no two threads write to one place: results do not depend on
@@ -25,7 +25,6 @@ PRIMES = (1, 2654435761, 805459861)
 ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
-THIRD = np.float32(1.0 / 3.0)
 PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
 
 
@@ -121,14 +120,18 @@ def _add(out, row, weight, a, b):
 
 @_jit
 def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, threads, out):
-    """Gradient of `encode` with respect to the table, added to out (T, 2): one thread owns a level.
+    """Gradient of `encode` with respect to the table, written to out (T, 2): one thread owns a level.
+
+    A level is set to zero just before its gradients are added, so that its rows are still in the cache.
 
     gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
     """
+    levels = resolution.shape[0]
     for thread in prange(threads):
         # Fine levels cost more than coarse ones: every thread gets some of both.
-        for level in range(thread, resolution.shape[0], threads):
+        for level in range(thread, levels, threads):
             weight = level_weight[level]
+            out[offset[level] : offset[level + 1] if level + 1 < levels else out.shape[0]] = ZERO
             if weight == ZERO:
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
@@ -179,19 +182,6 @@ def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, leve
                 out[n, 0] += gz * (gy * (v1 - v0) + fy * (v3 - v2)) + fz * (gy * (v5 - v4) + fy * (v7 - v6))
                 out[n, 1] += gz * (gx * (v2 - v0) + fx * (v3 - v1)) + fz * (gx * (v6 - v4) + fx * (v7 - v5))
                 out[n, 2] += gy * (gx * (v4 - v0) + fx * (v5 - v1)) + fy * (gx * (v6 - v2) + fx * (v7 - v3))
-
-
-@_jit
-def adam(table, gradient, first, second, rate, beta_first, beta_second, epsilon):
-    """One step of Adam on the rows (T, 2) whose gradient is not zero; bias correction is part of the rate."""
-    for row in prange(table.shape[0]):
-        if gradient[row, 0] == ZERO and gradient[row, 1] == ZERO:
-            continue
-        for k in range(2):
-            g = gradient[row, k]
-            first[row, k] = beta_first * first[row, k] + (ONE - beta_first) * g
-            second[row, k] = beta_second * second[row, k] + (ONE - beta_second) * g * g
-            table[row, k] -= rate * first[row, k] / (np.sqrt(second[row, k]) + epsilon)
 
 
 @_jit
@@ -301,64 +291,3 @@ def march(
                 out_t[r, s] = start[cell] + (middle - np.float32(cell)) * step
                 out_delta[r, s] = (end - edge) * step
                 edge = end
-
-
-@_jit
-def composite(sigma, rgb, t, delta, weights, color, opacity, depth, distortion):
-    """Volume rendering of (R, S) samples: weights, colour (R, 3), opacity, sum of w t, and distortion (R,).
-
-    The distortion is Mip-NeRF 360's (Barron et al. 2022, equation 15) with distances in ray units.
-    """
-    samples = sigma.shape[1]
-    for r in prange(sigma.shape[0]):
-        transmittance = ONE
-        red, green, blue = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        mass, moment, spread = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for s in range(samples):
-            alpha = ONE - np.exp(-sigma[r, s] * delta[r, s])
-            w = transmittance * alpha
-            transmittance *= ONE - alpha
-            weights[r, s] = w
-            red += w * rgb[r, s, 0]
-            green += w * rgb[r, s, 1]
-            blue += w * rgb[r, s, 2]
-            spread += np.float32(2.0) * w * (t[r, s] * mass - moment) + THIRD * w * w * delta[r, s]
-            mass += w
-            moment += w * t[r, s]
-        color[r, 0], color[r, 1], color[r, 2] = red, green, blue
-        opacity[r], depth[r], distortion[r] = mass, moment, spread
-
-
-@_jit
-def composite_backward(sigma, rgb, t, delta, weights, g_color, g_opacity, g_depth, g_distortion, g_sigma, g_rgb):
-    """Gradients of `composite` with respect to sigma (R, S) and rgb (R, S, 3)."""
-    samples = sigma.shape[1]
-    two = np.float32(2.0)
-    for r in prange(sigma.shape[0]):
-        mass, moment, tau = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for s in range(samples):
-            mass += weights[r, s]
-            moment += weights[r, s] * t[r, s]
-            tau += sigma[r, s] * delta[r, s]
-        behind, mass_behind, moment_behind = np.float32(0.0), np.float32(0.0), np.float32(0.0)
-        for reverse in range(samples):
-            s = samples - 1 - reverse
-            w, z = weights[r, s], t[r, s]
-            mass_before = mass - mass_behind - w
-            moment_before = moment - moment_behind - w * z
-            pull = z * (mass_before - mass_behind) - (moment_before - moment_behind)
-            g = (
-                g_color[r, 0] * rgb[r, s, 0]
-                + g_color[r, 1] * rgb[r, s, 1]
-                + g_color[r, 2] * rgb[r, s, 2]
-                + g_opacity[r]
-                + g_depth[r] * z
-                + g_distortion[r] * two * (pull + THIRD * w * delta[r, s])
-            )
-            after = np.exp(-tau)
-            g_sigma[r, s] = delta[r, s] * (after * g - behind)
-            behind += w * g
-            mass_behind += w
-            moment_behind += w * z
-            tau -= sigma[r, s] * delta[r, s]
-            g_rgb[r, s, 0], g_rgb[r, s, 1], g_rgb[r, s, 2] = w * g_color[r, 0], w * g_color[r, 1], w * g_color[r, 2]

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import torch
@@ -115,29 +114,6 @@ def march_reference(
     return t, (end - edge) * step, used[:, 0] > 0
 
 
-class _Composite(torch.autograd.Function):
-    """The Numba compositing kernels as one differentiable function of density and colour."""
-
-    @staticmethod
-    def forward(ctx: Any, sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> Any:
-        rays = sigma.shape[0]
-        sigma, rgb, t, delta = (a.detach().contiguous() for a in (sigma, rgb, t, delta))
-        weights, color = torch.empty_like(sigma), torch.empty(rays, 3)
-        opacity, depth, distortion = torch.empty(rays), torch.empty(rays), torch.empty(rays)
-        kernels.composite(*(a.numpy() for a in (sigma, rgb, t, delta, weights, color, opacity, depth, distortion)))
-        ctx.save_for_backward(sigma, rgb, t, delta, weights)
-        ctx.mark_non_differentiable(weights)
-        return color, opacity, depth, distortion, weights
-
-    @staticmethod
-    def backward(ctx: Any, *gradients: Any) -> Any:
-        saved = ctx.saved_tensors
-        g_sigma, g_rgb = torch.empty_like(saved[0]), torch.empty_like(saved[1])
-        arrays = [a.contiguous().numpy() for a in (*saved, *gradients[:4])]
-        kernels.composite_backward(*arrays, g_sigma.numpy(), g_rgb.numpy())
-        return g_sigma, g_rgb, None, None
-
-
 def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Volume rendering of S samples on each of R rays.
 
@@ -151,15 +127,6 @@ def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> tuple[Ten
         colour (R, 3) on black, opacity (R,), sum of w t (R,), distortion (R,), and the weights w (R, S), which carry
         no gradient.
     """
-    if kernels.AVAILABLE and sigma.device.type == "cpu":
-        return _Composite.apply(sigma, rgb, t, delta)
-    return composite_reference(sigma, rgb, t, delta)
-
-
-def composite_reference(
-    sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """`composite` in plain PyTorch."""
     tau = sigma * delta
     before = torch.cumsum(tau, 1) - tau
     w = torch.exp(-before) * (1 - torch.exp(-tau))

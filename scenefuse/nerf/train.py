@@ -18,7 +18,6 @@ import torch
 from torch import Tensor, nn
 
 from scenefuse.nerf import kernels, losses
-from scenefuse.nerf.adam import BETAS, EPSILON, TableAdam
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
@@ -266,9 +265,8 @@ class Optimizer:
     """Adam for table, networks and poses, with linear warm-up and a cosine to 2 % of the highest rates."""
 
     def __init__(self, table: nn.Parameter, networks: list[nn.Parameter], pose: nn.Parameter) -> None:
-        self.table = TableAdam(table)
-        groups = [{"params": networks}, {"params": [pose]}]
-        self.rest = torch.optim.Adam(groups, betas=BETAS, eps=EPSILON, fused=True)
+        groups = [{"params": p} for p in ([table], networks, [pose])]
+        self.adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
     def step(self, schedule: Schedule, step: int) -> None:
         """Apply all gradients at the rates of this step, and clear them."""
@@ -276,21 +274,11 @@ class Optimizer:
         rise = min(1.0, (step + 1) / warmup)
         done = max(0.0, (step - warmup) / max(1.0, schedule.steps - warmup))
         factor = rise * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
-        for group, rate in zip(self.rest.param_groups, (schedule.learning_rate, schedule.pose_learning_rate)):
+        rates = schedule.grid_learning_rate, schedule.learning_rate, schedule.pose_learning_rate
+        for group, rate in zip(self.adam.param_groups, rates):
             group["lr"] = rate * factor
-        self.table.step(schedule.grid_learning_rate * factor)
-        self.rest.step()
-        self.table.table.grad = None
-        self.rest.zero_grad(set_to_none=True)
-
-    def state(self) -> dict[str, Any]:
-        """For a checkpoint."""
-        return {"table": self.table.state(), "rest": self.rest.state_dict()}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Back from `state`."""
-        self.table.load(state["table"])
-        self.rest.load_state_dict(state["rest"])
+        self.adam.step()
+        self.adam.zero_grad(set_to_none=True)
 
 
 class _Meter:
@@ -335,7 +323,7 @@ class _Meter:
 def _save(path: Path, model: Model, optimizer: Optimizer, pose: Tensor, step: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    state = {"model": model.state(), "optimizer": optimizer.state(), "pose": pose.detach(), "step": step}
+    state = {"model": model.state(), "optimizer": optimizer.adam.state_dict(), "pose": pose.detach(), "step": step}
     torch.save(state, temporary)
     os.replace(temporary, path)
 
@@ -348,7 +336,7 @@ def _resume(path: Path | None, model: Model, optimizer: Optimizer, pose: Tensor)
     model.field.load_state_dict(state["model"]["field"])
     device = model.field.table.device
     model.occupancy = Occupancy(*(state["model"][name].to(device) for name in ("hull", "density", "occupied")))
-    optimizer.load(state["optimizer"])
+    optimizer.adam.load_state_dict(state["optimizer"])
     with torch.no_grad():
         pose.copy_(state["pose"])
     return int(state["step"])

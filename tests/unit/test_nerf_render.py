@@ -10,7 +10,6 @@ from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import (
     Prior,
     composite,
-    composite_reference,
     march,
     march_reference,
     median_distance,
@@ -35,23 +34,6 @@ def test_composite_by_hand():
     pairs = 2 * (0.5 * 0.25 * 1 + 0.5 * 0.1875 * 2 + 0.25 * 0.1875 * 1)
     own = (0.25 + 0.0625 + 0.1875**2) / 3
     assert float(distortion) == pytest.approx(pairs + own, abs=1e-6)
-
-
-@pytest.mark.skipif(not kernels.AVAILABLE, reason="Numba is not installed")
-def test_composite_gradients_match_the_reference():
-    rng = torch.Generator().manual_seed(0)
-    t = torch.rand(20, 9, generator=rng).sort(1).values
-    delta = torch.rand(20, 9, generator=rng) * 0.2
-    grown = []
-    for function in (composite, composite_reference):
-        sigma = (torch.rand(20, 9, generator=torch.Generator().manual_seed(1)) * 20).requires_grad_()
-        rgb = torch.rand(20, 9, 3, generator=torch.Generator().manual_seed(2)).requires_grad_()
-        color, opacity, moment, distortion, _ = function(sigma, rgb, t, delta)
-        loss = (color * torch.tensor([1.0, -2.0, 0.5])).sum() + 0.7 * opacity.square().sum() + moment.sin().sum()
-        (loss + 3 * distortion.sum()).backward()
-        grown.append((sigma.grad, rgb.grad))
-    for ours, reference in zip(*grown):
-        assert torch.allclose(ours, reference, rtol=1e-4, atol=1e-5)
 
 
 def test_uniform_marching_splits_the_occupied_length_evenly():
