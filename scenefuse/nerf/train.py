@@ -52,8 +52,6 @@ class Schedule:
     """samples per ray at the end"""
     coarse_until: float
     """share of the steps after which all levels are open"""
-    prior_until: float
-    """share of the steps after which the depth prior has faded out"""
     edge_boost: float
     """adaptive grid: gradients of fine levels are multiplied by 1 + this at edges"""
     pose_learning_rate: float
@@ -190,24 +188,23 @@ def _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, s
     rng = torch.Generator().manual_seed(seed * 1_000_003 + step)
     refine = schedule.pose_learning_rate > 0 and progress > 0.2
     terms, samples = _loss_terms(field, occupancy, photos, batch, schedule, weights, pose if refine else None,
-                                 count, progress, rng)  # fmt: skip
+                                 count, rng)  # fmt: skip
     loss = sum(getattr(weights, f"{name}_weight") * value for name, value in terms.items() if name != "psnr")
     loss.backward()
     optimizer.step(schedule, step)
     return {name: float(value.detach()) for name, value in terms.items()}, (len(batch.view), samples)
 
 
-def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count, progress, rng):  # type: ignore[no-untyped-def]
+def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count, rng):  # type: ignore[no-untyped-def]
     device = field.table.device
     rotation, center = photos.rotation.to(device)[batch.view], photos.center.to(device)[batch.view]
     if pose is not None:
         rotation, center = refined(rotation, center, pose[batch.view])
     origin, direction, length = camera_rays(photos.intrinsics.to(device)[batch.view], rotation, center, batch.uv)
-    fade = max(0.0, 1 - progress / schedule.prior_until) if schedule.prior_until > 0 else 0.0
     has_prior = (batch.depth > 0) & batch.inside
     confidence = batch.confidence * has_prior
     prior_distance = batch.depth * length.detach()
-    prior = Prior(prior_distance, torch.full_like(length, 0.04).detach(), 0.6 * fade * confidence)
+    prior = Prior(prior_distance, torch.full_like(length, 0.04).detach(), 0.6 * confidence)
     jitter = torch.rand(len(origin), count, generator=rng).to(device)
     background = torch.rand(len(origin), 3, generator=rng).to(device)
     drawn = march(origin.detach().contiguous(), direction.detach().contiguous(), occupancy, jitter, 0.25, prior)
@@ -224,13 +221,13 @@ def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count,
     target = matte * batch.color[ray] + (1 - matte) * shown
     distance = moment / opacity.clamp(min=1e-3)
     terms = {"color": losses.color_loss(composed, target, inside)}
-    if weights.depth_weight > 0 and fade > 0:
-        terms["depth"] = losses.depth_loss(distance, opacity, prior_distance[ray], fade * confidence[ray], DEPTH_DELTA)
-    if weights.rank_weight > 0 and fade > 0:
+    if weights.depth_weight > 0:
+        terms["depth"] = losses.depth_loss(distance, opacity, prior_distance[ray], confidence[ray], DEPTH_DELTA)
+    if weights.rank_weight > 0:
         spread_out = (torch.zeros_like(length).index_put((ray,), a) for a in (distance, opacity))
         every_distance, every_opacity = spread_out
         terms["rank"] = losses.rank_loss(
-            every_distance, every_opacity, prior_distance, fade * confidence, batch.uv, schedule.images_per_batch,
+            every_distance, every_opacity, prior_distance, confidence, batch.uv, schedule.images_per_batch,
             0.02 * photos.images.shape[2], 0.02,
         )  # fmt: skip
     if weights.mask_weight > 0:

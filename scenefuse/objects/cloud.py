@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
 from scenefuse.maps import read_depth, read_normals
 from scenefuse.nerf.agreement import back_project, compare
-from scenefuse.objects.photo_refinement import refine_by_photos
+from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.objects.views import Views, load_views
 from scenefuse.stage import StageError, quantity, read_json, threads, write_json
 
@@ -23,12 +23,6 @@ from scenefuse.stage import StageError, quantity, read_json, threads, write_json
 class CloudSettings:
     """How rendered depth maps become one cloud."""
 
-    refine_reach_px: float
-    """how far a rendered depth may move, in the other photos, to where they match best; 0 leaves depths as rendered"""
-    refine_window_px: int
-    """side of the matching window, odd"""
-    refine_min_score: float
-    """least mean correlation of the best matches; below it the rendered depth stays"""
     min_views: int
     """views that must agree on a point, its own included"""
     agreement: float
@@ -56,6 +50,7 @@ def object_cloud(
     cameras_report: Path,
     cloud: Path,
     report: Path,
+    refinement: RefinementSettings,
     settings: CloudSettings,
     seed: int,
 ) -> None:
@@ -71,6 +66,7 @@ def object_cloud(
         cameras_report: JSON of the cameras stage, for `up_in_camera_frame`.
         cloud: output PLY with normals, colours, and the fields `confidence` (0..1) and `views`.
         report: output JSON.
+        refinement: of rendered depths by photos.
         settings: gates and spacing.
         seed: of the sample that measures spacing.
 
@@ -90,10 +86,7 @@ def object_cloud(
         raise StageError(f"{stage} was made from other photos than {cameras} holds now; run the NeRF stage again")
     poses = saved["object_from_cam"].numpy()
     depths, confidence, normals = _maps(stage, views, settings.min_confidence)
-    refined_share = 0.0
-    if settings.refine_reach_px > 0:
-        limits = settings.refine_reach_px, settings.refine_window_px, settings.refine_min_score
-        depths, refined_share = refine_by_photos(views, poses, depths, *limits)
+    depths, moved = refine_by_photos(views, poses, depths, refinement)
     raw, diagonal = fuse_depths(views, poses, depths, confidence, normals, settings)
     if len(raw) < 100:
         raise StageError(
@@ -106,7 +99,7 @@ def object_cloud(
     write_cloud(cloud, cleaned)
     content = {
         "points": quantity(len(cleaned), "1"),
-        "refined_share": quantity(refined_share, "1"),
+        "refined_share": quantity(float(moved.sum() / max(int((depths > 0).sum()), 1)), "1"),
         "points_before_thinning": quantity(len(raw), "1"),
         "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
         "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),

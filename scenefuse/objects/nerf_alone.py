@@ -14,6 +14,7 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.train import Schedule
 from scenefuse.objects.cloud import CloudSettings, object_cloud
 from scenefuse.objects.import_photos import import_photos
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.scenes.undistort import UndistortSettings
 from scenefuse.settings import build, shipped_with
@@ -68,6 +69,7 @@ def nerf_files(
     photos = read_json(steps / "photos.json")
     exact = {"mask_band_px": 0} if value(photos, "masks_exact") else {}
     chosen = wanted["nerf"] | wanted["nerf_alone"] | exact
+    refinement = build(RefinementSettings, wanted["photo_refinement"])
     train_nerf(
         cameras=cameras,
         masks=mattes,
@@ -79,6 +81,7 @@ def nerf_files(
         field=build(FieldSettings, chosen),
         schedule=build(Schedule, chosen),
         losses=build(LossWeights, chosen),
+        refinement=refinement,
         settings=build(NerfSettings, chosen),
         hold_out_every=wanted["hold_out_every"],
         device=chosen["device"],
@@ -97,6 +100,7 @@ def nerf_files(
             cameras_report=steps / "photos.json",
             cloud=out / "object.ply",
             report=steps / "cloud.json",
+            refinement=refinement,
             settings=build(CloudSettings, wanted["cloud"]),
             seed=seed,
         )

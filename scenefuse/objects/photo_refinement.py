@@ -1,4 +1,6 @@
-"""Rendered depth moved to where the photos match best: the NeRF says where the surface is, the photos how exactly."""
+"""Depths moved to where the photos match best: a map says where the surface is, the photos say how exactly."""
+
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,47 +13,57 @@ from scenefuse.scenes.plane_sweep import DepthSettings, Photo, refine_depth
 SOURCES, BEST_SOURCES, BEST_ANGLE_DEG = 8, 3, 15.0
 
 
+@dataclass(frozen=True)
+class RefinementSettings:
+    """How depths are moved to where photos match."""
+
+    match_reach_px: float
+    """how far a depth may move, in the other photos, to where they match best; 0 leaves depths as they are"""
+    match_window_px: int
+    """side of the matching window, odd"""
+    match_min_score: float
+    """least mean correlation of the best matches; below it a depth stays as it is"""
+
+
 def refine_by_photos(
-    views: Views,
-    poses: NDArray[np.float64],
-    depths: NDArray[np.float32],
-    reach_px: float,
-    window_px: int,
-    min_score: float,
-) -> tuple[NDArray[np.float32], float]:
-    """Depth maps (V, H, W) with every pixel moved along its ray to the best match, and the share that was.
+    views: Views, poses: NDArray[np.float64], depths: NDArray[np.float32], settings: RefinementSettings
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Depth maps (V, H, W) with every pixel moved along its ray to the best match, and which of them were.
 
     Windows of a photo are matched with those of the eight photos that see the object from about 15 degrees aside; the
     best three count (`scenefuse.scenes.plane_sweep`). A pixel whose match is poor, hardly better than where it was, or
-    farther off than the reach, keeps its rendered depth.
+    farther off than the reach, keeps its depth.
 
     Args:
         views: photos and intrinsics at the maps' size.
-        poses: (V, 4, 4) object_from_cam that the maps were rendered with.
+        poses: (V, 4, 4) object_from_cam of the maps.
         depths: (V, H, W) along z, 0 for none.
-        reach_px: how far a pixel may move in the other photos, pixels.
-        window_px: side of the matching window, odd.
-        min_score: least mean NCC of the best three.
+        settings: reach, window and least score.
     """
+    moved = np.zeros(depths.shape, bool)
+    if settings.match_reach_px == 0:
+        return depths, moved
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    settings = DepthSettings(0, SOURCES, BEST_SOURCES, 0, 1, window_px, 0.0, min_score, 0.0, False)
+    window = settings.match_window_px
+    limits = DepthSettings(0, SOURCES, BEST_SOURCES, 0, 1, window, 0.0, settings.match_min_score, 0.0, False)
     photos = [_photo(views, poses, index) for index in range(len(depths))]
     sources = _sources(poses, depths, views.intrinsics)
-    moved, count = depths.copy(), 0
+    refined = depths.copy()
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows) == 0:
             continue
-        pad = 2 * window_px
+        pad = 2 * window
         top, left = max(rows.min() - pad, 0), max(columns.min() - pad, 0)
         part = np.s_[top : rows.max() + pad + 1, left : columns.max() + pad + 1]
         whole = photos[index]
         cut = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]]) @ whole.intrinsics
         reference = Photo(np.ascontiguousarray(whole.gray[part]), cut, whole.cam_from_world)
-        found = refine_depth(reference, [photos[s] for s in sources[index]], depth[part], reach_px, settings, device)
-        moved[index][part] = np.where(found > 0, found, depth[part])
-        count += int((found > 0).sum())
-    return moved, count / max(int((depths > 0).sum()), 1)
+        near = [photos[s] for s in sources[index]]
+        found = refine_depth(reference, near, depth[part], settings.match_reach_px, limits, device)
+        moved[index][part] = found > 0
+        refined[index][part] = np.where(found > 0, found, depth[part])
+    return refined, moved
 
 
 def _photo(views: Views, poses: NDArray[np.float64], index: int) -> Photo:

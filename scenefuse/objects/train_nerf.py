@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.maps import read_depth, write_depth, write_normals
+from scenefuse.maps import write_depth, write_normals
 from scenefuse.nerf import kernels
 from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
 from scenefuse.nerf.field import FieldSettings
@@ -21,6 +21,8 @@ from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import Photos, cube_from_cameras, dilate
 from scenefuse.nerf.render import Rendered, render_view
 from scenefuse.nerf.train import Model, Schedule, keep_memory, new_model, refined, train
+from scenefuse.objects.depth_prior import DepthPrior, read_prior
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.views import Views, load_views
 from scenefuse.stage import StageError, atomic_directory, quantity, threads, write_json
 from scenefuse.transforms import Sim3, fit_sim3
@@ -59,6 +61,7 @@ def train_nerf(
     field: FieldSettings,
     schedule: Schedule,
     losses: LossWeights,
+    refinement: RefinementSettings,
     settings: NerfSettings,
     hold_out_every: int,
     device: Literal["auto", "cpu", "cuda"],
@@ -81,6 +84,7 @@ def train_nerf(
         field: size of the field.
         schedule: of the training.
         losses: weights of the losses.
+        refinement: of the prior's depths by photos.
         settings: sizes and gates.
         hold_out_every: every n-th photo is not trained on and measures quality; 0 holds out none.
         device: `auto` takes CUDA where it is.
@@ -100,7 +104,8 @@ def train_nerf(
     if earlier is not None and earlier["names"] == views.names:
         views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     nerf_from_object, hull = _volume(views, training, settings, earlier)
-    photos = make_photos(views, nerf_from_object, prior, exact=settings.mask_band_px == 0)
+    known = None if prior is None else read_prior(prior, views, refinement, settings.agreement)
+    photos = make_photos(views, nerf_from_object, known, exact=settings.mask_band_px == 0)
     model = new_model(field, torch.from_numpy(hull), len(training), seed, chosen)
     warm = earlier is not None and earlier["model"]["settings"] == model.state()["settings"]
     if warm and earlier is not None:
@@ -139,6 +144,8 @@ def train_nerf(
         "kernels": quantity(kernel, ""),
         "started_from_previous": quantity(warm, ""),
         "depth_prior": quantity(prior is not None, ""),
+        "prior_refined_share": quantity(known and known.refined_share, "1"),
+        "prior_confident_share": quantity(known and known.confident_share, "1"),
         "hull_share": quantity(float(hull.mean()), "1"),
         "occupied_share": quantity(float(model.occupancy.occupied.float().mean()), "1"),
         "diagonal": quantity(diagonal, "object units"),
@@ -172,20 +179,11 @@ def train_nerf(
 _TERMS = ("color", "depth", "rank", "mask", "sparsity", "distortion")
 
 
-def make_photos(views: Views, nerf_from_object: Sim3, prior: Path | None, exact: bool) -> Photos:
-    """All photos in the unit cube's frame, with the depth prior of a stage folder; grey mattes only where `exact`."""
+def make_photos(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None, exact: bool) -> Photos:
+    """All photos in the unit cube's frame, with the depth prior if there is one; grey mattes only where `exact`."""
     rotation = np.stack([nerf_from_object.rotation @ pose[:3, :3] for pose in views.object_from_cam])
-    depths = np.zeros(views.masks.shape, dtype=np.float32)
-    confidence = np.zeros(views.masks.shape, dtype=np.float32)
-    size = views.masks.shape[2], views.masks.shape[1]
-    for index, name in enumerate(views.names if prior is not None else []):
-        path = Path(prior or "") / "depth_maps" / f"{name}.bin"
-        if path.is_file():
-            certain = read_depth(path.parent.parent / "confidence_maps" / path.name)
-            depths[index] = cv2.resize(read_depth(path), size, interpolation=cv2.INTER_NEAREST)
-            confidence[index] = cv2.resize(certain, size, interpolation=cv2.INTER_NEAREST)
-    valid = np.isfinite(depths) & (depths > 0) & views.masks
-    depths, confidence = np.where(valid, depths, 0), np.where(valid, np.nan_to_num(confidence).clip(0, 1), 0)
+    nothing = np.zeros(views.masks.shape, np.float32)
+    depths, confidence = (nothing, nothing) if prior is None else (prior.depths, prior.confidence)
     return Photos(
         torch.from_numpy(views.images),
         torch.from_numpy(views.masks),
@@ -194,7 +192,7 @@ def make_photos(views: Views, nerf_from_object: Sim3, prior: Path | None, exact:
         torch.from_numpy(rotation.astype(np.float32)),
         torch.from_numpy(nerf_from_object.apply(views.object_from_cam[:, :3, 3]).astype(np.float32)),
         torch.from_numpy((depths * nerf_from_object.scale).astype(np.float32)),
-        torch.from_numpy(confidence.astype(np.float32)),
+        torch.from_numpy(confidence),
     )
 
 

@@ -144,8 +144,8 @@ def refine_depth(
     low, high = float(first.min()), float(first.max()) * 1.001
     matcher = _Matcher(reference, sources, settings, device)
     step = reach_px * (high - low) / max(matcher.shift_per_inverse_depth(low, high), 1e-6)
-    inverse, _ = _refine(matcher, first, step / 2, low, high)
-    inverse, score = _refine(matcher, inverse, step / 4, low, high)
+    inverse, _ = _refine_once(matcher, first[None], step / 2)
+    inverse, score = _refine(matcher, _median3(inverse), step / 4, low, high)
     inverse, _ = _local_planes(inverse, score)
     inverse, score = _refine_once(matcher, inverse[None], step / 8)
     gain = score - matcher.score(first[None])[0]

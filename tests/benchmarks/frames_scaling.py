@@ -27,6 +27,7 @@ from scenefuse.nerf.train import Schedule
 from scenefuse.objects.cloud import CloudSettings, object_cloud
 from scenefuse.objects.depth import DepthSettings, train_depth
 from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.settings import build, shipped_with
 from scenefuse.stage import quantity, run, write_json
@@ -104,7 +105,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
             **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
             report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
             schedule=build(Schedule, settings), losses=build(LossWeights, settings),
-            settings=build(NerfSettings, settings),
+            refinement=build(RefinementSettings, own["photo_refinement"]), settings=build(NerfSettings, settings),
         )  # fmt: skip
 
     start, began = time.monotonic(), os.times()
@@ -126,7 +127,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
         object_cloud(
             **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
             cameras_report=folder / "cameras.json", cloud=folder / "object.ply", report=folder / "object.json",
-            settings=build(CloudSettings, own["cloud"]),
+            refinement=build(RefinementSettings, own["photo_refinement"]), settings=build(CloudSettings, own["cloud"]),
         )  # fmt: skip
     now = os.times()
     total = now.user + now.system - began.user - began.system

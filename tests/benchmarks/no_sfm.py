@@ -23,6 +23,7 @@ from scenefuse.nerf.train import Schedule
 from scenefuse.objects.cloud import CloudSettings, object_cloud
 from scenefuse.objects.depth import DepthSettings, train_depth
 from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.poses import PoseSettings, find_poses
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.settings import build, shipped_with
@@ -66,7 +67,7 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         train_nerf(
             **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
             field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
-            settings=build(NerfSettings, own),
+            refinement=build(RefinementSettings, settings["photo_refinement"]), settings=build(NerfSettings, own),
         )  # fmt: skip
 
     train_depth(**inputs, **common, **outputs("stage1"), settings=build(DepthSettings, settings["stage1"]))
@@ -78,8 +79,9 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
     nerf("stage4", "stage3", folder / "stage2")
     object_cloud(
         **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
-        cloud=folder / "object.ply", report=folder / "object.json", settings=build(CloudSettings, settings["cloud"]),
-        seed=seed,
+        cloud=folder / "object.ply", report=folder / "object.json",
+        refinement=build(RefinementSettings, settings["photo_refinement"]),
+        settings=build(CloudSettings, settings["cloud"]), seed=seed,
     )  # fmt: skip
 
 

@@ -23,6 +23,7 @@ from scenefuse.nerf.quality import psnr
 from scenefuse.nerf.train import Schedule
 from scenefuse.objects.cloud import CloudSettings, object_cloud
 from scenefuse.objects.feedback import FeedbackSettings, refine_depth
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.objects.views import load_views
 from scenefuse.settings import build, shipped_with
@@ -39,6 +40,7 @@ class Arm:
     masks: bool = True
     prior: bool = True
     feedback: bool = True
+    matching: dict[str, Any] = field(default_factory=dict)
     long: bool = False
     """stage 2 alone, with stage 4's epochs added"""
 
@@ -52,6 +54,7 @@ def arms(settings: dict[str, Any]) -> dict[str, Arm]:
         "no_masks": Arm(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
         "no_depth": Arm(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
         "no_relative_depth": Arm(nerf={"rank_weight": 0}),
+        "prior_unrefined": Arm(matching={"match_reach_px": 0}),
         "no_feedback": Arm(feedback=False),
         "poses_of_sfm" if refined else "poses_refined": Arm(nerf={"pose_learning_rate": other}),
         "no_adaptive_grid": Arm(nerf={"edge_boost": 0}),
@@ -74,6 +77,7 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
                 **inputs, **common, prior=prior if arm.prior else None, previous=previous, stage=work / f"stage{stage}",
                 report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
                 schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
+                refinement=build(RefinementSettings, settings["photo_refinement"] | arm.matching),
             )  # fmt: skip
 
         early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
@@ -96,8 +100,8 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
             "within_4": value(depth, f"{last.name}_depth_within_1pct"),
             "psnr_2": held_out_psnr(folder, work / "stage2", settings),
             "psnr_4": held_out_psnr(folder, last, settings),
-            **cloud(folder, inputs, last, truth, settings["cloud"], seed),
-            **as_rendered(cloud(folder, inputs, last, truth, settings["cloud"] | {"refine_reach_px": 0}, seed)),
+            **cloud(folder, inputs, last, truth, settings, seed, {}),
+            **as_rendered(cloud(folder, inputs, last, truth, settings, seed, {"match_reach_px": 0})),
             "seconds": seconds,
         }
 
@@ -108,14 +112,22 @@ def as_rendered(measures: dict[str, Any]) -> dict[str, Any]:
 
 
 def cloud(
-    folder: Path, inputs: dict[str, Any], last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
+    folder: Path,
+    inputs: dict[str, Any],
+    last: Path,
+    truth: ObjectTruth,
+    settings: dict[str, Any],
+    seed: int,
+    matching: dict[str, Any],
 ) -> dict[str, Any]:
     """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
     path = last.with_name("object.ply")
     try:
         object_cloud(
             **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "cameras.json",
-            cloud=path, report=path.with_suffix(".json"), settings=build(CloudSettings, settings), seed=seed,
+            cloud=path, report=path.with_suffix(".json"), seed=seed,
+            refinement=build(RefinementSettings, settings["photo_refinement"] | matching),
+            settings=build(CloudSettings, settings["cloud"]),
         )  # fmt: skip
     except StageError as error:
         print(f"no cloud: {error}", flush=True)

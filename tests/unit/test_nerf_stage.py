@@ -12,13 +12,15 @@ from test_nerf_train import FIELD, WEIGHTS, sphere_views
 from scenefuse.maps import read_depth, write_depth
 from scenefuse.nerf.train import Schedule
 from scenefuse.objects.cloud import CloudSettings, object_cloud
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.train_nerf import NerfSettings, train_nerf
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
+MATCHING = RefinementSettings(0.0, 5, 0.6)
 SETTINGS = NerfSettings(
     width_px=48, mask_band_px=1, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03
 )
-SCHEDULE = Schedule(2, 120 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 0.9, 1.0, 1e-5)
+SCHEDULE = Schedule(2, 120 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, 1e-5)
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,7 @@ def _run(root, stage, previous=None, **changes):
         field=FIELD,
         schedule=SCHEDULE,
         losses=WEIGHTS,
+        refinement=MATCHING,
         settings=SETTINGS,
         hold_out_every=6,
         device="cpu",
@@ -86,7 +89,8 @@ def test_two_stages_and_the_cloud(workspace):
         cameras_report=workspace / "cameras.json",
         cloud=workspace / "object.ply",
         report=workspace / "object.json",
-        settings=CloudSettings(0.0, 5, 0.6, 2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
+        refinement=MATCHING,
+        settings=CloudSettings(2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
         seed=0,
     )
     cloud = read_json(workspace / "object.json")

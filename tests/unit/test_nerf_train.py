@@ -26,7 +26,7 @@ WEIGHTS = LossWeights(1.0, 1.0, 0.02, 0.1, 0.05, 0.01)
 
 
 def _schedule(steps, pose=0.0):
-    return Schedule(2, steps * 512 // 2, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 0.9, 1.0, pose)
+    return Schedule(2, steps * 512 // 2, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, pose)
 
 
 def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0):

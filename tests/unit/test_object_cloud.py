@@ -6,10 +6,11 @@ from test_nerf_train import CENTER, RADIUS, sphere_views
 
 from scenefuse.clouds import Cloud
 from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths, object_cloud, with_plane_normals
+from scenefuse.objects.photo_refinement import RefinementSettings
 from scenefuse.objects.views import Views
 from scenefuse.stage import StageError
 
-SETTINGS = CloudSettings(0.0, 5, 0.6, 3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
+SETTINGS = CloudSettings(3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
 
 
 def _views():
@@ -60,6 +61,7 @@ def test_a_missing_model_is_named(tmp_path):
             cameras_report=tmp_path / "cameras.json",
             cloud=tmp_path / "object.ply",
             report=tmp_path / "object.json",
+            refinement=RefinementSettings(0.0, 5, 0.6),
             settings=SETTINGS,
             seed=0,
         )

@@ -17,6 +17,7 @@ POSED = {
     "sfm": "results/objects/{object}/cameras",
     "network": "results/objects/{object}/poses",
 }[STAGE1.pop("pose_source")]
+NERF = config["object"]["nerf"] | config["object"]["photo_refinement"]
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
@@ -292,7 +293,7 @@ rule stage2:
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
+        options=flags(NERF | config["object"]["stage2"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
         script=script("nerf_stage.py"),
@@ -370,7 +371,7 @@ rule stage4:
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
+        options=flags(NERF | config["object"]["stage4"] | HELD_OUT),
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
         script=script("nerf_stage.py"),
@@ -406,7 +407,7 @@ rule object_cloud:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["object"]["cloud"]),
+        options=flags(config["object"]["cloud"] | config["object"]["photo_refinement"]),
         seed=config["seed"],
         script=script("object_cloud.py"),
         code=code("object_cloud.py"),

@@ -1,0 +1,90 @@
+"""The depth prior of a NeRF stage: maps of an earlier stage, moved to where the training photos match, and checked."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.maps import read_depth
+from scenefuse.nerf.agreement import back_project, compare
+from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.objects.views import Views
+
+AGREEING_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What is known of the surface before a NeRF is trained.
+
+    Attributes:
+        depths: (V, H, W) float32 along z in object units, 0 for none, at the size of the views; none in held-out views.
+        confidence: (V, H, W) float32 in 0..1.
+        refined_share: share of the prior's pixels that photos moved.
+        confident_share: share of the training photos' masks with a prior.
+    """
+
+    depths: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    refined_share: float
+    confident_share: float
+
+
+def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreement: float) -> DepthPrior:
+    """Read a stage's depth maps, move them by photos, and keep what two other photos' maps agree with.
+
+    Held-out photos take no part: neither their maps nor their pixels.
+
+    Args:
+        folder: of the earlier stage, with depth_maps/ and confidence_maps/.
+        views: photos, masks and cameras at the NeRF's size.
+        settings: of the refinement by photos.
+        agreement: largest difference of depth that agrees, share of the object's diagonal.
+    """
+    training = np.flatnonzero(~views.held_out)
+    names = [views.names[i] for i in training]
+    seen = replace(
+        views, names=names, images=views.images[training], mattes=views.mattes[training],
+        intrinsics=views.intrinsics[training], object_from_cam=views.object_from_cam[training],
+        held_out=views.held_out[training], tracks=[views.tracks[i] for i in training],
+    )  # fmt: skip
+    depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
+    certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
+    depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
+    depths, moved = refine_by_photos(seen, seen.object_from_cam, depths, settings)
+    refined = float(moved.sum() / max(int((depths > 0).sum()), 1))
+    confidence = np.where(moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
+    depths = np.where(confidence > 0, depths, 0)
+    shape = views.masks.shape
+    whole = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    whole[0][training], whole[1][training] = depths, confidence
+    share = float((confidence > 0).sum() / max(int(seen.masks.sum()), 1))
+    return DepthPrior(*whole, refined, share)
+
+
+def _scaled(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """A map at another size, zeros where there is none."""
+    if not path.is_file():
+        return np.zeros(shape, np.float32)
+    return np.asarray(cv2.resize(read_depth(path), shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _confirmed(views: Views, depths: NDArray[np.float32], agreement: float) -> NDArray[np.bool_]:
+    """(V, H, W), True where enough other views have the same surface."""
+    pixels = [np.nonzero(depth) for depth in depths]
+    clouds = [
+        back_project(depth[r, c].astype(np.float64), k, pose, r, c)
+        for depth, (r, c), k, pose in zip(depths, pixels, views.intrinsics, views.object_from_cam)
+    ]
+    confirmed = np.zeros(depths.shape, bool)
+    together = np.concatenate(clouds)
+    if len(together) == 0:
+        return confirmed
+    low, high = np.percentile(together, [0.5, 99.5], axis=0)
+    tolerance = agreement * float(np.linalg.norm(high - low))
+    for index, (points, (rows, columns)) in enumerate(zip(clouds, pixels)):
+        said = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
+        confirmed[index, rows, columns] = said.agree >= AGREEING_VIEWS
+    return confirmed
