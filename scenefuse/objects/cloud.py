@@ -56,7 +56,8 @@ def object_cloud(
 ) -> None:
     """Fuse a NeRF stage's depth maps into the object's cloud (method N13), in the object's camera (SfM) frame.
 
-    Rendered depths are first moved to where the photos match best, where they match (`refine_by_photos`).
+    Rendered depths are first moved to where the photos match best, where they match, and those that the photos deny
+    are left out (`refine_by_photos`).
 
     Args:
         cameras: undistorted COLMAP workspace of the object.
@@ -86,7 +87,9 @@ def object_cloud(
         raise StageError(f"{stage} was made from other photos than {cameras} holds now; run the NeRF stage again")
     poses = saved["object_from_cam"].numpy()
     depths, confidence, normals = _maps(stage, views, settings.min_confidence)
-    depths, moved = refine_by_photos(views, poses, depths, refinement)
+    rendered = max(int((depths > 0).sum()), 1)
+    refined = refine_by_photos(views, poses, depths, refinement)
+    depths = np.where(refined.denied, 0, refined.depths)
     raw, diagonal = fuse_depths(views, poses, depths, confidence, normals, settings)
     if len(raw) < 100:
         raise StageError(
@@ -99,7 +102,8 @@ def object_cloud(
     write_cloud(cloud, cleaned)
     content = {
         "points": quantity(len(cleaned), "1"),
-        "refined_share": quantity(float(moved.sum() / max(int((depths > 0).sum()), 1)), "1"),
+        "refined_share": quantity(float(refined.moved.sum() / rendered), "1"),
+        "denied_share": quantity(float(refined.denied.sum() / rendered), "1"),
         "points_before_thinning": quantity(len(raw), "1"),
         "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
         "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),

@@ -33,7 +33,7 @@ class DepthPrior:
 
 
 def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreement: float) -> DepthPrior:
-    """Read a stage's depth maps, move them by photos, and keep what two other photos' maps agree with.
+    """Read a stage's depth maps, move them by photos, and keep what photos do not deny and two other maps confirm.
 
     Held-out photos take no part: neither their maps nor their pixels.
 
@@ -53,9 +53,10 @@ def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreeme
     depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
-    depths, moved = refine_by_photos(seen, seen.object_from_cam, depths, settings)
-    refined = float(moved.sum() / max(int((depths > 0).sum()), 1))
-    confidence = np.where(moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
+    asked = refine_by_photos(seen, seen.object_from_cam, depths, settings)
+    refined = float(asked.moved.sum() / max(int((depths > 0).sum()), 1))
+    depths = np.where(asked.denied, 0, asked.depths)
+    confidence = np.where(asked.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
     depths = np.where(confidence > 0, depths, 0)
     shape = views.masks.shape
     whole = np.zeros(shape, np.float32), np.zeros(shape, np.float32)

@@ -14,6 +14,15 @@ SOURCES, BEST_SOURCES, BEST_ANGLE_DEG = 8, 3, 15.0
 
 
 @dataclass(frozen=True)
+class RefinedDepths:
+    """Depths (V, H, W) after the photos were asked, 0 for none; which of them moved; which the photos deny."""
+
+    depths: NDArray[np.float32]
+    moved: NDArray[np.bool_]
+    denied: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class RefinementSettings:
     """How depths are moved to where photos match."""
 
@@ -22,17 +31,18 @@ class RefinementSettings:
     match_window_px: int
     """side of the matching window, odd"""
     match_min_score: float
-    """least mean correlation of the best matches; below it a depth stays as it is"""
+    """least mean correlation of the best matches; below it photos deny a depth where there is texture"""
 
 
 def refine_by_photos(
     views: Views, poses: NDArray[np.float64], depths: NDArray[np.float32], settings: RefinementSettings
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Depth maps (V, H, W) with every pixel moved along its ray to the best match, and which of them were.
+) -> RefinedDepths:
+    """Depth maps (V, H, W) with every pixel moved along its ray to the best match.
 
     Windows of a photo are matched with those of the eight photos that see the object from about 15 degrees aside; the
     best three count (`scenefuse.scenes.plane_sweep`). A pixel whose match is poor, hardly better than where it was, or
-    farther off than the reach, keeps its depth.
+    farther off than the reach, keeps its depth. Where there is texture that matches neither there nor nearby in
+    photos that have the place in view, the photos deny the depth.
 
     Args:
         views: photos and intrinsics at the maps' size.
@@ -40,15 +50,14 @@ def refine_by_photos(
         depths: (V, H, W) along z, 0 for none.
         settings: reach, window and least score.
     """
-    moved = np.zeros(depths.shape, bool)
+    result = RefinedDepths(depths.copy(), np.zeros(depths.shape, bool), np.zeros(depths.shape, bool))
     if settings.match_reach_px == 0:
-        return depths, moved
+        return result
     device = "cuda" if torch.cuda.is_available() else "cpu"
     window = settings.match_window_px
     limits = DepthSettings(0, SOURCES, BEST_SOURCES, 0, 1, window, 0.0, settings.match_min_score, 0.0, False)
     photos = [_photo(views, poses, index) for index in range(len(depths))]
     sources = _sources(poses, depths, views.intrinsics)
-    refined = depths.copy()
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows) == 0:
@@ -61,9 +70,8 @@ def refine_by_photos(
         reference = Photo(np.ascontiguousarray(whole.gray[part]), cut, whole.cam_from_world)
         near = [photos[s] for s in sources[index]]
         found = refine_depth(reference, near, depth[part], settings.match_reach_px, limits, device)
-        moved[index][part] = found > 0
-        refined[index][part] = np.where(found > 0, found, depth[part])
-    return refined, moved
+        result.depths[index][part], result.moved[index][part], result.denied[index][part] = found
+    return result
 
 
 def _photo(views: Views, poses: NDArray[np.float64], index: int) -> Photo:

@@ -20,6 +20,8 @@ from torch import Tensor
 
 # Less than this is no better match: smooth surfaces match nearly everywhere.
 MIN_GAIN = 0.02
+# Windows whose grey values deviate by this much (three of 255 levels) have a texture that must match somewhere.
+TEXTURE = 3 / 255
 
 
 @dataclass(frozen=True)
@@ -127,8 +129,11 @@ def estimate_depth(
 def refine_depth(
     reference: Photo, sources: list[Photo], depth: NDArray[np.float32], reach_px: float, settings: DepthSettings,
     device: str,
-) -> NDArray[np.float32]:  # fmt: skip
-    """A depth map that is nearly right, moved to where the photos match best; 0 where they match nowhere near it.
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
+    """A depth map that is nearly right, moved to where the photos match best.
+
+    Returns the depths (H, W), which of them moved, and which the photos deny: the window has texture, and it matches
+    neither there nor nearby.
 
     Args:
         reference: the photo of the depth map, at its size.
@@ -148,10 +153,13 @@ def refine_depth(
     inverse, score = _refine(matcher, _median3(inverse), step / 4, low, high)
     inverse, _ = _local_planes(inverse, score)
     inverse, score = _refine_once(matcher, inverse[None], step / 8)
-    gain = score - matcher.score(first[None])[0]
-    good = (score >= settings.min_score) & (gain >= MIN_GAIN) & ((inverse - first).abs() <= step)
-    good &= torch.from_numpy(known).to(device)
-    return torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse)).cpu().numpy()
+    before = matcher.score(first[None])[0]
+    moved = (score >= settings.min_score) & (score - before >= MIN_GAIN) & ((inverse - first).abs() <= step)
+    moved &= torch.from_numpy(known).to(device)
+    asked = (matcher.variance >= TEXTURE**2) & (matcher.seen_by(first) >= matcher.best)
+    denied = ~moved & (before < settings.min_score) & asked
+    refined = torch.where(moved, 1 / inverse.clamp(min=1e-12), torch.from_numpy(depth).to(device))
+    return refined.cpu().numpy(), moved.cpu().numpy(), denied.cpu().numpy() & known
 
 
 class _Matcher:
@@ -193,14 +201,23 @@ class _Matcher:
                 best[k], candidate = torch.maximum(best[k], candidate), torch.minimum(best[k], candidate)
         return torch.stack(best).mean(0) if self.best > 1 else best[0]
 
-    def _ncc(self, inverse: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> Tensor:
-        """NCC of one source, (D, h, w); -0.5 where the hypothesis lies outside the source photo."""
+    def seen_by(self, inverse: Tensor) -> Tensor:
+        """Source photos (h, w) in which a hypothesis per pixel (h, w) lies."""
+        return sum(self._place(inverse[None], *source[1:])[1][0].int() for source in self.sources)  # type: ignore[return-value]
+
+    @staticmethod
+    def _place(inverse: Tensor, directions: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
+        """Where D hypotheses per pixel lie in a source photo, (D, h, w, 2) in -1..1, and whether they do, (D, h, w)."""
         z = directions[2] + move[2] * inverse
         scale = 1 / z.clamp(min=1e-6)
         grid = torch.stack(
             [(directions[0] + move[0] * inverse) * scale, (directions[1] + move[1] * inverse) * scale], dim=-1
         )
-        inside = (z > 1e-6) & (grid.abs().amax(-1) < 1)
+        return grid, (z > 1e-6) & (grid.abs().amax(-1) < 1)
+
+    def _ncc(self, inverse: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> Tensor:
+        """NCC of one source, (D, h, w); -0.5 where the hypothesis lies outside the source photo."""
+        grid, inside = self._place(inverse, directions, move)
         count, height, width = inverse.shape
         grid = grid.reshape(1, count * height, width, 2)
         warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)

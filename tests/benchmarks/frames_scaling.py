@@ -100,12 +100,12 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
 
     def nerf(number: int, prior: int, previous: Path | None) -> None:
-        settings = own["nerf"] | own[f"stage{number}"]
+        settings = own["nerf"] | own["matching"] | own[f"stage{number}"]
         train_nerf(
             **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
             report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
             schedule=build(Schedule, settings), losses=build(LossWeights, settings),
-            refinement=build(RefinementSettings, own["photo_refinement"]), settings=build(NerfSettings, settings),
+            refinement=build(RefinementSettings, settings), settings=build(NerfSettings, settings),
         )  # fmt: skip
 
     start, began = time.monotonic(), os.times()
@@ -127,7 +127,8 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
         object_cloud(
             **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
             cameras_report=folder / "cameras.json", cloud=folder / "object.ply", report=folder / "object.json",
-            refinement=build(RefinementSettings, own["photo_refinement"]), settings=build(CloudSettings, own["cloud"]),
+            refinement=build(RefinementSettings, own["cloud"] | own["matching"]),
+            settings=build(CloudSettings, own["cloud"]),
         )  # fmt: skip
     now = os.times()
     total = now.user + now.system - began.user - began.system

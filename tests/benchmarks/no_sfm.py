@@ -63,11 +63,11 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         return {"stage": folder / name, "report": folder / f"{name}.json"}
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
-        own = settings["nerf"] | settings[name]
+        own = settings["nerf"] | settings["matching"] | settings[name]
         train_nerf(
             **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
             field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
-            refinement=build(RefinementSettings, settings["photo_refinement"]), settings=build(NerfSettings, own),
+            refinement=build(RefinementSettings, own), settings=build(NerfSettings, own),
         )  # fmt: skip
 
     train_depth(**inputs, **common, **outputs("stage1"), settings=build(DepthSettings, settings["stage1"]))
@@ -77,11 +77,11 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         settings=build(FeedbackSettings, settings["stage3"]),
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
+    own = settings["cloud"] | settings["matching"]
     object_cloud(
         **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
         cloud=folder / "object.ply", report=folder / "object.json",
-        refinement=build(RefinementSettings, settings["photo_refinement"]),
-        settings=build(CloudSettings, settings["cloud"]), seed=seed,
+        refinement=build(RefinementSettings, own), settings=build(CloudSettings, own), seed=seed,
     )  # fmt: skip
 
 

@@ -40,7 +40,6 @@ class Arm:
     masks: bool = True
     prior: bool = True
     feedback: bool = True
-    matching: dict[str, Any] = field(default_factory=dict)
     long: bool = False
     """stage 2 alone, with stage 4's epochs added"""
 
@@ -54,7 +53,7 @@ def arms(settings: dict[str, Any]) -> dict[str, Arm]:
         "no_masks": Arm(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
         "no_depth": Arm(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
         "no_relative_depth": Arm(nerf={"rank_weight": 0}),
-        "prior_unrefined": Arm(matching={"match_reach_px": 0}),
+        "prior_unrefined": Arm(nerf={"match_reach_px": 0}),
         "no_feedback": Arm(feedback=False),
         "poses_of_sfm" if refined else "poses_refined": Arm(nerf={"pose_learning_rate": other}),
         "no_adaptive_grid": Arm(nerf={"edge_boost": 0}),
@@ -72,12 +71,12 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
-            own = settings["nerf"] | arm.nerf | {"epochs": epochs}
+            own = settings["nerf"] | settings["matching"] | arm.nerf | {"epochs": epochs}
             train_nerf(
                 **inputs, **common, prior=prior if arm.prior else None, previous=previous, stage=work / f"stage{stage}",
                 report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
                 schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
-                refinement=build(RefinementSettings, settings["photo_refinement"] | arm.matching),
+                refinement=build(RefinementSettings, own),
             )  # fmt: skip
 
         early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
@@ -92,7 +91,7 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
         if not arm.long:
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if arm.long else "stage4")
-        seconds = time.monotonic() - start
+        seconds, fusing = time.monotonic() - start, settings["cloud"] | settings["matching"]
         depth = depth_results([work / "stage2", last], truth, photos)
         return {
             "depth_2_pct": 100 * value(depth, "stage2_depth_error"),
@@ -100,8 +99,8 @@ def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[st
             "within_4": value(depth, f"{last.name}_depth_within_1pct"),
             "psnr_2": held_out_psnr(folder, work / "stage2", settings),
             "psnr_4": held_out_psnr(folder, last, settings),
-            **cloud(folder, inputs, last, truth, settings, seed, {}),
-            **as_rendered(cloud(folder, inputs, last, truth, settings, seed, {"match_reach_px": 0})),
+            **cloud(folder, inputs, last, truth, fusing, seed),
+            **as_rendered(cloud(folder, inputs, last, truth, fusing | {"match_reach_px": 0}, seed)),
             "seconds": seconds,
         }
 
@@ -112,22 +111,15 @@ def as_rendered(measures: dict[str, Any]) -> dict[str, Any]:
 
 
 def cloud(
-    folder: Path,
-    inputs: dict[str, Any],
-    last: Path,
-    truth: ObjectTruth,
-    settings: dict[str, Any],
-    seed: int,
-    matching: dict[str, Any],
+    folder: Path, inputs: dict[str, Any], last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
 ) -> dict[str, Any]:
     """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
     path = last.with_name("object.ply")
     try:
         object_cloud(
             **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "cameras.json",
-            cloud=path, report=path.with_suffix(".json"), seed=seed,
-            refinement=build(RefinementSettings, settings["photo_refinement"] | matching),
-            settings=build(CloudSettings, settings["cloud"]),
+            cloud=path, report=path.with_suffix(".json"), refinement=build(RefinementSettings, settings),
+            settings=build(CloudSettings, settings), seed=seed,
         )  # fmt: skip
     except StageError as error:
         print(f"no cloud: {error}", flush=True)
@@ -176,8 +168,9 @@ def object_ablation(
     """Print mean and spread of every arm over seeds as Markdown; all runs go to bench/object_ablation.tsv.
 
     Stage 1 is the workflow's in every arm. `no_masks` calls everything the object, for the NeRF and for the cloud;
-    its cloud thus holds the surroundings, which `F 1 %, cut` leaves out. `no_depth` has no prior at all, `no_feedback`
-    takes stage 1's depth in stage 4. Depth errors are medians over pixels that truly show the object.
+    its cloud thus holds the surroundings, which `F 1 %, cut` leaves out. `no_depth` has no prior at all,
+    `prior_unrefined` one that photos did not move, `no_feedback` takes stage 1's depth in stage 4. Depth errors are
+    medians over pixels that truly show the object.
 
     Args:
         results: folder of a finished demo.

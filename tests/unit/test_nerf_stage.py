@@ -20,7 +20,7 @@ MATCHING = RefinementSettings(0.0, 5, 0.6)
 SETTINGS = NerfSettings(
     width_px=48, mask_band_px=1, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03
 )
-SCHEDULE = Schedule(2, 120 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, 1e-5)
+SCHEDULE = Schedule(2, 200 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, 1e-5)
 
 
 @pytest.fixture(scope="module")

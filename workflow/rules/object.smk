@@ -17,7 +17,7 @@ POSED = {
     "sfm": "results/objects/{object}/cameras",
     "network": "results/objects/{object}/poses",
 }[STAGE1.pop("pose_source")]
-NERF = config["object"]["nerf"] | config["object"]["photo_refinement"]
+NERF = config["object"]["nerf"] | config["object"]["matching"]
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
@@ -407,7 +407,7 @@ rule object_cloud:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["object"]["cloud"] | config["object"]["photo_refinement"]),
+        options=flags(config["object"]["cloud"] | config["object"]["matching"]),
         seed=config["seed"],
         script=script("object_cloud.py"),
         code=code("object_cloud.py"),
