@@ -62,6 +62,23 @@ def back_project(
     return in_camera @ frame_from_cam[:3, :3].T + frame_from_cam[:3, 3]
 
 
+def surface_points(
+    depth: NDArray[np.float32], intrinsics: Floats, frame_from_cam: Floats
+) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
+    """Points (N, 3) of all pixels of a map (H, W) that have a depth, and their rows and columns."""
+    rows, columns = np.nonzero(depth > 0)
+    known = depth[rows, columns].astype(np.float64)
+    return back_project(known, intrinsics, frame_from_cam, rows, columns), rows, columns
+
+
+def extent(points: Floats) -> float:
+    """Diagonal of the box of points (N, 3), half a per cent at each side left out; 0 without points."""
+    if len(points) == 0:
+        return 0.0
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
 def compare(
     points: Floats,
     view: int,

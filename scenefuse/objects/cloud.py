@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
 from scenefuse.maps import read_depth, read_normals
-from scenefuse.nerf.agreement import back_project, compare
+from scenefuse.nerf.agreement import compare, extent, surface_points
 from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.objects.views import Views, load_views
 from scenefuse.stage import StageError, quantity, read_json, threads, write_json
@@ -134,19 +134,14 @@ def fuse_depths(
         normals: (V, H, W, 3) in the camera frame.
         settings: the gates.
     """
-    pixels = [np.nonzero(d > 0) for d in depths]
-    clouds = [
-        back_project(d[r, c].astype(np.float64), k, p, r, c)
-        for d, (r, c), k, p in zip(depths, pixels, views.intrinsics, poses)
-    ]
-    together = np.concatenate(clouds)
+    known = [surface_points(*view) for view in zip(depths, views.intrinsics, poses)]
+    together = np.concatenate([points for points, _, _ in known])
     if len(together) == 0:
         return Cloud(together), 0.0
-    low, high = np.percentile(together, [0.5, 99.5], axis=0)
-    diagonal = float(np.linalg.norm(high - low))
+    diagonal = extent(together)
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for m in views.masks])
     parts = []
-    for index, (points, (rows, columns)) in enumerate(zip(clouds, pixels)):
+    for index, (points, rows, columns) in enumerate(known):
         said = compare(points, index, depths, grown, views.intrinsics, poses, settings.agreement * diagonal)
         seen = said.agree + said.through
         keep = (said.agree + 1 >= settings.min_views) & (said.through <= settings.through_share * seen)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.maps import read_depth
-from scenefuse.nerf.agreement import back_project, compare
+from scenefuse.nerf.agreement import compare, extent, surface_points
 from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.objects.views import Views
 
@@ -74,18 +74,10 @@ def _scaled(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
 
 def _confirmed(views: Views, depths: NDArray[np.float32], agreement: float) -> NDArray[np.bool_]:
     """(V, H, W), True where enough other views have the same surface."""
-    pixels = [np.nonzero(depth) for depth in depths]
-    clouds = [
-        back_project(depth[r, c].astype(np.float64), k, pose, r, c)
-        for depth, (r, c), k, pose in zip(depths, pixels, views.intrinsics, views.object_from_cam)
-    ]
+    known = [surface_points(*view) for view in zip(depths, views.intrinsics, views.object_from_cam)]
+    tolerance = agreement * extent(np.concatenate([points for points, _, _ in known]))
     confirmed = np.zeros(depths.shape, bool)
-    together = np.concatenate(clouds)
-    if len(together) == 0:
-        return confirmed
-    low, high = np.percentile(together, [0.5, 99.5], axis=0)
-    tolerance = agreement * float(np.linalg.norm(high - low))
-    for index, (points, (rows, columns)) in enumerate(zip(clouds, pixels)):
+    for index, (points, rows, columns) in enumerate(known):
         said = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
         confirmed[index, rows, columns] = said.agree >= AGREEING_VIEWS
     return confirmed

@@ -68,8 +68,8 @@ def nerf_files(
     )
     photos = read_json(steps / "photos.json")
     exact = {"mask_band_px": 0} if value(photos, "masks_exact") else {}
-    chosen = wanted["nerf"] | wanted["nerf_alone"] | wanted["matching"] | exact
-    cloud_settings = wanted["cloud"] | wanted["matching"]
+    chosen = wanted["nerf"] | wanted["nerf_alone"] | exact
+    refinement = build(RefinementSettings, wanted["matching"])
     train_nerf(
         cameras=cameras,
         masks=mattes,
@@ -81,7 +81,7 @@ def nerf_files(
         field=build(FieldSettings, chosen),
         schedule=build(Schedule, chosen),
         losses=build(LossWeights, chosen),
-        refinement=build(RefinementSettings, chosen),
+        refinement=refinement,
         settings=build(NerfSettings, chosen),
         hold_out_every=wanted["hold_out_every"],
         device=chosen["device"],
@@ -100,8 +100,8 @@ def nerf_files(
             cameras_report=steps / "photos.json",
             cloud=out / "object.ply",
             report=steps / "cloud.json",
-            refinement=build(RefinementSettings, cloud_settings),
-            settings=build(CloudSettings, cloud_settings),
+            refinement=refinement,
+            settings=build(CloudSettings, wanted["cloud"]),
             seed=seed,
         )
         cloud, refused = read_json(steps / "cloud.json"), None
@@ -115,7 +115,7 @@ def nerf_files(
             "nerf": nerf,
             "cloud": cloud,
             "no_cloud_because": quantity(refused, ""),
-            "settings": quantity(chosen | {"cloud": cloud_settings}, ""),
+            "settings": quantity(chosen | {"matching": wanted["matching"], "cloud": wanted["cloud"]}, ""),
             "seed": quantity(seed, ""),
             "seconds": quantity(round(time.perf_counter() - start, 1), "s"),
         },

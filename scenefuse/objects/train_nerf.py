@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scenefuse.maps import write_depth, write_normals
 from scenefuse.nerf import kernels
-from scenefuse.nerf.agreement import back_project, compare, normals_from_depth
+from scenefuse.nerf.agreement import compare, extent, normals_from_depth, surface_points
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, tight_cube, visual_hull
@@ -131,7 +131,7 @@ def train_nerf(
     depths = np.stack([_gated_depth(r) for r in rendered]) / nerf_from_object.scale
     if not (depths > 0).any():
         raise StageError(f"the NeRF of {cameras} found no surface: no ray reached an opacity of 0.9; check the masks")
-    diagonal = _diagonal(depths, views, poses)
+    diagonal = extent(np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, poses)]))
     confidence = _confidence(depths, rendered, views, poses, settings.agreement * diagonal)
     content: dict[str, Any] = {
         "nerf_from_object": quantity(nerf_from_object.matrix, "nerf units per object unit"),
@@ -286,26 +286,13 @@ def _gated_depth(rendered: Rendered) -> NDArray[np.float32]:
     return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth)).numpy()
 
 
-def _diagonal(depths: NDArray[np.float32], views: Views, poses: NDArray[np.float64]) -> float:
-    points = np.concatenate([_points(d, k, p)[0] for d, k, p in zip(depths, views.intrinsics, poses)])
-    low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    return float(np.linalg.norm(high - low))
-
-
-def _points(
-    depth: NDArray[np.float32], intrinsics: NDArray[np.float64], pose: NDArray[np.float64]
-) -> tuple[Any, Any, Any]:
-    rows, columns = np.nonzero(depth > 0)
-    return back_project(depth[rows, columns].astype(np.float64), intrinsics, pose, rows, columns), rows, columns
-
-
 def _confidence(
     depths: NDArray[np.float32], rendered: list[Rendered], views: Views, poses: NDArray[np.float64], tolerance: float
 ) -> NDArray[np.float32]:
     """Opacity times the share of the views that should see a point and agree (at least two are asked for)."""
     confidence, masks = np.zeros_like(depths), views.masks
     for index in range(len(depths)):
-        points, rows, columns = _points(depths[index], views.intrinsics[index], poses[index])
+        points, rows, columns = surface_points(depths[index], views.intrinsics[index], poses[index])
         said = compare(points, index, depths, masks, views.intrinsics, poses, tolerance)
         share = said.agree / np.maximum(said.agree + said.through, 2)
         confidence[index, rows, columns] = share * rendered[index].opacity.numpy()[rows, columns].clip(0, 1)
