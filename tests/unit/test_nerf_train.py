@@ -96,7 +96,7 @@ def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
 
 
 def test_training_finds_the_sphere(sphere):
-    model, photos, cube, result = _train(sphere, steps=250)
+    model, photos, cube, result = _train(sphere, steps=400)
     depths, masks = sphere[4], sphere[1]
     view = photos.intrinsics[0], photos.rotation[0], photos.center[0], photos.masks[0]
     rendered = render_view(model.field, model.occupancy, *view, samples=32, uniform=0.25, colored=True)
@@ -108,7 +108,7 @@ def test_training_finds_the_sphere(sphere):
     picture = photos.images[0].float() / 255
     assert psnr(rendered.color, picture, dilate(photos.masks, -1)[0]) > 22
     assert silhouette_iou(rendered.opacity, photos.masks[0]) > 0.95
-    assert result["steps"] == 250
+    assert result["steps"] == 400
 
 
 def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch):
