@@ -112,7 +112,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     if part == "stage1":
         train_depth(
             **inputs, **common, stage=folder / part, report=folder / "stage1.json",
-            pose_source=own["stage1"]["pose_source"], settings=build(DepthSettings, own["stage1"]),
+            settings=build(DepthSettings, own["stage1"]),
         )  # fmt: skip
     elif part == "stage2":
         nerf(2, 1, None)
