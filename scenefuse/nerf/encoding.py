@@ -1,7 +1,9 @@
 """Multi-resolution hash encoding of positions and spherical harmonics of directions."""
 
+import contextlib
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -9,6 +11,10 @@ import torch
 from torch import Tensor
 
 from scenefuse.nerf import kernels
+
+triton_kernels: Any = None
+with contextlib.suppress(ImportError):  # comes with PyTorch's CUDA build
+    from scenefuse.nerf import triton_kernels
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,14 @@ class HashGrid:
     offset: np.ndarray
     mask: np.ndarray
     rows: int
+    _on: dict[torch.device, tuple[Tensor, ...]] = field(default_factory=dict, repr=False, compare=False)
+
+    def on(self, device: torch.device) -> tuple[Tensor, ...]:
+        """resolution, stride, offset and mask as tensors on a device."""
+        if device not in self._on:
+            arrays = self.resolution, self.stride, self.offset, self.mask
+            self._on[device] = tuple(torch.from_numpy(a).to(device) for a in arrays)
+        return self._on[device]
 
 
 def hash_grid(levels: int, log2_table: int, coarsest: int, finest: int) -> HashGrid:
@@ -48,8 +62,10 @@ def hash_grid(levels: int, log2_table: int, coarsest: int, finest: int) -> HashG
     )
 
 
-def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor) -> Tensor:
-    """Plain PyTorch encoding of (N, 3) positions in 0..1 as (N, 2 L) features; every device, differentiable."""
+def encode_reference(
+    x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None = None, fine_from: int = 0
+) -> Tensor:
+    """`encode` in plain PyTorch, on every device."""
     device = x.device
     resolution = torch.from_numpy(grid.resolution).to(device)
     stride = torch.from_numpy(grid.stride.astype(np.int64)).to(device)[None, :, None]
@@ -64,48 +80,57 @@ def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Ten
     hashed = (vx ^ (vy * kernels.PRIMES[1]) ^ (vz * kernels.PRIMES[2])) & mask
     row = torch.where(stride > 0, vx + stride * (vy + stride * vz), hashed) + offset
     weight = torch.where(corners.bool(), part, 1 - part).prod(-1)
-    features = (table[row] * weight[..., None]).sum(2)
+    values = table[row]
+    if boost is not None:
+        fine = torch.arange(len(grid.resolution), device=device) >= fine_from
+        boosted = values * torch.where(fine, boost[:, None], 1.0)[:, :, None, None]
+        values = boosted + (values - boosted).detach()
+    features = (values * weight[..., None]).sum(2)
     return (features * level_weight.to(device)[None, :, None]).flatten(1)
 
 
 class _Encode(torch.autograd.Function):
-    """The Numba kernels as one differentiable function of positions and table."""
+    """The kernels of a device as one differentiable function of positions and table."""
 
     @staticmethod
     def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
                 fine_from: int) -> Tensor:  # fmt: skip
-        out = torch.empty(x.shape[0], 2 * len(grid.resolution))
-        positions, features = x.detach().numpy(), table.detach().numpy()
-        kernels.encode(positions, features, *_levels(grid), level_weight.numpy(), kernels.threads(), out.numpy())
-        ctx.save_for_backward(x, table, level_weight)
-        ctx.grid, ctx.boost, ctx.fine_from = grid, boost, fine_from
+        kernel, plain = _kernels_on(x.device)
+        levels = [plain(t) for t in (*grid.on(x.device), level_weight)]
+        out = torch.empty(len(x), 2 * len(grid.resolution), device=x.device)
+        kernel.encode(plain(x), plain(table), *levels, plain(out))
+        ctx.save_for_backward(x, table, torch.ones(len(x), device=x.device) if boost is None else boost)
+        ctx.levels, ctx.fine_from = levels, fine_from
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        x, table, level_weight = ctx.saved_tensors
-        gradient = gradients[0].contiguous().numpy()
-        positions, weight = x.detach().numpy(), level_weight.numpy()
+        x, table, boost = ctx.saved_tensors
+        kernel, plain = _kernels_on(x.device)
+        given = plain(x), plain(gradients[0].contiguous())
         g_x = g_table = None
         if ctx.needs_input_grad[0]:
             g_x = torch.empty_like(x)
-            kernels.encode_backward_x(
-                positions, gradient, table.detach().numpy(), *_levels(ctx.grid), weight, kernels.threads(), g_x.numpy()
-            )
+            kernel.encode_backward_x(*given, plain(table), *ctx.levels, plain(g_x))
         if ctx.needs_input_grad[1]:
-            boost = np.ones(len(positions), np.float32) if ctx.boost is None else ctx.boost.numpy()
             g_table = torch.empty_like(table)
-            kernels.encode_backward(
-                positions,
-                gradient,
-                *_levels(ctx.grid),
-                weight,
-                boost,
-                ctx.fine_from,
-                kernels.threads(),
-                g_table.numpy(),
-            )
+            kernel.encode_backward(*given, *ctx.levels, plain(boost), ctx.fine_from, plain(g_table))
         return g_x, g_table, None, None, None, None
+
+
+def kernels_on(device: str) -> str:
+    """What computes the encoding on a device: numba, triton or torch."""
+    module = _kernels_on(torch.device(device))[0]
+    return "torch" if module is None else "triton" if module is triton_kernels else "numba"
+
+
+def _kernels_on(device: torch.device) -> tuple[Any, Callable[[Tensor], Any]]:
+    """The module whose kernels run on a device, and how they take a tensor; no module: plain PyTorch has to do it."""
+    if device.type == "cpu" and kernels.AVAILABLE:
+        return kernels, lambda tensor: tensor.detach().numpy()
+    if device.type == "cuda" and triton_kernels is not None:
+        return triton_kernels, Tensor.detach
+    return None, Tensor.detach
 
 
 def encode(
@@ -121,21 +146,9 @@ def encode(
         boost: (N,) factor on each sample's gradient on levels >= fine_from (adaptive grid update), or None.
         fine_from: first level that `boost` acts on.
     """
-    if kernels.AVAILABLE and x.device.type == "cpu":
+    if _kernels_on(x.device)[0] is not None:
         return _Encode.apply(x.contiguous(), table, grid, level_weight, boost, fine_from)
-    out = encode_reference(x, table, grid, level_weight)
-    return out if boost is None or not out.requires_grad else _boost(out, boost, 2 * fine_from)
-
-
-def _boost(features: Tensor, boost: Tensor, first_column: int) -> Tensor:
-    """Leave the values, multiply the gradient of the columns from `first_column` on."""
-    fine = features[:, first_column:] * boost[:, None]
-    fine = fine + (features[:, first_column:] - fine).detach()
-    return torch.cat([features[:, :first_column], fine], dim=1)
-
-
-def _levels(grid: HashGrid) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    return grid.resolution, grid.stride, grid.offset, grid.mask
+    return encode_reference(x, table, grid, level_weight, boost, fine_from)
 
 
 def spherical_harmonics(direction: Tensor) -> Tensor:

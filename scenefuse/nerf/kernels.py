@@ -44,9 +44,28 @@ def set_threads(count: int) -> None:
         nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
 
 
-def threads() -> int:
-    """Threads that the kernels use."""
-    return nb.get_num_threads()
+def encode(x, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+    """Trilinear hash encoding (Mueller et al. 2022, section 3).
+
+    x (N, 3) in 0..1; table (T, 2); per level: resolution, stride (0: hashed), offset into the table, index mask,
+    weight; out (N, 2 L).
+    """
+    _encode(nb.get_num_threads(), x, table, resolution, stride, offset, mask, level_weight, out)
+
+
+def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):  # type: ignore[no-untyped-def]
+    """Gradient of `encode` with respect to the table, written to out (T, 2).
+
+    gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
+    """
+    levels = resolution, stride, offset, mask, level_weight
+    _encode_backward(nb.get_num_threads(), x, gradient, *levels, boost, fine_from, out)
+
+
+def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+    """Gradient of `encode` with respect to the positions, written to out (N, 3)."""
+    levels = resolution, stride, offset, mask, level_weight
+    _encode_backward_x(nb.get_num_threads(), x, gradient, table, *levels, out)
 
 
 @_inline
@@ -76,14 +95,8 @@ def _rows(ix, iy, iz, stride, start, mask):
 
 
 @_jit
-def encode(x, table, resolution, stride, offset, mask, level_weight, threads, out):
-    """Trilinear hash encoding (Mueller et al. 2022, section 3).
-
-    A thread goes through all of its samples level by level, so that one level's rows stay in its cache.
-
-    x (N, 3) in 0..1; table (T, 2); per level: resolution, stride (0: hashed), offset into the table, index mask,
-    weight; out (N, 2 L).
-    """
+def _encode(threads, x, table, resolution, stride, offset, mask, level_weight, out):
+    """A thread goes through all of its samples level by level, so that one level's rows stay in its cache."""
     count = x.shape[0]
     for thread in prange(threads):
         first, last = count * thread // threads, count * (thread + 1) // threads
@@ -119,13 +132,8 @@ def _add(out, row, weight, a, b):
 
 
 @_jit
-def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, threads, out):
-    """Gradient of `encode` with respect to the table, written to out (T, 2): one thread owns a level.
-
-    A level is set to zero just before its gradients are added, so that its rows are still in the cache.
-
-    gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
-    """
+def _encode_backward(threads, x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):
+    """One thread owns a level, and sets it to zero just before adding to it: its rows are still in the cache then."""
     levels = resolution.shape[0]
     for thread in prange(threads):
         # Fine levels cost more than coarse ones: every thread gets some of both.
@@ -157,8 +165,7 @@ def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight,
 
 
 @_jit
-def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, threads, out):
-    """Gradient of `encode` with respect to the positions, written to out (N, 3)."""
+def _encode_backward_x(threads, x, gradient, table, resolution, stride, offset, mask, level_weight, out):
     count = x.shape[0]
     for thread in prange(threads):
         first, last = count * thread // threads, count * (thread + 1) // threads

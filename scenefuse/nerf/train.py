@@ -329,7 +329,7 @@ def _resume(path: Path | None, model: Model, optimizer: Optimizer, pose: Tensor)
     """Load a checkpoint into model, optimizer and pose; the step to go on with, 0 without one."""
     if path is None or not path.is_file():
         return 0
-    state = torch.load(path, weights_only=True)
+    state = torch.load(path, map_location="cpu", weights_only=True)
     model.field.load_state_dict(state["model"]["field"])
     device = model.field.table.device
     model.occupancy = Occupancy(*(state["model"][name].to(device) for name in ("hull", "density", "occupied")))

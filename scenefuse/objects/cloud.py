@@ -76,9 +76,9 @@ def object_cloud(
     """
     cv2.setNumThreads(threads())
     torch.set_num_threads(threads())
-    saved = torch.load(stage / "model.pt", weights_only=True) if (stage / "model.pt").is_file() else None
-    if saved is None:
+    if not (stage / "model.pt").is_file():
         raise StageError(f"{stage}/model.pt does not exist; run the NeRF stage first")
+    saved = torch.load(stage / "model.pt", map_location="cpu", weights_only=True)
     nerf_from_object = read_json(stage_report)["nerf_from_object"]
     up = read_json(cameras_report).get("up_in_camera_frame")
     width = read_depth(stage / "depth_maps" / f"{saved['names'][0]}.bin").shape[1]

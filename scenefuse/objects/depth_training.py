@@ -285,7 +285,7 @@ def _resume(
 ) -> int:
     if not checkpoint.is_file():
         return 0
-    state = torch.load(checkpoint, weights_only=True)
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     depth.load_state_dict(state["depth"])
     pose.load_state_dict(state["pose"])
     optimizer.load_state_dict(state["optimizer"])

@@ -279,7 +279,7 @@ def _mean(values: Tensor) -> float | None:
 def _load_networks(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StageError(f"{path} does not exist; run stage 1 first")
-    state = torch.load(path, weights_only=True)
+    state = torch.load(path, map_location="cpu", weights_only=True)
     if not {"depth", "pose", "settings"} <= set(state):
         raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
     return state

@@ -12,8 +12,8 @@ import torch
 from numpy.typing import NDArray
 
 from scenefuse.maps import write_depth, write_normals
-from scenefuse.nerf import kernels
 from scenefuse.nerf.agreement import compare, extent, normals_from_depth, surface_points
+from scenefuse.nerf.encoding import kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, tight_cube, visual_hull
@@ -87,7 +87,7 @@ def train_nerf(
         refinement: of the prior's depths by photos.
         settings: sizes and gates.
         hold_out_every: every n-th photo is not trained on and measures quality; 0 holds out none.
-        device: `auto` takes CUDA where it is.
+        device: `auto` takes CUDA where it is; the networks then multiply in TF32.
         seed: of the weights and of every random draw.
 
     Raises:
@@ -96,6 +96,7 @@ def train_nerf(
     start = time.monotonic()
     torch.set_num_threads(threads())
     cv2.setNumThreads(threads())
+    torch.backends.cuda.matmul.fp32_precision = "tf32"
     keep_memory()
     chosen = _device(device)
     views = load_views(cameras, masks, settings.width_px, hold_out_every)
@@ -115,7 +116,7 @@ def train_nerf(
         model.field.level_weight.fill_(1.0)
     key = _key(field, schedule, losses, settings, seed, views.held_out.tolist(), chosen, photos, earlier)
     checkpoint = checkpoints / key / "state.pt"
-    kernel = "numba" if kernels.AVAILABLE and chosen == "cpu" else "torch"
+    kernel = kernels_on(chosen)
     print(
         f"{len(training)} photos, hull {hull.mean():.1%} of the cube, {schedule.steps} steps on {chosen} ({kernel})",
         flush=True,
@@ -224,7 +225,7 @@ def _volume(
 def _read_model(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the earlier NeRF stage first")
-    return torch.load(path, weights_only=True)
+    return torch.load(path, map_location="cpu", weights_only=True)
 
 
 def _key(*parts: Any) -> str:

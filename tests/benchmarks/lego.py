@@ -1,4 +1,4 @@
-"""NeRF-synthetic Lego on the CPU: test PSNR over training time, on white and over whole pictures as in the literature.
+"""NeRF-synthetic Lego: test PSNR over training time, on white and over whole pictures as in the literature.
 
 python tests/benchmarks/lego.py --data ../shared/data/lego
 """
@@ -6,6 +6,7 @@ python tests/benchmarks/lego.py --data ../shared/data/lego
 import tempfile
 import time
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -35,6 +36,7 @@ def lego(
     every: float = 20.0,
     few: int = 5,
     threads: int = 2,
+    device: Literal["cpu", "cuda"] = "cpu",
     seed: int = 0,
     pictures: Path | None = None,
 ) -> None:
@@ -46,10 +48,12 @@ def lego(
         every: seconds of training between two measurements.
         few: test views of each measurement on the way; the last one takes all.
         threads: CPU threads.
+        device: where to train.
         seed: of all random choices.
         pictures: folder for renders beside photos, or none.
     """
     torch.set_num_threads(threads)
+    torch.backends.cuda.matmul.fp32_precision = "tf32"
     settings = shipped_with(config)["object"]
     chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
     with tempfile.TemporaryDirectory() as name:
@@ -64,7 +68,7 @@ def lego(
     cube, hull = _volume(views, training, build(NerfSettings, chosen), None)
     photos = make_photos(views, cube, None, exact=True)
     schedule = build(Schedule, chosen)
-    model = new_model(build(FieldSettings, chosen), torch.from_numpy(hull), len(training), seed, "cpu")
+    model = new_model(build(FieldSettings, chosen), torch.from_numpy(hull), len(training), seed, device)
     print(
         f"hull {hull.mean():.1%} of the cube in {time.perf_counter() - start:.1f} s, {schedule.steps} steps", flush=True
     )

@@ -1,6 +1,6 @@
-"""The NeRF's kernels and training steps on the CPU, beside the same in plain PyTorch and nerfstudio's encoding.
+"""The NeRF's kernels and training steps, beside the same in plain PyTorch and nerfstudio's encoding.
 
-make bench-nerf, or: python tests/benchmarks/nerf.py --repeats 3
+make bench-nerf, or: python tests/benchmarks/nerf.py --repeats 3 --device cuda
 """
 
 import statistics
@@ -8,12 +8,13 @@ import sys
 import time
 import types
 from collections.abc import Callable
+from typing import Literal
 
 import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
-from scenefuse.nerf import kernels
-from scenefuse.nerf.encoding import encode, encode_reference, hash_grid
+from scenefuse.nerf import encoding, kernels
+from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy
@@ -25,39 +26,41 @@ from scenefuse.stage import run
 LEVELS, LOG2_TABLE, COARSEST, FINEST, SAMPLES = 16, 19, 16, 1024, 32768
 
 
-def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2) -> None:
+def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Literal["cpu", "cuda"] = "cpu") -> None:
     """Print times and ratios.
 
     Args:
         repeats: runs of each encoding; the median counts.
         steps: training steps of each model.
         threads: CPU threads.
+        device: where everything runs.
     """
+    torch.backends.cuda.matmul.fp32_precision = "tf32"
     torch.set_num_threads(threads)
     kernels.set_threads(threads)
     keep_memory()
-    print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward:")
-    compare({name: median_seconds(step, repeats) for name, step in encodings().items()}, "s")
-    for title, step in kernel_steps().items():
-        print(f"{title}:")
-        compare(by_both(lambda: median_seconds(step, repeats)), "s")  # noqa: B023
+    print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward, {device}:")
+    compare({name: median_seconds(step, repeats) for name, step in encodings(device).items()}, "s")
+    if kernels_on(device) == "numba":
+        print("marching 2304 rays through 128^3 cells, 32 samples:")
+        compare(by_both(lambda: median_seconds(marching(2304, 128, 32), repeats)), "s")
     print("training, default field, 2304 rays a step:")
-    compare(by_both(lambda: training_seconds(steps if kernels.AVAILABLE else max(4, steps // 10), threads)), "s a step")
+    compare(by_both(lambda: training_seconds(steps, threads, device)), "s a step")
 
 
 def by_both(measured: Callable[[], float]) -> dict[str, float]:
     """The same with the kernels and in plain PyTorch."""
     seconds = {"scenefuse": measured()}
-    kernels.AVAILABLE = False
+    before = kernels.AVAILABLE, encoding.triton_kernels
+    kernels.AVAILABLE, encoding.triton_kernels = False, None
     seconds["scenefuse in plain PyTorch"] = measured()
-    kernels.AVAILABLE = True
+    kernels.AVAILABLE, encoding.triton_kernels = before
     return seconds
 
 
-def kernel_steps() -> dict[str, Callable[[], None]]:
-    """What the other kernel does in a training step, at its size."""
+def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
+    """Marching as in a training step, through a shell."""
     generator = torch.Generator().manual_seed(0)
-    rays, samples, cells = 2304, 32, 128
     grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
     shell = ((grid.norm(dim=0) - 0.6).abs() < 0.1).contiguous()
     occupancy = Occupancy(shell, 50 * shell.float(), shell)
@@ -65,11 +68,7 @@ def kernel_steps() -> dict[str, Callable[[], None]]:
     direction = torch.nn.functional.normalize(torch.rand(rays, 3, generator=generator) - 0.5 - origin)
     origin, none = origin + 0.5, torch.zeros(rays)
     jitter, prior = torch.rand(rays, samples, generator=generator), Prior(none - 1, none, none)
-
-    def marching() -> None:
-        march(origin, direction, occupancy, jitter, 0.25, prior)
-
-    return {f"marching {rays} rays through {cells}^3 cells, {samples} samples": marching}
+    return lambda: march(origin, direction, occupancy, jitter, 0.25, prior)
 
 
 def compare(seconds: dict[str, float], unit: str) -> None:
@@ -79,13 +78,13 @@ def compare(seconds: dict[str, float], unit: str) -> None:
         print(f"  {name:30s} {value:9.4f} {unit}   {value / first:6.1f} x")
 
 
-def encodings() -> dict[str, Callable[[], None]]:
+def encodings(device: str) -> dict[str, Callable[[], None]]:
     """Encoders of the same size, each as a step that runs forward and backward on the same positions."""
     generator = torch.Generator().manual_seed(0)
-    x = torch.rand(SAMPLES, 3, generator=generator)
-    weight = torch.rand(SAMPLES, 2 * LEVELS, generator=generator)
-    grid, every_level = hash_grid(LEVELS, LOG2_TABLE, COARSEST, FINEST), torch.ones(LEVELS)
-    table = torch.nn.Parameter(torch.rand(grid.rows, 2, generator=generator))
+    x = torch.rand(SAMPLES, 3, generator=generator).to(device)
+    weight = torch.rand(SAMPLES, 2 * LEVELS, generator=generator).to(device)
+    grid, every_level = hash_grid(LEVELS, LOG2_TABLE, COARSEST, FINEST), torch.ones(LEVELS, device=device)
+    table = torch.nn.Parameter(torch.rand(grid.rows, 2, generator=generator).to(device))
     # Nearly every cache line of the table is read and nearly every one of its gradient written.
     gradient = torch.empty_like(table).detach()
 
@@ -106,23 +105,26 @@ def encodings() -> dict[str, Callable[[], None]]:
     except ImportError as error:
         print(f"  (nerfstudio is not there: {error})")
         return peers
-    theirs = HashEncoding(LEVELS, COARSEST, FINEST, LOG2_TABLE, 2, implementation="torch")
+    theirs = HashEncoding(LEVELS, COARSEST, FINEST, LOG2_TABLE, 2, implementation="torch").to(device)
     peers["nerfstudio 1.1.5, torch"] = lambda: step(lambda: theirs(x), theirs.hash_table)
     return peers
 
 
 def median_seconds(step: Callable[[], None], repeats: int) -> float:
     """Median time of a step, after one that warms up."""
+    wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     step()
     times = []
     for _ in range(repeats):
+        wait()
         start = time.perf_counter()
         step()
+        wait()
         times.append(time.perf_counter() - start)
     return statistics.median(times)
 
 
-def training_seconds(steps: int, threads: int) -> float:
+def training_seconds(steps: int, threads: int, device: str) -> float:
     """Seconds of one training step of the default field on photos of a painted sphere, compilation left out."""
     config = shipped_with(None)["object"]
     settings = config["nerf"]
@@ -132,9 +134,9 @@ def training_seconds(steps: int, threads: int) -> float:
     rays = settings["images_per_batch"] * settings["rays_per_image"]
     weights = build(LossWeights, settings)
     seconds = 0.0
-    for count in (2, steps):
+    for count in (2, steps if kernels_on(device) != "torch" else max(4, steps // 10)):
         fitted = settings | {"epochs": 2, "rays_per_epoch": count * rays // 2}
-        model = new_model(build(FieldSettings, settings), torch.from_numpy(hull), len(photos), 0, "cpu")
+        model = new_model(build(FieldSettings, settings), torch.from_numpy(hull), len(photos), 0, device)
         schedule = build(Schedule, fitted)
         result = train(
             model,
