@@ -10,11 +10,14 @@ import cv2
 import numpy as np
 import pandas as pd
 
+from scenefuse.clouds import read_cloud
 from scenefuse.metrics.truth import mask_iou
 from scenefuse.objects.masks import MaskSettings, make_masks, read_frames
 from scenefuse.objects.supplied import supplied_masks
 from scenefuse.settings import ROOT, build, shipped_with
 from scenefuse.stage import read_json, run, value
+from scenefuse.viz.object_sheet import inner, upright
+from scenefuse.viz.render import orbit_camera, point_radii, render
 
 EXAMPLE = ROOT / "config/examples/alexander"
 WRONG = {"DSC05138.JPG"}
@@ -22,7 +25,7 @@ WRONG = {"DSC05138.JPG"}
 
 
 def alexander(*, results: Path, given: Path) -> None:
-    """Print the IoU of the masks with the supplied ones, and the NeRF's quality; all to bench/alexander.tsv.
+    """Print the IoU of the masks with the supplied ones (bench/alexander.tsv) and the NeRF's quality; draw the cloud.
 
     The supplied masks are undistorted like the photos. A photo that a method leaves out counts for neither its mean
     nor its median, and is counted beside them. GrabCut runs here, with the same prompts and cameras.
@@ -66,6 +69,12 @@ def alexander(*, results: Path, given: Path) -> None:
             f"{value(report, 'ssim'):.3f}, silhouettes' IoU {value(report, 'silhouette_iou'):.3f}, "
             f"{value(report, 'photos_measured')} photos"
         )
+    report = read_json(folder / "object.json")
+    print(f"cloud: {value(report, 'points')} points; photos deny {value(report, 'denied_share'):.1%} of the depths")
+    cloud = upright(read_cloud(folder / "object.ply"), folder / "cameras")
+    framed, radii = inner(cloud.points), point_radii(cloud.points)
+    sides = [render(cloud, orbit_camera(framed, a, 10, (420, 420)), radii) for a in (220, 310, 130, 40)]
+    cv2.imwrite(str(results / "bench/alexander.png"), np.hstack(sides)[..., ::-1])
 
 
 if __name__ == "__main__":
