@@ -1,6 +1,6 @@
 """Masks of the object in every photo: GrabCut or SAM 2 from prompts, or supplied; the visual hull makes them agree."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -14,7 +14,8 @@ from scenefuse.objects.contact_sheet import contact_sheet as draw_sheet
 from scenefuse.objects.cut import first_cuts, second_cuts
 from scenefuse.objects.frames import original_sizes
 from scenefuse.objects.hull import Frame, Hull, Mask, agreement, carve, silhouette
-from scenefuse.objects.sam2 import Sam2, ask, check_weights
+from scenefuse.objects.mask_algebra import kept_part, mask_folders
+from scenefuse.objects.sam2 import Sam2, Sam2Onnx, Sam2Transformers, ask, check_weights
 from scenefuse.objects.supplied import supplied_masks
 from scenefuse.objects.target import Target, points_in_masks, target_from_points
 from scenefuse.stage import (
@@ -71,8 +72,10 @@ def make_masks(
     method: Literal["grabcut", "sam2", "supplied"],
     prompts: Path | None,
     supplied: Path | None,
-    sam2_encoder: Path | None,
-    sam2_decoder: Path | None,
+    sam2_encoder: Path,
+    sam2_decoder: Path,
+    sam2_checkpoint: Path | None,
+    keep: str,
     settings: MaskSettings,
     seed: int,
     masks: Path,
@@ -84,7 +87,7 @@ def make_masks(
     Prompts give an upright box; the sparse points in it and above the ground seed GrabCut in each photo, whose masks
     carve a visual hull, along which they are cut again. SAM 2 is asked in each photo with all prompts and the box
     around them, and again with the hull where it disagrees. Supplied masks are undistorted, never changed. A photo
-    whose mask disagrees with the hull is dropped.
+    whose mask disagrees with the hull is dropped. What `keep` says is applied last.
 
     Args:
         cameras: undistorted COLMAP workspace of the object (PINHOLE cameras).
@@ -97,6 +100,8 @@ def make_masks(
         supplied: for supplied: folder of masks named like the photos, with or without `_mask`; non-zero on the object.
         sam2_encoder: for sam2: weights of the encoder (.ort or .onnx).
         sam2_decoder: for sam2: weights of the decoder (.onnx).
+        sam2_checkpoint: for sam2: folder of a checkpoint that transformers runs instead, or none.
+        keep: what the masks keep, `object` or an expression with other folders of masks (mask_algebra.py).
         settings: see MaskSettings.
         seed: seed of the ground's RANSAC.
         masks: output folder, {photo without suffix}.png, uint8 0 or 255, the size of the undistorted photo.
@@ -111,6 +116,8 @@ def make_masks(
     up = np.array(value(read_json(cameras_json), "up_in_camera_frame"), dtype=np.float64)
     without: dict[str, str] = {}
     if method == "supplied":
+        if supplied is None:
+            raise StageError("method supplied needs a folder of masks; set its path in config/objects.tsv")
         found = supplied_masks(supplied, sfm, frames)
         without = {f.name: "no mask was supplied" for f in frames if f.name not in found}
         frames = [f for f in frames if f.name in found]
@@ -122,11 +129,10 @@ def make_masks(
     if method == "supplied":
         made = _judged([found[f.name] for f in frames], frames, target, settings)
     elif method == "sam2":
-        encoder = check_weights(sam2_encoder, settings.sam2_encoder_sha256, "encoder")
-        decoder = check_weights(sam2_decoder, settings.sam2_decoder_sha256, "decoder")
-        made = _segment(Sam2(encoder, decoder, threads()), target, frames, settings)
+        made = _segment(_network(sam2_encoder, sam2_decoder, sam2_checkpoint, settings), target, frames, settings)
     else:
         made = _cut(target, frames, settings)
+    made = _kept(made, keep, sfm, frames)
     dropped = without | made.dropped
     kept = [k for k, f in enumerate(frames) if f.name not in dropped]
     for name, reason in sorted(dropped.items()):
@@ -154,6 +160,7 @@ def make_masks(
         report,
         {
             "method": quantity(method, ""),
+            "keep": quantity(keep, ""),
             "masks": quantity(len(kept), "1"),
             "photos": quantity(len(frames) + len(without), "1"),
             "median_agreement": quantity(median, "1"),
@@ -220,6 +227,29 @@ def _judged(masks: list[Mask], frames: list[Frame], target: Target, settings: Ma
                 f"IoU with the visual hull is {score:.2f}, below {settings.min_agreement} (min_agreement)"
             )
     return _Made(masks, scores, dropped, hull)
+
+
+def _network(encoder: Path, decoder: Path, checkpoint: Path | None, settings: MaskSettings) -> Sam2:
+    """SAM 2 by transformers if there is a checkpoint, else by ONNX Runtime."""
+    if checkpoint is not None:
+        return Sam2Transformers(checkpoint)
+    return Sam2Onnx(
+        check_weights(encoder, settings.sam2_encoder_sha256, "encoder"),
+        check_weights(decoder, settings.sam2_decoder_sha256, "decoder"),
+        threads(),
+    )
+
+
+def _kept(made: _Made, keep: str, sfm: Path, frames: list[Frame]) -> _Made:
+    """The part of the masks that an expression keeps; their agreement stays that of the whole object."""
+    others = {folder: supplied_masks(folder, sfm, frames) for folder in mask_folders(keep)}
+    masks, dropped = [], dict(made.dropped)
+    for frame, mask in zip(frames, made.masks):
+        here = {folder: found[frame.name] for folder, found in others.items() if frame.name in found}
+        masks.append(kept_part(keep, mask, here))
+        if not masks[-1].any():
+            dropped.setdefault(frame.name, f"nothing is left of the mask ({keep})")
+    return replace(made, masks=masks, dropped=dropped)
 
 
 def read_frames(cameras: Path) -> tuple[list[Frame], Array]:

@@ -12,7 +12,7 @@ from scenefuse.objects.hull import Frame, Mask
 from scenefuse.stage import StageError
 
 
-def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[str, Mask]:
+def supplied_masks(folder: Path, sfm: Path, frames: list[Frame]) -> dict[str, Mask]:
     """Masks from a folder by the name of the photo they belong to, undistorted like it.
 
     Args:
@@ -23,8 +23,10 @@ def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[
     Raises:
         StageError: no such folder, an unreadable mask, or masks that belong to none of the photos.
     """
-    if folder is None or not folder.is_dir():
-        raise StageError(f"the folder of supplied masks {folder} does not exist; set its path in config/objects.tsv")
+    if not folder.is_dir():
+        raise StageError(
+            f"the folder of masks {folder} does not exist; set its path in config/objects.tsv, or in object.masks.keep"
+        )
     files = mask_files(folder)
     model = pycolmap.Reconstruction(sfm)
     originals = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
@@ -43,7 +45,7 @@ def supplied_masks(folder: Path | None, sfm: Path, frames: list[Frame]) -> dict[
             f"masks that match no photo: {len(files)} masks in {folder} (first: {example}), photos are named like "
             f"{frames[0].name}; name a mask like its photo, with or without _mask"
         )
-    print(f"{len(masks)} of {len(frames)} photos have a supplied mask", flush=True)
+    print(f"{len(masks)} of {len(frames)} photos have a mask in {folder}", flush=True)
     return masks
 
 

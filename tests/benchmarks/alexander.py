@@ -42,7 +42,8 @@ def alexander(*, results: Path, given: Path) -> None:
         make_masks(
             cameras=folder / "cameras", cameras_json=folder / "cameras.json", sfm=folder / "sfm",
             photos=folder / "photos.json", method="grabcut", prompts=EXAMPLE / "prompts.tsv", supplied=None,
-            sam2_encoder=None, sam2_decoder=None, settings=build(MaskSettings, shipped["object"]["masks"]),
+            sam2_encoder=Path(), sam2_decoder=Path(), sam2_checkpoint=None, keep="object",
+            settings=build(MaskSettings, shipped["object"]["masks"]),
             seed=shipped["seed"], masks=work / "masks", contact_sheet=results / "bench/alexander_grabcut.png",
             report=work / "masks.json",
         )  # fmt: skip

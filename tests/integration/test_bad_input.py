@@ -58,9 +58,7 @@ def test_unknown_scene_of_an_object(project):
 
 
 def test_missing_photo_folder(project):
-    assert "scenes.tsv, scene 'yard': the photos 'flight' do not exist" in project.run(
-        "-n", "results/scenes/yard/photos.json"
-    )
+    assert "scenes.tsv, scene 'yard': 'flight' does not exist" in project.run("-n", "results/scenes/yard/photos.json")
 
 
 def test_empty_photo_folder(project):

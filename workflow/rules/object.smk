@@ -5,6 +5,7 @@
 #           results/objects/{object}/features.db, database.db          COLMAP databases
 #           results/objects/{object}/sfm/, sfm.json                    cameras and sparse points
 #           results/objects/{object}/cameras/, cameras.json            undistorted photos with pinhole cameras
+#           results/weights/                                           SAM 2's, for masks by it
 #           results/objects/{object}/masks/, masks.json, masks.png     where the object is in each photo
 #           results/objects/{object}/poses/, poses.json                the same with poses found without SfM, for pose_source network
 #           results/objects/{object}/stage1/ .. stage4/, stage1.json   depth and pose networks; NeRF; feedback; NeRF
@@ -164,6 +165,32 @@ rule cameras:
     shell:
         "exec python {params.script} --folder {input.frames} --photos {input.photos} --sparse {input.model}"
         " --cameras {output.cameras} --report {output.report} {params.options} &> {log}"
+
+
+rule sam2_weights:
+    """SAM 2's weights for ONNX Runtime; not asked for where the config names others."""
+    output:
+        encoder="results/weights/sam2_encoder.ort",
+        decoder="results/weights/sam2_decoder.onnx",
+    log:
+        "results/logs/sam2_weights.log",
+    localrule: True
+    conda:
+        "../../envs/reconstruction.yaml"
+    params:
+        options=flags(
+            {
+                "package": config["object"]["masks"]["sam2_package"],
+                "sam2_encoder_sha256": config["object"]["masks"]["sam2_encoder_sha256"],
+                "sam2_decoder_sha256": config["object"]["masks"]["sam2_decoder_sha256"],
+            }
+        ),
+        script=script("sam2_weights.py"),
+        code=code("sam2_weights.py"),
+    message:
+        "SAM 2's weights"
+    shell:
+        "exec python {params.script} --sam2-encoder {output.encoder} --sam2-decoder {output.decoder} {params.options} &> {log}"
 
 
 rule masks:
