@@ -1,0 +1,65 @@
+"""The code for a GPU keeps its tensors together; where there is no GPU, on one that is pretended."""
+
+import numpy as np
+import pytest
+import torch
+from painted_sphere import photos_of, sphere_views, sphere_volume
+from pretend_gpu import OnGpu, PretendGpu, to_pretended
+from test_depth import plane_views
+
+from scenefuse.nerf import encoding
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.render import render_view
+from scenefuse.nerf.train import Schedule, new_model, train
+from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.settings import build, shipped_with
+
+
+@pytest.fixture
+def gpu(monkeypatch):
+    """CUDA, or what passes for it; its own kernels are tested elsewhere."""
+    if torch.cuda.is_available():
+        yield
+        return
+    monkeypatch.setattr(encoding, "triton_kernels", None)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.nn.Module, "to", to_pretended)
+    with PretendGpu():
+        yield
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a real one")
+def test_the_pretended_gpu_notices_what_was_left_behind(gpu):
+    there, here = torch.ones(3, device="cuda"), torch.ones(3)
+    assert (there + 1).device.type == "cuda" and (there + here.to("cuda")).device.type == "cuda"
+    assert (there + here.sum()).cpu().device.type == "cpu" and isinstance(there[torch.tensor([0, 2])], OnGpu)
+    for mistake in (lambda: there + here, lambda: torch.cat([there, here]), lambda: there.numpy()):
+        with pytest.raises(RuntimeError, match="on the (CPU|GPU)"):
+            mistake()
+
+
+def test_training_and_rendering_on_a_gpu(gpu, tmp_path):
+    settings = shipped_with(None)["object"]["nerf"]
+    views = sphere_views(6, 40)
+    cube, hull = sphere_volume(views, 32)
+    photos = photos_of(views, cube, prior=1.0)
+    small = {"epochs": 1, "images_per_batch": 3, "rays_per_image": 16, "rays_per_epoch": 48 * 20}
+    schedule = build(Schedule, settings | small | {"pose_learning_rate": 1e-4})
+    model = new_model(
+        build(FieldSettings, settings | {"log2_table": 12}), torch.from_numpy(hull), len(photos), 0, "cuda"
+    )
+    train(
+        model, photos, schedule, build(LossWeights, settings), warm=False, seed=0, threads=1,
+        checkpoint=tmp_path / "state.pt", report=print, band_px=2,
+    )  # fmt: skip
+    assert {model.field.table.device.type, model.occupancy.alpha.device.type, model.pose.device.type} == {"cuda"}
+    camera = photos.intrinsics[0], photos.rotation[0], photos.center[0]
+    rendered = render_view(model.field, model.occupancy, *camera, photos.masks[0], 16, 0.25, True)
+    assert rendered.depth.device.type == "cpu" and bool((rendered.opacity > 0).any())
+
+
+def test_asking_photos_about_depths_on_a_gpu(gpu):
+    views, truth = plane_views(count=4)
+    refined = refine_by_photos(views, views.object_from_cam, truth.astype(np.float32), RefinementSettings(4.0, 5, 0.6))
+    assert refined.depths.shape == truth.shape
