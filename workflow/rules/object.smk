@@ -181,8 +181,12 @@ rule sam2_weights:
         options=flags(
             {
                 "package": config["object"]["masks"]["sam2_package"],
-                "sam2_encoder_sha256": config["object"]["masks"]["sam2_encoder_sha256"],
-                "sam2_decoder_sha256": config["object"]["masks"]["sam2_decoder_sha256"],
+                "sam2_encoder_sha256": config["object"]["masks"][
+                    "sam2_encoder_sha256"
+                ],
+                "sam2_decoder_sha256": config["object"]["masks"][
+                    "sam2_decoder_sha256"
+                ],
             }
         ),
         script=script("sam2_weights.py"),
