@@ -77,7 +77,10 @@ def test_boost_multiplies_fine_gradients_only_and_no_values(device):
         values.append(out.detach())
     first_fine = int(grid.offset[3])
     assert torch.equal(values[0], values[1])
-    assert torch.allclose(gradients[0][:first_fine], gradients[1][:first_fine], rtol=1e-4, atol=1e-6)
+    if device == "cuda":  # atomic additions in any order
+        assert torch.allclose(gradients[0][:first_fine], gradients[1][:first_fine], rtol=1e-4, atol=1e-6)
+    else:
+        assert torch.equal(gradients[0][:first_fine], gradients[1][:first_fine])
     assert torch.allclose(3 * gradients[0][first_fine:], gradients[1][first_fine:], rtol=1e-4, atol=1e-6)
 
 
