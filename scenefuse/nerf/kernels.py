@@ -2,23 +2,26 @@
 
 Each one has a plain PyTorch twin beside its caller, which tests compare against and which runs on other devices or
 where Numba is not installed. Loops are arranged so that no two threads write to one place: results do not depend on
-the number of threads.
+the number of threads. Rows of large levels are fetched ahead of their use, since the processor cannot guess them.
 """
 
 from typing import Any
 
 import numpy as np
+import torch
 
 nb: Any = None
 prange: Any = range
 try:
     import numba as nb
+    from llvmlite import ir
     from numba import prange
+    from numba.extending import intrinsic
 except ImportError:  # the PyTorch twins do the work
     pass
 else:
-    # Numba's OpenMP layer would change the thread count of the OpenMP that PyTorch uses.
-    nb.config.THREADING_LAYER = "workqueue"
+    # PyTorch's threads, which wait busily for a while, and threads of Numba's own would take the cores from each other.
+    nb.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 AVAILABLE = nb is not None
 PRIMES = (1, 2654435761, 805459861)
@@ -26,6 +29,8 @@ ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
+AHEAD = 16  # samples
+NEAR_ROWS = 1 << 17  # a level of so many rows, one MiB, stays in a core's cache
 
 
 def _jit(function):  # type: ignore[no-untyped-def]
@@ -38,10 +43,15 @@ def _inline(function):  # type: ignore[no-untyped-def]
     return function if nb is None else nb.njit(fastmath=True, inline="always")(function)
 
 
+def _intrinsic(function):  # type: ignore[no-untyped-def]
+    return function if nb is None else intrinsic(function)
+
+
 def set_threads(count: int) -> None:
-    """Use `count` threads for every kernel."""
+    """Use `count` threads for every kernel and for PyTorch, whose number Numba changes when it starts."""
     if nb is not None:
         nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
+    torch.set_num_threads(count)
 
 
 def encode(x, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
@@ -94,6 +104,46 @@ def _rows(ix, iy, iz, stride, start, mask):
     )  # fmt: skip
 
 
+@_intrinsic
+def _prefetch(typing, array, row):  # type: ignore[no-untyped-def]
+    """Ask the processor for a row of an array (T, 2), and do not wait."""
+
+    def generate(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        table = context.make_array(signature.args[0])(context, builder, arguments[0])
+        place = builder.gep(table.data, [builder.shl(builder.zext(arguments[1], ir.IntType(64)), ir.IntType(64)(1))])
+        byte, number = ir.IntType(8).as_pointer(), ir.IntType(32)
+        kind = ir.FunctionType(ir.VoidType(), [byte, number, number, number])
+        # To read, to be kept in all caches, data.
+        flags = number(0), number(3), number(1)
+        fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], kind)
+        builder.call(fetch, [builder.bitcast(place, byte), *flags])
+        return context.get_dummy_value()
+
+    return nb.void(array, row), generate
+
+
+@_inline
+def _is_far(stride, mask):
+    return (stride * stride * stride if stride > 0 else mask) >= NEAR_ROWS
+
+
+@_inline
+def _fetch(table, position, size, stride, start, mask):
+    """Ask for the rows that a sample at a position (3,) will need."""
+    ix, _ = _cell(position[0], size)
+    iy, _ = _cell(position[1], size)
+    iz, _ = _cell(position[2], size)
+    r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, stride, start, mask)
+    _prefetch(table, r0)
+    _prefetch(table, r1)
+    _prefetch(table, r2)
+    _prefetch(table, r3)
+    _prefetch(table, r4)
+    _prefetch(table, r5)
+    _prefetch(table, r6)
+    _prefetch(table, r7)
+
+
 @_jit
 def _encode(threads, x, table, resolution, stride, offset, mask, level_weight, out):
     """A thread goes through all of its samples level by level, so that one level's rows stay in its cache."""
@@ -108,7 +158,10 @@ def _encode(threads, x, table, resolution, stride, offset, mask, level_weight, o
                     out[n, 2 * level + 1] = ZERO
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
+            far = _is_far(step, bits)
             for n in range(first, last):
+                if far:
+                    _fetch(table, x[min(n + AHEAD, last - 1)], size, step, start, bits)
                 ix, fx = _cell(x[n, 0], size)
                 iy, fy = _cell(x[n, 1], size)
                 iz, fz = _cell(x[n, 2], size)
@@ -143,7 +196,10 @@ def _encode_backward(threads, x, gradient, resolution, stride, offset, mask, lev
             if weight == ZERO:
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
+            far = _is_far(step, bits)
             for n in range(x.shape[0]):
+                if far:
+                    _fetch(out, x[min(n + AHEAD, x.shape[0] - 1)], size, step, start, bits)
                 scale = weight * boost[n] if level >= fine_from else weight
                 ga, gb = scale * gradient[n, 2 * level], scale * gradient[n, 2 * level + 1]
                 if ga == ZERO and gb == ZERO:
@@ -175,7 +231,10 @@ def _encode_backward_x(threads, x, gradient, table, resolution, stride, offset, 
             if weight == ZERO:
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
+            far = _is_far(step, bits)
             for n in range(first, last):
+                if far:
+                    _fetch(table, x[min(n + AHEAD, last - 1)], size, step, start, bits)
                 p, q = weight * size * gradient[n, 2 * level], weight * size * gradient[n, 2 * level + 1]
                 ix, fx = _cell(x[n, 0], size)
                 iy, fy = _cell(x[n, 1], size)

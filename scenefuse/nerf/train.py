@@ -128,7 +128,6 @@ def train(
         final loss terms and `psnr` (means over the last tenth), `steps`, `seconds`, `rays_per_second`,
         `samples_per_second`.
     """
-    torch.set_num_threads(threads)
     kernels.set_threads(threads)
     keep_memory()
     pool = pixel_pool(photos, band_px=band_px, ring_px=12, edge_px=3)

@@ -27,35 +27,38 @@ LEVELS, LOG2_TABLE, COARSEST, FINEST, SAMPLES = 16, 19, 16, 1024, 32768
 
 
 def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Literal["cpu", "cuda"] = "cpu") -> None:
-    """Print times and ratios.
+    """Print times and ratios; what is compared takes turns, so that a busy machine slows all of it.
 
     Args:
-        repeats: runs of each encoding; the median counts.
-        steps: training steps of each model.
+        repeats: runs of each encoding and of marching; the median counts.
+        steps: training steps of each model, three times.
         threads: CPU threads.
         device: where everything runs.
     """
     torch.backends.cuda.matmul.fp32_precision = "tf32"
-    torch.set_num_threads(threads)
     kernels.set_threads(threads)
     keep_memory()
     print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward, {device}:")
-    compare({name: median_seconds(step, repeats) for name, step in encodings(device).items()}, "s")
+    compare(medians({name: lambda step=step: time_of(step) for name, step in encodings(device).items()}, repeats), "s")
     if kernels_on(device) == "numba":
         print("marching 2304 rays through 128^3 cells, 32 samples:")
-        compare(by_both(lambda: median_seconds(marching(2304, 128, 32), repeats)), "s")
+        step = marching(2304, 128, 32)
+        compare(medians(by_both(lambda: time_of(step)), repeats), "s")
     print("training, default field, 2304 rays a step:")
-    compare(by_both(lambda: training_seconds(steps, threads, device)), "s a step")
+    compare(medians(by_both(lambda: training_seconds(steps, threads, device)), 3), "s a step")
 
 
-def by_both(measured: Callable[[], float]) -> dict[str, float]:
+def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
     """The same with the kernels and in plain PyTorch."""
-    seconds = {"scenefuse": measured()}
-    before = kernels.AVAILABLE, encoding.triton_kernels
-    kernels.AVAILABLE, encoding.triton_kernels = False, None
-    seconds["scenefuse in plain PyTorch"] = measured()
-    kernels.AVAILABLE, encoding.triton_kernels = before
-    return seconds
+
+    def plain() -> float:
+        before = kernels.AVAILABLE, encoding.triton_kernels
+        kernels.AVAILABLE, encoding.triton_kernels = False, None
+        taken = measured()
+        kernels.AVAILABLE, encoding.triton_kernels = before
+        return taken
+
+    return {"scenefuse": measured, "scenefuse in plain PyTorch": plain}
 
 
 def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
@@ -110,18 +113,20 @@ def encodings(device: str) -> dict[str, Callable[[], None]]:
     return peers
 
 
-def median_seconds(step: Callable[[], None], repeats: int) -> float:
-    """Median time of a step, after one that warms up."""
+def medians(measured: dict[str, Callable[[], float]], repeats: int) -> dict[str, float]:
+    """Median of what each returns, in turns, after one round that warms up."""
+    rounds = [{name: take() for name, take in measured.items()} for _ in range(repeats + 1)]
+    return {name: statistics.median(taken[name] for taken in rounds[1:]) for name in measured}
+
+
+def time_of(step: Callable[[], None]) -> float:
+    """Time of one step."""
     wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
+    wait()
+    start = time.perf_counter()
     step()
-    times = []
-    for _ in range(repeats):
-        wait()
-        start = time.perf_counter()
-        step()
-        wait()
-        times.append(time.perf_counter() - start)
-    return statistics.median(times)
+    wait()
+    return time.perf_counter() - start
 
 
 def training_seconds(steps: int, threads: int, device: str) -> float:

@@ -26,9 +26,9 @@ def device(request, monkeypatch):
     return "cpu"
 
 
-def _problem(seed=0):
-    rng = torch.Generator().manual_seed(seed)
-    grid = hash_grid(levels=6, log2_table=10, coarsest=4, finest=100)
+def _problem(log2_table=10):
+    rng = torch.Generator().manual_seed(0)
+    grid = hash_grid(levels=6, log2_table=log2_table, coarsest=4, finest=100)
     table = torch.rand(grid.rows, 2, generator=rng) - 0.5
     x = torch.rand(500, 3, generator=rng)
     weight = torch.tensor([1.0, 1.0, 0.7, 1.0, 0.3, 0.0])
@@ -52,8 +52,9 @@ def test_dense_level_interpolates_trilinearly():
 
 
 @pytest.mark.parametrize("boosted", [False, True])
-def test_kernel_values_and_gradients_match_the_reference(device, boosted):
-    grid, table, x, weight = _problem()
+@pytest.mark.parametrize("log2_table", [10, 18])  # the larger one has levels that are fetched ahead
+def test_kernel_values_and_gradients_match_the_reference(device, boosted, log2_table):
+    grid, table, x, weight = _problem(log2_table)
     boost = torch.linspace(1, 4, len(x), device=device) if boosted else None
     results = []
     for function in (encode, encode_reference):
