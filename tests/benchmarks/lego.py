@@ -1,6 +1,6 @@
 """NeRF-synthetic Lego: test PSNR over training time, on white and over whole pictures as in the literature.
 
-python tests/benchmarks/lego.py --data ../shared/data/lego
+python tests/benchmarks/lego.py --data data/lego
 """
 
 import tempfile
