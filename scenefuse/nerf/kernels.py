@@ -8,7 +8,6 @@ the number of threads. Rows of large levels are fetched ahead of their use, sinc
 from typing import Any
 
 import numpy as np
-import torch
 
 nb: Any = None
 prange: Any = range
@@ -19,9 +18,6 @@ try:
     from numba.extending import intrinsic
 except ImportError:  # the PyTorch twins do the work
     pass
-else:
-    # PyTorch's threads, which wait busily for a while, and threads of Numba's own would take the cores from each other.
-    nb.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
 
 AVAILABLE = nb is not None
 PRIMES = (1, 2654435761, 805459861)
@@ -45,13 +41,6 @@ def _inline(function):  # type: ignore[no-untyped-def]
 
 def _intrinsic(function):  # type: ignore[no-untyped-def]
     return function if nb is None else intrinsic(function)
-
-
-def set_threads(count: int) -> None:
-    """Use `count` threads for every kernel and for PyTorch, whose number Numba changes when it starts."""
-    if nb is not None:
-        nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
-    torch.set_num_threads(count)
 
 
 def encode(x, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]

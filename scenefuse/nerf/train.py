@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scenefuse.nerf import kernels, losses
+from scenefuse.cores import use_threads
+from scenefuse.nerf import losses
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
@@ -128,7 +129,7 @@ def train(
         final loss terms and `psnr` (means over the last tenth), `steps`, `seconds`, `rays_per_second`,
         `samples_per_second`.
     """
-    kernels.set_threads(threads)
+    use_threads(threads)
     keep_memory()
     pool = pixel_pool(photos, band_px=band_px, ring_px=12, edge_px=3)
     pose = nn.Parameter(model.pose.clone())

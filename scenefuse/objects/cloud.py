@@ -12,6 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
+from scenefuse.cores import use_threads
 from scenefuse.maps import read_depth, read_normals
 from scenefuse.nerf.agreement import compare, extent, surface_points
 from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
@@ -74,8 +75,7 @@ def object_cloud(
     Raises:
         StageError: a map is missing, or no point passes the gates.
     """
-    cv2.setNumThreads(threads())
-    torch.set_num_threads(threads())
+    use_threads(threads())
     if not (stage / "model.pt").is_file():
         raise StageError(f"{stage}/model.pt does not exist; run the NeRF stage first")
     saved = torch.load(stage / "model.pt", map_location="cpu", weights_only=True)

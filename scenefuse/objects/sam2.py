@@ -97,7 +97,7 @@ class Sam2Transformers:
                 "pip install transformers==5.23.0"
             ) from None
         try:
-            network = Sam2Model.from_pretrained(checkpoint, local_files_only=True)
+            network: Any = Sam2Model.from_pretrained(checkpoint, local_files_only=True)
         except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0]
             raise StageError(f"{checkpoint} is no folder of a SAM 2 checkpoint for transformers: {reason}") from None

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scenefuse.cores import use_threads
 from scenefuse.maps import write_depth, write_normals
 from scenefuse.nerf.agreement import compare, extent, normals_from_depth, surface_points
 from scenefuse.nerf.encoding import kernels_on
@@ -94,8 +95,7 @@ def train_nerf(
         StageError: no masks, an empty visual hull, CUDA asked for and missing, or no surface found.
     """
     start = time.monotonic()
-    torch.set_num_threads(threads())
-    cv2.setNumThreads(threads())
+    use_threads(threads())
     torch.backends.cuda.matmul.fp32_precision = "tf32"
     keep_memory()
     chosen = _device(device)

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.cores import use_threads
 from scenefuse.maps import read_depth, write_depth, write_normals
 from scenefuse.scenes.plane_sweep import DepthSettings, Photo, estimate_depth
 from scenefuse.scenes.sfm import cancellable
@@ -95,8 +96,7 @@ def estimate_depth_maps(
     device = "cuda" if chosen == "colmap" or torch.cuda.is_available() else "cpu"
     print(f"depth maps by {chosen} on {device}: {why}", flush=True)
     torch.manual_seed(seed)
-    torch.set_num_threads(threads())
-    cv2.setNumThreads(threads())
+    use_threads(threads())
     model = _read_model(workspace)
     tasks = _tasks(model, settings)
     if not tasks:

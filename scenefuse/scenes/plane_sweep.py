@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
+from scenefuse.scenes.matching_kernel import keep_best
+
 # Less than this is no better match: smooth surfaces match nearly everywhere.
 MIN_GAIN = 0.02
 # Windows whose grey values deviate by this much (three of 255 levels) have a texture that must match somewhere.
@@ -194,12 +196,16 @@ class _Matcher:
 
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
-        best = [torch.full_like(inverse, -0.5) for _ in range(self.best)]
+        best = inverse.new_full((self.best, *inverse.shape), -0.5)
         for gray, directions, move in self.sources:
+            if inverse.device.type == "cpu":
+                photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
+                keep_best(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
+                continue
             candidate = self._ncc(inverse, gray, directions, move)
             for k in range(self.best):
                 best[k], candidate = torch.maximum(best[k], candidate), torch.minimum(best[k], candidate)
-        return torch.stack(best).mean(0) if self.best > 1 else best[0]
+        return best.mean(0)
 
     def seen_by(self, inverse: Tensor) -> Tensor:
         """Source photos (h, w) in which a hypothesis per pixel (h, w) lies."""

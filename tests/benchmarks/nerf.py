@@ -13,6 +13,7 @@ from typing import Literal
 import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
+from scenefuse.cores import use_threads
 from scenefuse.nerf import encoding, kernels
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.field import FieldSettings
@@ -36,7 +37,7 @@ def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Litera
         device: where everything runs.
     """
     torch.backends.cuda.matmul.fp32_precision = "tf32"
-    kernels.set_threads(threads)
+    use_threads(threads)
     keep_memory()
     print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward, {device}:")
     compare(medians({name: lambda step=step: time_of(step) for name, step in encodings(device).items()}, repeats), "s")

@@ -6,11 +6,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from scenefuse.clouds import read_cloud
 from scenefuse.maps import read_depth, read_normals
 from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
-from scenefuse.scenes.plane_sweep import DepthSettings
+from scenefuse.scenes.plane_sweep import DepthSettings, Photo, _Matcher
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
@@ -86,6 +87,23 @@ def maps(workspace, tmp_path_factory):
             report=folder / f"{chunk}.json",
         )
     return folder
+
+
+@pytest.mark.parametrize("window", [3, 7])
+def test_matching_kernel_scores_as_its_twin(window):
+    rng = np.random.default_rng(0)
+    intrinsics = np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1.0]])
+    photos = [
+        Photo(rng.random(size, np.float32), intrinsics, np.column_stack([np.eye(3), [x, 0.1, 0]]))
+        for x, size in ((0, (50, 70)), (1, (50, 70)), (-2, (50, 70)), (9, (40, 80)))
+    ]
+    matcher = _Matcher(photos[0], photos[1:], replace(DEPTH, best_sources=2, window_px=window), "cpu")
+    # From behind the camera to far in front of it, some places beside the source photos.
+    inverse = torch.linspace(-0.3, 0.5, 5)[:, None, None] + torch.from_numpy(0.05 * rng.random((5, 50, 70), np.float32))
+    twin = torch.stack([matcher._ncc(inverse, *source) for source in matcher.sources])
+    assert (twin == -0.5).any() and (twin > 0).any()
+    best = torch.cat([twin, torch.full_like(inverse, -0.5)[None].expand(2, -1, -1, -1)]).sort(0, descending=True)[0]
+    assert (matcher.score(inverse) - best[:2].mean(0)).abs().max() < 2e-4
 
 
 def test_depth_and_normals_of_a_slanted_plane(maps):

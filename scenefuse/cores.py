@@ -1,0 +1,22 @@
+"""CPU threads of a stage, for all libraries that have their own."""
+
+import contextlib
+from typing import Any
+
+import cv2
+import torch
+
+nb: Any = None
+with contextlib.suppress(ImportError):
+    import numba as nb
+
+    # PyTorch's threads wait busily for a while: Numba uses the same ones, or the two would take each other's cores.
+    nb.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+
+
+def use_threads(count: int) -> None:
+    """Let PyTorch, Numba and OpenCV use `count` threads each."""
+    cv2.setNumThreads(count)
+    if nb is not None:
+        nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
+    torch.set_num_threads(count)  # last, since Numba changes it when it starts

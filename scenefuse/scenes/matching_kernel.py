@@ -1,0 +1,135 @@
+"""CPU kernel in Numba for the matching of depth hypotheses; its PyTorch twin is `_Matcher._ncc` in plane_sweep.py.
+
+A band of rows is warped, summed over windows and compared row by row, so that everything but the photos stays in the
+cache. What a pixel gets does not depend on bands or threads.
+"""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+_BAND = 32
+_FLAT = np.float32(1.5e-5)
+_ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+_MATH = {"contract", "reassoc", "nsz"}
+
+
+@njit(fastmath=_MATH, error_model="numpy")
+def _place(inverse, directions, move, y, width, height, place, part_x, part_y, inside):
+    """Where one row lies in the source photo: its upper left pixel, the place between pixels, and whether it does."""
+    direction_x, direction_y, direction_z = directions[0, y], directions[1, y], directions[2, y]
+    half_x, half_y = np.float32(width) * _HALF, np.float32(height) * _HALF
+    last_x, last_y = np.float32(width - 1), np.float32(height - 1)
+    end_x, end_y = np.int32(width - 2), np.int32(height - 2)
+    for x in range(len(inverse)):
+        z = direction_z[x] + move[2] * inverse[x]
+        scale = _ONE / max(z, np.float32(1e-6))
+        u = (direction_x[x] + move[0] * inverse[x]) * scale
+        v = (direction_y[x] + move[1] * inverse[x]) * scale
+        inside[x] = _ONE if (z > np.float32(1e-6)) & (abs(u) < _ONE) & (abs(v) < _ONE) else _ZERO
+        px = min(max((u + _ONE) * half_x - _HALF, _ZERO), last_x)
+        py = min(max((v + _ONE) * half_y - _HALF, _ZERO), last_y)
+        # Whatever a depth that is not a number gives, it is a pixel of the photo.
+        x0 = np.int32(max(min(np.int32(px), end_x), np.int32(0)))
+        y0 = np.int32(max(min(np.int32(py), end_y), np.int32(0)))
+        part_x[x], part_y[x] = px - np.float32(x0), py - np.float32(y0)
+        place[x] = y0 * np.int32(width) + x0
+
+
+@njit(fastmath=_MATH, error_model="numpy")
+def _warp(flat, width, place, part_x, part_y, value):
+    """Bilinear samples of a photo, all its rows behind each other."""
+    for x in range(len(place)):
+        at = np.uint32(place[x])
+        below = np.uint32(at + width)
+        a, b = flat[at], flat[np.uint32(at + 1)]
+        c, d = flat[below], flat[np.uint32(below + 1)]
+        upper = a + part_x[x] * (b - a)
+        lower = c + part_x[x] * (d - c)
+        value[x] = upper + part_y[x] * (lower - upper)
+
+
+@njit(fastmath=_MATH)
+def _sums_along(value, reference, window, sums):
+    """Sums over `window` pixels of a row, its square and its product with the reference (3 w,); outside is zero."""
+    width, radius = len(value), window // 2
+    row = np.zeros(width + 2 * radius, np.float32)
+    inner = row[radius : radius + width]
+    for k in range(3):
+        for x in range(width):
+            inner[x] = value[x] * (_ONE if k == 0 else value[x] if k == 1 else reference[x])
+        out = sums[k * width : (k + 1) * width]
+        out[:] = row[:width]
+        for w in range(1, window):
+            shifted = row[w : w + width]
+            for x in range(width):
+                out[x] += shifted[x]
+
+
+@njit(fastmath=_MATH)
+def _sum_across(rows, out):
+    """Sum of the rows (n, w)."""
+    out[:] = rows[0]
+    for w in range(1, len(rows)):
+        row = rows[w]
+        for x in range(len(out)):
+            out[x] += row[x]
+
+
+@njit(fastmath=_MATH, error_model="numpy")
+def _correlate(sums, share, mean, variance, inside, score):
+    """Normalised cross-correlation of a row's windows from their sums (3 w,)."""
+    width = len(score)
+    first, second, both = sums[:width], sums[width : 2 * width], sums[2 * width :]
+    for x in range(width):
+        average = first[x] * share
+        spread = max(second[x] * share - average * average, _ZERO)
+        covariance = both[x] * share - average * mean[x]
+        ncc = covariance / math.sqrt((spread + _FLAT) * (variance[x] + _FLAT))
+        score[x] = ncc if inside[x] > _ZERO else -_HALF
+
+
+@njit
+def _insert(score, best):
+    """Keep the better of two rows of scores in `best`, the other in `score`."""
+    for x in range(len(score)):
+        better = max(best[x], score[x])
+        score[x] = min(best[x], score[x])
+        best[x] = better
+
+
+@njit(parallel=True, cache=True)
+def keep_best(inverse, reference, mean, variance, gray, directions, move, window, best):  # type: ignore[no-untyped-def]
+    """Match D hypotheses per pixel in one source photo, and keep the best scores seen so far.
+
+    All float32: inverse (D, h, w) inverse depths; reference (h, w) and the mean and variance of its windows; gray
+    (H, W) source photo; directions (3, h, w) and move (3,) give its places in -1..1; window: its side, odd; best
+    (K, D, h, w), sorted, the largest first: changed in place.
+    """
+    count, height, width = inverse.shape
+    radius = window // 2
+    share = _ONE / np.float32(window * window)
+    bands = (height + _BAND - 1) // _BAND
+    for job in prange(count * bands):
+        d, top = job // bands, job % bands * _BAND
+        flat, size_x, size_y = gray.ravel(), gray.shape[1], gray.shape[0]
+        place, inside = np.zeros(width, np.int32), np.zeros((window, width), np.float32)
+        part_x, part_y = np.zeros(width, np.float32), np.zeros(width, np.float32)
+        value, score = np.zeros(width, np.float32), np.zeros(width, np.float32)
+        # Sums along the last `window` rows, and over the whole windows.
+        sums, total = np.zeros((window, 3 * width), np.float32), np.zeros(3 * width, np.float32)
+        for y in range(top - radius, min(top + _BAND, height) + radius):
+            slot = (y + window) % window
+            if 0 <= y < height:
+                _place(inverse[d, y], directions, move, y, size_x, size_y, place, part_x, part_y, inside[slot])
+                _warp(flat, np.uint32(size_x), place, part_x, part_y, value)
+                _sums_along(value, reference[y], window, sums[slot])
+            else:
+                sums[slot] = _ZERO
+            middle = y - radius
+            if middle >= top:
+                _sum_across(sums, total)
+                _correlate(total, share, mean[middle], variance[middle], inside[middle % window], score)
+                for k in range(best.shape[0]):
+                    _insert(score, best[k, d, middle])
