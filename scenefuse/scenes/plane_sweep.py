@@ -197,15 +197,21 @@ class _Matcher:
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
         best = inverse.new_full((self.best, *inverse.shape), -0.5)
-        for gray, directions, move in self.sources:
-            if inverse.device.type == "cpu":
-                photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
-                keep_best(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
-                continue
-            candidate = self._ncc(inverse, gray, directions, move)
-            for k in range(self.best):
-                best[k], candidate = torch.maximum(best[k], candidate), torch.minimum(best[k], candidate)
+        keep = self._keep_best_on_cpu if inverse.device.type == "cpu" else self._keep_best
+        for source in self.sources:
+            keep(inverse, best, *source)
         return best.mean(0)
+
+    def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
+        """The same as `_keep_best`, by the CPU's kernel."""
+        photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
+        keep_best(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
+
+    def _keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
+        """Put the scores of one source among the best (K, D, h, w), the largest first."""
+        score = self._ncc(inverse, gray, directions, move)
+        for k in range(self.best):
+            best[k], score = torch.maximum(best[k], score), torch.minimum(best[k], score)
 
     def seen_by(self, inverse: Tensor) -> Tensor:
         """Source photos (h, w) in which a hypothesis per pixel (h, w) lies."""

@@ -1,4 +1,4 @@
-"""The NeRF's kernels and training steps, beside the same in plain PyTorch and nerfstudio's encoding.
+"""The kernels of NeRF and matching, and training steps, beside the same in plain PyTorch and nerfstudio's encoding.
 
 make bench-nerf, or: python tests/benchmarks/nerf.py --repeats 3 --device cuda
 """
@@ -10,6 +10,8 @@ import types
 from collections.abc import Callable
 from typing import Literal
 
+import cv2
+import numpy as np
 import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
@@ -21,6 +23,7 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import Prior, march
 from scenefuse.nerf.train import Schedule, keep_memory, new_model, train
+from scenefuse.scenes.plane_sweep import DepthSettings, Photo, _Matcher
 from scenefuse.settings import build, shipped_with
 from scenefuse.stage import run
 
@@ -45,6 +48,9 @@ def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Litera
         print("marching 2304 rays through 128^3 cells, 32 samples:")
         step = marching(2304, 128, 32)
         compare(medians(by_both(lambda: time_of(step)), repeats), "s")
+    if device == "cpu":
+        print("matching 16 depth hypotheses of 400 x 300 pixels in 8 photos, windows of 7:")
+        compare(medians({name: lambda step=step: time_of(step) for name, step in matching().items()}, repeats), "s")
     print("training, default field, 2304 rays a step:")
     compare(medians(by_both(lambda: training_seconds(steps, threads, device)), 3), "s a step")
 
@@ -73,6 +79,25 @@ def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
     origin, none = origin + 0.5, torch.zeros(rays)
     jitter, prior = torch.rand(rays, samples, generator=generator), Prior(none - 1, none, none)
     return lambda: march(origin, direction, occupancy, jitter, 0.25, prior)
+
+
+def matching() -> dict[str, Callable[[], None]]:
+    """A chunk of the plane sweep, by the kernel and in plain PyTorch."""
+    rng = np.random.default_rng(0)
+    grays = [cv2.GaussianBlur(rng.random((300, 400), np.float32), (0, 0), 2) for _ in range(9)]
+    poses = [np.column_stack([np.eye(3), [x, 0, 0]]) for x in (0, -4, -3, -2, -1, 1, 2, 3, 4)]
+    intrinsics = np.array([[350, 0, 200], [0, 350, 150], [0, 0, 1.0]])
+    photos = [Photo(gray, intrinsics, pose) for gray, pose in zip(grays, poses)]
+    settings = build(DepthSettings, shipped_with(None)["scene"]["depth_maps"])
+    matcher = _Matcher(photos[0], photos[1:], settings, "cpu")
+    inverse = torch.linspace(1 / 60, 1 / 20, 16)[:, None, None].expand(-1, 300, 400).contiguous()
+
+    def plain() -> None:
+        best = inverse.new_full((matcher.best, *inverse.shape), -0.5)
+        for source in matcher.sources:
+            matcher._keep_best(inverse, best, *source)
+
+    return {"scenefuse": lambda: matcher.score(inverse), "scenefuse in plain PyTorch": plain}
 
 
 def compare(seconds: dict[str, float], unit: str) -> None:
