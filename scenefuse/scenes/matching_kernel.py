@@ -1,4 +1,4 @@
-"""CPU kernel in Numba for the matching of depth hypotheses; its PyTorch twin is `_Matcher._keep_best` in plane_sweep.py.
+"""CPU kernel in Numba that matches depth hypotheses; its PyTorch twin is `_Matcher._keep_best` in plane_sweep.py.
 
 A band of rows is warped, summed over windows and compared row by row, so that everything but the photos stays in the
 cache. What a pixel gets does not depend on bands or threads.
