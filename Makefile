@@ -31,7 +31,7 @@ bench-registration: .venv/ready
 	pip install --quiet --disable-pip-version-check -r tests/benchmarks/requirements.txt
 	PYTHONPATH=tests OMP_NUM_THREADS=1 python tests/benchmarks/registration.py --jobs $(CORES)
 
-# Hash encoding and training steps, beside plain PyTorch and nerfstudio's encoding; a minute. Only that one module of
+# Hash encoding, marching, matching and training steps, beside plain PyTorch and nerfstudio's encoding; a minute. Only that one module of
 # nerfstudio is used, so what else it depends on is not installed.
 bench-nerf: .venv/ready
 	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7 rich==14.0.0 markdown-it-py==3.0.0 mdurl==0.1.2

@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from scenefuse.cores import use_threads
 from scenefuse.maps import write_depth
 from scenefuse.objects.depth_consistency import Agreement, agreement_between_views, align_to_points, residuals_at_points
 from scenefuse.objects.depth_crops import Crops, crop_to_object
@@ -150,8 +150,7 @@ def train_depth(
 
 def prepare_torch(seed: int) -> None:
     """Threads of this stage and a fixed seed."""
-    torch.set_num_threads(threads())
-    cv2.setNumThreads(threads())
+    use_threads(threads())
     torch.manual_seed(seed)
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 import torch
 
+from scenefuse.cores import use_threads
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.quality import psnr, ssim
@@ -52,7 +53,7 @@ def lego(
         seed: of all random choices.
         pictures: folder for renders beside photos, or none.
     """
-    torch.set_num_threads(threads)
+    use_threads(threads)
     torch.backends.cuda.matmul.fp32_precision = "tf32"
     settings = shipped_with(config)["object"]
     chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
