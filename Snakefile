@@ -19,10 +19,16 @@ resource_scopes:
 
 include: "workflow/rules/common.smk"
 include: "workflow/rules/demo.smk"
-include: "workflow/rules/scene.smk"
-include: "workflow/rules/object.smk"
-include: "workflow/rules/join.smk"
-include: "workflow/rules/summary.smk"
+include: "workflow/rules/sfm.smk"
+include: "workflow/rules/mvs.smk"
+include: "workflow/rules/masks.smk"
+include: "workflow/rules/poses.smk"
+include: "workflow/rules/depth.smk"
+include: "workflow/rules/nerf.smk"
+include: "workflow/rules/registration.smk"
+include: "workflow/rules/fusion.smk"
+include: "workflow/rules/metrics.smk"
+include: "workflow/rules/report.smk"
 
 
 rule all:

@@ -9,9 +9,9 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from scenefuse.clouds import Cloud
 from scenefuse.demo import objects
 from scenefuse.demo.meshes import Part, blob, box, grid, join, lathe, tube
+from scenefuse.io.clouds import Cloud
 from scenefuse.registration.free_space import DepthView, FreeSpace
 from scenefuse.transforms import Sim3, rotation_angle_deg
 

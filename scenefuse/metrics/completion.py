@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.clouds import Cloud, spacing
+from scenefuse.io.clouds import Cloud, spacing
 from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.stage import quantity, threads
 from scenefuse.transforms import Array
@@ -40,7 +40,7 @@ def completion_metrics(
         around: the scene's points that were kept around the object.
         scene: the scene's points on the object before completion: the incomplete cloud of NUE.
         added: P_new.
-        diagonal: of the full arm's crop.
+        diagonal: of the full variant's crop.
         unit: of the scene's lengths.
         settings: see CompletionSettings.
         seed: of samples and of the null cloud.

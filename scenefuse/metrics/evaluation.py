@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.clouds import read_cloud
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.maps import read_depth
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.maps import read_depth
 from scenefuse.metrics.truth import (
     CameraFit,
     Mesh,
@@ -28,7 +28,7 @@ from scenefuse.metrics.truth import (
     sample_surface,
     true_depth,
 )
-from scenefuse.scenes.geodesy import LocalFrame
+from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -156,8 +156,8 @@ def evaluate_object(
     masks: Path,
     stages: list[Path],
     cloud: Path,
-    arms: list[Path],
-    witness: Path | None,
+    variants: list[Path],
+    alignment: Path | None,
     before: Path | None,
     after: Path | None,
     scene_evaluation: Path,
@@ -173,16 +173,16 @@ def evaluate_object(
     Definitions. Every length is over the diagonal of the object's true bounding box. The surface to be found is what
     of the object's true surface any photo of its orbit sees (for the scene's scores: any photo of the orbit or of the
     flight). `scene_f_score_before` and `_after` compare clouds in the scene's frame; of a cloud, the points count that
-    lie in the object's true box, widened by 5 %, nearer to the object than to the terrain and the clutter. Each arm's
-    error is that of its scene_from_object against the one that follows from the true cameras on both sides.
+    lie in the object's true box, widened by 5 %, nearer to the object than to the terrain and the clutter. The error of
+    each variant is that of its scene_from_object against the one that follows from the true cameras on both sides.
 
     Args:
         cameras: the object's undistorted COLMAP workspace.
         masks: folder of masks of its photos.
         stages: folders that hold depth_maps/, in order; empty for none.
         cloud: the object's cloud in its own frame.
-        arms: fine.json of every arm, each in a folder named for the arm; `full` first gives the main results.
-        witness: JSON of the second witness, judged like an arm, or nothing.
+        variants: fine.json of every variant, in a folder named for it; `full` first gives the main results.
+        alignment: JSON of the alignment from shared features, judged like a variant, or nothing.
         before: scene cloud before fusion, scene frame; the whole scene or the object's surroundings.
         after: the same after fusion; absent when nothing was fused.
         scene_evaluation: what `evaluate_scene` wrote.
@@ -218,17 +218,17 @@ def evaluate_object(
     scene_diagonal = diagonal / truth_from_scene.scale
 
     def judged(path: Path) -> dict[str, Any]:
-        return _arm_results(
+        return _variant_results(
             read_json(path), true, middle_in_object, scene_diagonal, truth_from_scene, object_points, mesh,
             to_find, diagonal, samples, seed,
         )  # fmt: skip
 
-    arm_results = {path.parent.name: judged(path) for path in arms}
-    result |= next(iter(arm_results.values()), {})
-    if witness is not None:
-        result |= {f"witness_{name}": entry for name, entry in judged(witness).items() if name != "status"}
+    variant_results = {path.parent.name: judged(path) for path in variants}
+    result |= next(iter(variant_results.values()), {})
+    if alignment is not None:
+        result |= {f"witness_{name}": entry for name, entry in judged(alignment).items() if name != "status"}
     result |= _scene_results(before, after, truth_from_scene, mesh, known.rest, known.surface[by_any], diagonal)
-    result |= {"tau": quantity(0.01 * diagonal, "m"), "arms": arm_results}
+    result |= {"tau": quantity(0.01 * diagonal, "m"), "variants": variant_results}
     write_json(evaluation, result)
     _print(result)
 
@@ -322,7 +322,7 @@ def cloud_results(points: Array, known: ObjectTruth, samples: int, seed: int) ->
     return result
 
 
-def _arm_results(
+def _variant_results(
     fine: dict[str, Any],
     true: Sim3,
     middle_in_object: Array,
@@ -335,7 +335,7 @@ def _arm_results(
     samples: int,
     seed: int,
 ) -> dict[str, Any]:
-    """Errors of one arm's registration; empty values where it holds no transform."""
+    """Errors of one variant's registration; empty values where it holds no transform."""
     matrix = fine.get("scene_from_object", {}).get("value")
     result = {"status": quantity(fine.get("status", {}).get("value"), "")}
     if matrix is None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.clouds import Cloud, read_cloud, spacing
+from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.metrics.completion import CompletionSettings, completion_metrics, plane_normals
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Sim3
@@ -15,7 +15,7 @@ from scenefuse.transforms import Sim3
 
 @dataclass(frozen=True)
 class MetricSettings:
-    """Settings of all metrics. Shares are of the full arm's crop diagonal, the same for every arm."""
+    """Settings of all metrics. Shares are of the full variant's crop diagonal, the same for every variant."""
 
     tau_fraction: float
     """Distance within which points correspond."""
@@ -52,9 +52,9 @@ def compute_metrics(
 
     Args:
         object: object cloud (PLY) in its own frame.
-        crop: scene points on the object (PLY); the full arm's for every arm, so that arms can be compared.
-        reference: JSON of the full arm's crop stage: its diagonal sets all thresholds, and the unit of lengths.
-        fine: JSON of the fine registration of this arm.
+        crop: scene points on the object (PLY); the full variant's for every variant, so that variants can be compared.
+        reference: JSON of the full variant's crop stage: its diagonal sets all thresholds, and the unit of lengths.
+        fine: JSON of the fine registration of this variant.
         fused: the object's fused surroundings (PLY, with `source`); without it completion is left out.
         metrics: output JSON with `registration` and `completion`.
         seed: of samples and of the random clouds that give the null values.
@@ -100,7 +100,7 @@ def registration_metrics(
         scene: the scene's points on the object.
         scene_from_object: the pose.
         tau: inlier distance.
-        diagonal: of the full arm's crop.
+        diagonal: of the full variant's crop.
         unit: of the scene's lengths.
         settings: for the normals.
     """

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scenefuse.clouds import Cloud, read_cloud
+from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.registration.evidence import known_ups
 from scenefuse.registration.features import fpfh, match, ransac_similarities
 from scenefuse.registration.paper import paper_coarse

@@ -12,7 +12,7 @@ from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
 
 @dataclass(frozen=True)
-class Witness:
+class Alignment:
     """The similarity that photos of object and scene agree on, found without the clouds.
 
     Attributes:
@@ -46,12 +46,12 @@ class Evidence:
     Attributes:
         ups: unit up directions (3,) in the object's and in the scene's frame.
         free_space: what the scene's cameras saw through.
-        witness: the photos' similarity.
+        alignment: the photos' similarity.
     """
 
     ups: tuple[Array, Array] | None = None
     free_space: FreeSpace | None = None
-    witness: Witness | None = None
+    alignment: Alignment | None = None
 
 
 def known_ups(cameras: Path | None, crop_report: Path) -> tuple[Array, Array] | None:
@@ -64,14 +64,14 @@ def known_ups(cameras: Path | None, crop_report: Path) -> tuple[Array, Array] | 
     return a / np.linalg.norm(a), b / np.linalg.norm(b)
 
 
-def read_witness(path: Path | None) -> Witness | None:
-    """The witness of a witness stage's JSON, or None where it found none."""
+def read_alignment(path: Path | None) -> Alignment | None:
+    """The alignment of an alignment stage's JSON, or None where it found none."""
     if path is None:
         return None
     content = read_json(path)
     if not value(content, "found"):
         return None
-    return Witness(
+    return Alignment(
         Sim3.from_matrix(np.array(value(content, "scene_from_object"))),
         Uncertainty.even(*(value(content, name) for name in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))),
         value(content, "shared_points"),

@@ -7,16 +7,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scenefuse.clouds import Cloud, read_cloud
-from scenefuse.registration.audit import Gate, Verdict, judge, tilt_deg, turned_copies
+from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.registration.coarse import Hypothesis, keep_distinct, prepare_both
-from scenefuse.registration.evidence import Evidence, Witness, known_ups, read_witness
+from scenefuse.registration.evidence import Alignment, Evidence, known_ups, read_alignment
 from scenefuse.registration.free_space import read_free_space
 from scenefuse.registration.paper import paper_fine
 from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
 from scenefuse.registration.score import Score, score
 from scenefuse.registration.surface import Surface, probing, with_grid
+from scenefuse.registration.verify import Decision, Gate, decide, tilt_deg, turned_copies
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -58,8 +58,8 @@ class FineSettings:
     """Gate: smallest relative lead over the best pose that differs."""
     max_final_tilt_deg: float
     """Gate: largest angle in degrees between the up directions."""
-    use_witness: bool
-    """Whether the photos' similarity (the witness) is compared with the clouds' and overrules it."""
+    use_alignment: bool
+    """Whether the photos' similarity (the alignment) is compared with the clouds' and overrules it."""
     free_space_photos: int
     """Photos of the scene whose depth maps are asked what they saw through; 0 leaves the test out."""
     free_space_fraction: float
@@ -78,10 +78,10 @@ class FineSettings:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The refined hypotheses, best first, the verdict on the first, and its spread."""
+    """The refined hypotheses, best first, the decision on the first, and its spread."""
 
     ranked: list[Hypothesis]
-    verdict: Verdict
+    decision: Decision
     spread: Uncertainty | None
 
 
@@ -93,7 +93,7 @@ def register_finely(
     scale: Path,
     coarse: Path,
     cameras: Path | None = None,
-    witness: Path | None = None,
+    alignment: Path | None = None,
     workspace: Path | None = None,
     depth: list[Path] | None = None,
     fine: Path,
@@ -117,7 +117,7 @@ def register_finely(
         scale: JSON of the scale stage.
         coarse: JSON of the coarse stage.
         cameras: JSON with `up_in_camera_frame`, or nothing.
-        witness: JSON of the witness stage, or nothing.
+        alignment: JSON of the alignment stage, or nothing.
         workspace: undistorted COLMAP workspace of the scene, or nothing; with `depth` it gives the free space.
         depth: folders of the scene's depth maps.
         fine: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.
@@ -135,7 +135,7 @@ def register_finely(
     if recipe == "default" and workspace is not None and settings.free_space_photos > 0:
         tolerance = settings.free_space_fraction * scene.diagonal
         free_space = read_free_space(workspace, depth or [], scene.points, settings.free_space_photos, tolerance)
-    photos = read_witness(witness) if settings.use_witness else None
+    photos = read_alignment(alignment) if settings.use_alignment else None
     evidence = Evidence(known_ups(cameras, crop_report), free_space, photos)
     poses = [
         (Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"])
@@ -145,20 +145,20 @@ def register_finely(
         outcome = _paper(cloud, scene, poses[0][0], scales, voxel_fraction, settings, seed)
     else:
         outcome = refine_hypotheses(cloud, scene, poses, scales, evidence, settings, seed)
-    best, verdict = outcome.ranked[0], outcome.verdict
+    best, decision = outcome.ranked[0], outcome.decision
     seconds = time.perf_counter() - start
-    status = "registered" if verdict.registered else "unregistered"
-    print(f"{status}: {verdict.reason}", flush=True)
+    status = "registered" if decision.registered else "unregistered"
+    print(f"{status}: {decision.reason}", flush=True)
     if picture is not None:
         draw_alignment(picture, cloud, scene, best.pose, seed)
     length = read_json(crop_report)["diagonal"]["unit"]
     unit = "scene units per object unit"
-    rival = verdict.rival
+    rival = decision.rival
     write_json(
         fine,
         {
             "status": quantity(status, ""),
-            "reason": quantity(verdict.reason, ""),
+            "reason": quantity(decision.reason, ""),
             "scene_from_object": quantity(best.pose.matrix, ""),
             "scale": quantity(best.pose.scale, unit),
             "scale_over_prior": quantity(best.pose.scale / scales.centre, "1"),
@@ -167,13 +167,13 @@ def register_finely(
             "recall": quantity(best.score.recall, "1"),
             "color_agreement": quantity(best.score.color, "1"),
             "score": quantity(best.score.total, "1"),
-            "decided_by": quantity(verdict.decided_by, ""),
-            "margin": quantity(verdict.margin, "1"),
-            "free_axis": quantity(verdict.free_axis, ""),
+            "decided_by": quantity(decision.decided_by, ""),
+            "margin": quantity(decision.margin, "1"),
+            "free_axis": quantity(decision.free_axis, ""),
             "blocked": quantity(best.score.blocked, "1"),
             "tilt_deg": quantity(tilt_deg(best.pose, evidence.ups), "degrees"),
             **spread_quantities(outcome.spread, length),
-            "scale_ledger": quantity(scale_ledger(prior, evidence.witness, best, outcome.spread, verdict), ""),
+            "scale_ledger": quantity(scale_ledger(prior, evidence.alignment, best, outcome.spread, decision), ""),
             "tau": quantity(settings.score_fraction * scene.diagonal, length),
             "source": quantity(best.source, ""),
             "rival": quantity(None if rival is None else rival.as_json(), ""),
@@ -204,8 +204,8 @@ def refine_hypotheses(
     ranked, spread, decided_by = pair.with_photos(ranked)
     gate = Gate(**{field.name: getattr(settings, field.name) for field in fields(Gate)})
     looks = probing(pair.obj, LOOK_POINTS, seed)
-    verdict = judge(ranked, looks, pair.diagonal, pair.tau, gate, pair.scales, evidence.ups, spread, decided_by)
-    return Outcome(ranked, verdict, spread)
+    decision = decide(ranked, looks, pair.diagonal, pair.tau, gate, pair.scales, evidence.ups, spread, decided_by)
+    return Outcome(ranked, decision, spread)
 
 
 @dataclass(frozen=True)
@@ -214,8 +214,8 @@ class _Pair:
 
     Attributes:
         obj: the object's surface, thinned.
-        looking: object and scene with few probing points and distance grids, for the first refinement and ranking.
-        asking: the same with more points, for the polish and the final score.
+        searched: object and scene with few probing points and distance grids, for the first refinement and ranking.
+        scored: the same with more points, for the polish and the final score.
         coarser: both at twice the spacing, for the spread.
         diagonal: of the scene crop.
         scales: what the scale may be: the coarse search stays inside the prior, what it found at a bound may go on.
@@ -225,8 +225,8 @@ class _Pair:
     """
 
     obj: Surface
-    looking: tuple[Surface, Surface]
-    asking: tuple[Surface, Surface]
+    searched: tuple[Surface, Surface]
+    scored: tuple[Surface, Surface]
     coarser: tuple[Surface, Surface]
     diagonal: float
     scales: ScaleRange
@@ -248,14 +248,14 @@ class _Pair:
         diagonal, fraction = scene.diagonal, settings.fine_voxel_fraction
         obj, target = prepare_both(cloud, scene, scale, fraction, seed, MOST_POINTS)
         cell, reach = 2 * fraction * diagonal, 2 * settings.start_fraction * diagonal
-        looking = (
+        searched = (
             probing(with_grid(obj, cell / scale, reach / scale), LOOK_POINTS, seed),
             probing(with_grid(target, cell, reach), LOOK_POINTS, seed),
         )
-        asking = probing(obj, REFINE_POINTS, seed), probing(target, REFINE_POINTS, seed)
+        scored = probing(obj, REFINE_POINTS, seed), probing(target, REFINE_POINTS, seed)
         coarser = prepare_both(cloud, scene, scale, 2 * fraction, seed, MOST_POINTS)
         scales = scales.widened(BEYOND_PRIOR)
-        return _Pair(obj, looking, asking, coarser, diagonal, scales, evidence, settings, seed)
+        return _Pair(obj, searched, scored, coarser, diagonal, scales, evidence, settings, seed)
 
     @property
     def centre(self) -> Array:
@@ -289,14 +289,14 @@ class _Pair:
 
     def settle(self, pose: Sim3, source: str, first: float) -> Hypothesis:
         """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
-        pose = refine_points(*self.looking, pose, self.scales, (first, self.narrow), 25)
-        return Hypothesis(pose, source, self.rate(pose, self.looking))
+        pose = refine_points(*self.searched, pose, self.scales, (first, self.narrow), 25)
+        return Hypothesis(pose, source, self.rate(pose, self.searched))
 
     def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
         """The best of the leaders' turned copies, settled."""
         up = None if self.evidence.ups is None else self.evidence.ups[1]
         copies = [c for h in leaders for c in turned_copies(h.pose, self.obj, up, self.settings.turn_steps)]
-        rated = [Hypothesis(c, "turned", self.rate(c, self.looking)) for c in copies]
+        rated = [Hypothesis(c, "turned", self.rate(c, self.searched)) for c in copies]
         # A copy counts only as the best of its surroundings: those near a leader would only slide back to it.
         best = [h for h in self.in_order(leaders + rated, angle_deg=25) if h.source == "turned"]
         return [self.settle(h.pose, "turned", 0.7 * self.wide) for h in best[:6]]
@@ -304,8 +304,8 @@ class _Pair:
     def polish(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis after the last refinement, by planes and colours."""
         color_weight = self.settings.color_weight
-        planes = refine_planes(*self.asking, h.pose, self.scales, self.narrow, ROUNDS, color_weight)
-        polished, before = (Hypothesis(p, h.source, self.rate(p, self.asking)) for p in (planes, h.pose))
+        planes = refine_planes(*self.scored, h.pose, self.scales, self.narrow, ROUNDS, color_weight)
+        polished, before = (Hypothesis(p, h.source, self.rate(p, self.scored)) for p in (planes, h.pose))
         # The score is too coarse to choose between two poses in one valley; it only tells that a polish went astray.
         return polished if polished.score.total > ASTRAY * before.score.total else before
 
@@ -313,11 +313,11 @@ class _Pair:
         """The hypothesis with the object grown about its centre."""
         fixed = h.pose.apply(self.centre)
         grown = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
-        return Hypothesis(grown, h.source, self.rate(grown, self.asking))
+        return Hypothesis(grown, h.source, self.rate(grown, self.scored))
 
     def spread(self, h: Hypothesis) -> Uncertainty | None:
         """How far the pose moves when halves of the surface are left out."""
-        both, settings = [self.asking, self.coarser], self.settings
+        both, settings = [self.scored, self.coarser], self.settings
         color_weight, resamplings = settings.color_weight, settings.resamplings
         return uncertainty(both, h.pose, self.scales, self.narrow, color_weight, resamplings, self.seed)
 
@@ -329,18 +329,18 @@ class _Pair:
         Where clouds and photos are in one valley, the surer of them has the last word, and clouds cannot leave it. The
         worse the clouds lie on each other at the photos' pose, the surer the photos must be.
         """
-        witness = self.evidence.witness
-        if witness is None:
+        alignment = self.evidence.alignment
+        if alignment is None:
             return ranked, self.spread(ranked[0]), "geometry"
-        agree = witness.agrees(ranked[0].pose, self.centre, self.diagonal)
+        agree = alignment.agrees(ranked[0].pose, self.centre, self.diagonal)
         if not agree:
-            ranked = [self.polish(self.settle(witness.pose, "photos", self.narrow)), *ranked]
+            ranked = [self.polish(self.settle(alignment.pose, "photos", self.narrow)), *ranked]
         spread = self.spread(ranked[0])
-        strays = not witness.agrees(ranked[0].pose, self.centre, self.diagonal)
-        by_photos = Hypothesis(witness.pose, "photos", self.rate(witness.pose, self.asking))
+        strays = not alignment.agrees(ranked[0].pose, self.centre, self.diagonal)
+        by_photos = Hypothesis(alignment.pose, "photos", self.rate(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
-        if strays or spread is None or witness.spread.size(self.diagonal) < worth * spread.size(self.diagonal):
-            ranked, spread = [by_photos, *ranked], witness.spread
+        if strays or spread is None or alignment.spread.size(self.diagonal) < worth * spread.size(self.diagonal):
+            ranked, spread = [by_photos, *ranked], alignment.spread
         return ranked, spread, "both" if agree else "photos"
 
 
@@ -355,7 +355,7 @@ def spread_quantities(spread: Uncertainty | None, unit: str) -> dict[str, Any]:
 
 
 def scale_ledger(
-    prior: dict[str, Any], witness: Witness | None, best: Hypothesis, spread: Uncertainty | None, verdict: Verdict
+    prior: dict[str, Any], alignment: Alignment | None, best: Hypothesis, spread: Uncertainty | None, decision: Decision
 ) -> list[dict[str, Any]]:
     """Every estimate of the scale with its spread (log), what it was used for, which one won and why.
 
@@ -366,14 +366,16 @@ def scale_ledger(
         for e in value(prior, "ledger")
     ]
     agree = {"both": ", and the clouds agree", "photos": "; the clouds' best fit is another pose"}
-    why = "the clouds' best fit inside the prior" + {"both": ", and the photos agree"}.get(verdict.decided_by, "")
-    by_photos = witness is not None and best.pose is witness.pose
-    if witness is not None:
-        use = f"won: surer than the clouds{agree[verdict.decided_by]}" if by_photos else "confirms"
-        sd = witness.spread.scale_sd_log
-        rows.append({"name": "shared points", "scale": witness.pose.scale, "sd_log": sd, "use": use})
-        if witness.scale_from_centres is not None:
-            rows.append({"name": "camera centres", "scale": witness.scale_from_centres, "sd_log": None, "use": "none"})
+    why = "the clouds' best fit inside the prior" + {"both": ", and the photos agree"}.get(decision.decided_by, "")
+    by_photos = alignment is not None and best.pose is alignment.pose
+    if alignment is not None:
+        use = f"won: surer than the clouds{agree[decision.decided_by]}" if by_photos else "confirms"
+        sd = alignment.spread.scale_sd_log
+        rows.append({"name": "shared points", "scale": alignment.pose.scale, "sd_log": sd, "use": use})
+        if alignment.scale_from_centres is not None:
+            rows.append(
+                {"name": "camera centres", "scale": alignment.scale_from_centres, "sd_log": None, "use": "none"}
+            )
     if not by_photos:
         own = None if spread is None else spread.scale_sd_log
         rows.append({"name": "clouds", "scale": best.pose.scale, "sd_log": own, "use": f"won: {why}"})
@@ -393,5 +395,5 @@ def _paper(
     pose = paper_fine(cloud, scene, start, voxel_fraction)
     obj, target = prepare_both(cloud, scene, scales.centre, settings.fine_voxel_fraction, seed, MOST_POINTS)
     rated = score(obj, target, pose, settings.score_fraction * scene.diagonal, settings.recall_weight, scales.centre)
-    verdict = Verdict(True, "the paper's recipe has no gate", "geometry", 0.0, None, None)
-    return Outcome([Hypothesis(pose, "fpfh", rated)], verdict, None)
+    decision = Decision(True, "the paper's recipe has no gate", "geometry", 0.0, None, None)
+    return Outcome([Hypothesis(pose, "fpfh", rated)], decision, None)

@@ -8,7 +8,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
-from scenefuse.maps import read_depth
+from scenefuse.io.maps import read_depth
 from scenefuse.transforms import Array
 
 

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 
 import numpy as np
 
-from scenefuse.clouds import Cloud
+from scenefuse.io.clouds import Cloud
 from scenefuse.transforms import Sim3
 
 

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.clouds import Cloud
+from scenefuse.io.clouds import Cloud
 from scenefuse.stage import atomic_file
 from scenefuse.transforms import Array, Sim3
 

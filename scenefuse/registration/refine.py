@@ -266,14 +266,16 @@ def _two_way_weights(pairs: Pairs, tau: float) -> Array:
     return 0.5 * weights * share
 
 
-def _weighted(arm: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Rows direction . (rotation x arm + translation + growth arm) + residual, and their Huber weights.
+def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Rows direction . (rotation x lever + translation + growth lever) + residual, and their Huber weights.
 
     Residuals are divided by their robust spread, so that kinds of rows can be added.
     """
     spread = 1.4826 * np.median(np.abs(residual - np.median(residual))) + 1e-12
     weight = weight * np.minimum(1, 2 * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
-    jacobian = np.concatenate([np.cross(arm, direction), direction, (arm * direction).sum(1, keepdims=True)], axis=1)
+    jacobian = np.concatenate(
+        [np.cross(lever, direction), direction, (lever * direction).sum(1, keepdims=True)], axis=1
+    )
     return jacobian, residual, weight
 
 

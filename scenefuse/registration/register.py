@@ -1,4 +1,4 @@
-"""Registration on its own: two clouds in, a verdict, a transform and a picture out; the workflow's steps in memory."""
+"""Registration on its own: two clouds in, a decision, a transform and a picture out; the workflow's steps in memory."""
 
 import time
 from collections.abc import Mapping
@@ -8,19 +8,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.fiducials import ScenePoints, read_points
-from scenefuse.formats import las_crs
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.io.formats import las_crs
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
-from scenefuse.registration.audit import tilt_deg
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop import CropSettings, crop_marked
+from scenefuse.registration.crop.crop_scene import CropSettings, crop_marked
 from scenefuse.registration.evidence import Evidence
 from scenefuse.registration.fine import FineSettings, Outcome, refine_hypotheses, spread_quantities
 from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.refine import ScaleRange
 from scenefuse.registration.scale import estimates, prior
-from scenefuse.settings import build, shipped_with
+from scenefuse.registration.verify import tilt_deg
+from scenefuse.sfm.fiducials import ScenePoints, read_points
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -37,7 +37,7 @@ class Registration:
         registered: whether the pose may be used.
         reason: one sentence why, or why not.
         scene_from_object: the best pose found, between the clouds' own coordinates; None where nothing gave a pose.
-        outcome: refined hypotheses and verdict, relative to `origins`; None where nothing gave a pose.
+        outcome: refined hypotheses and decision, relative to `origins`; None where nothing gave a pose.
         origins: the (3,) points subtracted from the object's and the scene's coordinates.
         scales: the scale prior.
         agreement: fitness, RMSE and normals at the best pose; see `registration_metrics`.
@@ -66,7 +66,7 @@ def register_clouds(
     Args:
         obj: the object, any frame and unit.
         scene: the scene's points around it (see `cut_scene`), any frame and unit; far origins lose no precision.
-        settings: all settings, as `scenefuse.settings.shipped_with` returns them.
+        settings: all settings, as `scenefuse.io.settings.shipped_with` returns them.
         seed: of all random choices.
         ups: up directions in the object's and in the scene's frame; None where one of them is not known.
         scales: scene units per object unit; None to estimate them from both extents.
@@ -98,7 +98,9 @@ def register_clouds(
     tau = measures.tau_fraction * near_scene.diagonal
     agreement = registration_metrics(near_obj, near_scene, pose, tau, near_scene.diagonal, "scene units", measures)
     whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
-    return Registration(outcome.verdict.registered, outcome.verdict.reason, whole, outcome, origins, scales, agreement)
+    return Registration(
+        outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement
+    )
 
 
 def cut_scene(
@@ -140,7 +142,7 @@ def cut_scene(
     return scene[cut.keep], f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}"
 
 
-def register_files(
+def register(
     *,
     object: Path,
     scene: Path,
@@ -224,7 +226,7 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
     }
     pose, outcome = found.scene_from_object, found.outcome
     if pose is not None and outcome is not None:
-        best, verdict = outcome.ranked[0], outcome.verdict
+        best, decision = outcome.ranked[0], outcome.decision
         unit = "scene units per object unit"
         content |= {
             "scene_from_object": quantity(pose.matrix, ""),
@@ -235,8 +237,8 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
             "recall": quantity(best.score.recall, "1"),
             "color_agreement": quantity(best.score.color, "1"),
             "score": quantity(best.score.total, "1"),
-            "margin": quantity(verdict.margin, "1"),
-            "free_axis": quantity(verdict.free_axis, ""),
+            "margin": quantity(decision.margin, "1"),
+            "free_axis": quantity(decision.free_axis, ""),
             **spread_quantities(outcome.spread, "scene units"),
             "tilt_deg": quantity(tilt_deg(best.pose, ups), "degrees"),
             "gravity_used": quantity(ups is not None, ""),
@@ -246,7 +248,7 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
 
 
 def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None) -> list[str]:
-    """The verdict in four lines."""
+    """The decision in four lines."""
     lines = [f"{'registered' if found.registered else 'unregistered'}: {found.reason}"]
     low, high = found.scales.clamp(0.0), found.scales.clamp(np.inf)
     held = f"held at {low:.6g}" if found.scales.width == 0 else f"searched from {low:.4g} to {high:.4g}"

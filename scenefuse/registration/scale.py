@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from scenefuse.clouds import Cloud, read_cloud, voxel_downsample
+from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample
 from scenefuse.registration.evidence import known_ups
 from scenefuse.registration.refine import ScaleRange
 from scenefuse.stage import quantity, write_json

@@ -58,8 +58,8 @@ def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> P
     The object's own search serves at every pose: a similarity keeps the order of distances.
     """
     s = scene_from_object.scale
-    asking, questioning = obj.points[obj.probe], scene.points[scene.probe]
-    ahead, there = scene.nearest(scene_from_object.apply(asking), tau)
+    scored, questioning = obj.points[obj.probe], scene.points[scene.probe]
+    ahead, there = scene.nearest(scene_from_object.apply(scored), tau)
     back, here = obj.nearest(scene_from_object.inverse().apply(questioning), tau / s)
     found, met = np.isfinite(ahead), np.isfinite(back)
     return Pairs(

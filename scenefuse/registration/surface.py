@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from scenefuse.clouds import Cloud, voxel_average
+from scenefuse.io.clouds import Cloud, voxel_average
 from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3
 

@@ -1,4 +1,4 @@
-"""The paper's Table 4 on the demo: every registration arm over several seeds, at the full arm's thresholds.
+"""The paper's Table 4 on the demo: every registration variant over several seeds, at the full variant's thresholds.
 
 make demo, then make bench-ablation; or python tests/benchmarks/ablation.py --results results --seeds 3
 """
@@ -10,29 +10,29 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from scenefuse.clouds import Cloud, read_cloud
 from scenefuse.demo.cameras import read_cameras
+from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.settings import build, merge, shipped_with
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
 from scenefuse.registration.fine import FineSettings, register_finely
-from scenefuse.settings import build, merge, shipped_with
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
 
 OBJECTS = ("house", "balloon", "sculpture")
 
 
-def one(results: Path, name: str, arm: str, seed: int, settings: dict[str, Any], true: Sim3) -> dict[str, Any]:
+def one(results: Path, name: str, variant: str, seed: int, settings: dict[str, Any], true: Sim3) -> dict[str, Any]:
     """Register one object again with another seed, from the workflow's crop and scale, and measure it."""
     folder, scene = results / "objects" / name, results / "scenes/demo"
-    own = merge(settings["registration"], settings["arms"][arm])
+    own = merge(settings["registration"], settings["variants"][variant])
     files = {
         "object": folder / "object.ply",
-        "crop": folder / f"registration/{arm}/crop.ply",
-        "crop_report": folder / f"registration/{arm}/crop.json",
-        "scale": folder / f"registration/{arm}/scale.json",
-        "cameras": folder / "cameras.json",
+        "crop": folder / f"registration/{variant}/crop.ply",
+        "crop_report": folder / f"registration/{variant}/crop.json",
+        "scale": folder / f"registration/{variant}/scale.json",
+        "cameras": folder / "undistorted.json",
     }
     with tempfile.TemporaryDirectory() as temporary:
         coarse, fine = Path(temporary) / "coarse.json", Path(temporary) / "fine.json"
@@ -41,7 +41,7 @@ def one(results: Path, name: str, arm: str, seed: int, settings: dict[str, Any],
             settings=build(CoarseSettings, own["coarse"]),
         )  # fmt: skip
         register_finely(
-            **files, coarse=coarse, witness=folder / "witness.json", workspace=scene / "dense",
+            **files, coarse=coarse, alignment=folder / "alignment.json", workspace=scene / "undistorted",
             depth=sorted(p for p in (scene / "depth").iterdir() if p.is_dir()), fine=fine,
             recipe=own["fine"]["recipe"], voxel_fraction=own["fine"]["voxel_fraction"], seed=seed,
             settings=build(FineSettings, own["fine"]),
@@ -56,7 +56,7 @@ def one(results: Path, name: str, arm: str, seed: int, settings: dict[str, Any],
     rmse = value(measured, "inlier_rmse")
     return {
         "object": name,
-        "arm": arm,
+        "variant": variant,
         "seed": seed,
         "registered": value(found, "status") == "registered",
         "fitness": value(measured, "fitness_target"),
@@ -75,7 +75,7 @@ def _size(obj: Cloud, true: Sim3) -> tuple[np.ndarray, float]:
 
 
 def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
-    """Print mean and spread of every arm over seeds; all trials go to bench/ablation.tsv in the results.
+    """Print mean and spread of every variant over seeds; all trials go to bench/ablation.tsv in the results.
 
     Args:
         results: folder of a finished demo.
@@ -87,17 +87,23 @@ def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
     scene = fit_cameras(read_posed(results / "scenes/demo/georeferenced", scene_cameras), scene_cameras)
     for name in OBJECTS:
         cameras = read_cameras(truth / name / "cameras.json")
-        orbit = fit_cameras(read_posed(results / f"objects/{name}/cameras/sparse", cameras), cameras)
+        orbit = fit_cameras(read_posed(results / f"objects/{name}/undistorted/sparse", cameras), cameras)
         true = scene.truth_from_model.inverse() @ orbit.truth_from_model
-        rows += [one(results, name, arm, seed, settings, true) for arm in settings["arms"] for seed in range(seeds)]
+        rows += [
+            one(results, name, variant, seed, settings, true)
+            for variant in settings["variants"]
+            for seed in range(seeds)
+        ]
     table = pd.DataFrame(rows)
     out = results / "bench/ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.5g")
     columns = ["registered", "fitness", "rmse_pct", "normals", "scale_pct", "rotation_deg", "shift_pct"]
-    groups = table.groupby(["object", "arm"], sort=False)[columns]
+    groups = table.groupby(["object", "variant"], sort=False)[columns]
     means, spreads = groups.mean(), groups.std()
-    print(f"{'object':10s} {'arm':11s}" + "".join(f"{c:>18s}" for c in columns) + f"   (mean ± sd over {seeds} seeds)")
+    print(
+        f"{'object':10s} {'variant':11s}" + "".join(f"{c:>18s}" for c in columns) + f"   (mean ± sd over {seeds} seeds)"
+    )
     for key in means.index:
         cells = "".join(f"{means.loc[key, c]:10.3g} ± {spreads.loc[key, c]:5.2g}" for c in columns[1:])
         print(f"{key[0]:10s} {key[1]:11s}{means.loc[key, 'registered']:18.2f}{cells}")

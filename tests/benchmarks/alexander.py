@@ -10,14 +10,14 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from scenefuse.clouds import read_cloud
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.settings import ROOT, build, shipped_with
+from scenefuse.masks.make_masks import MaskSettings, make_masks, read_frames
+from scenefuse.masks.supplied import supplied_masks
 from scenefuse.metrics.truth import mask_iou
-from scenefuse.objects.masks import MaskSettings, make_masks, read_frames
-from scenefuse.objects.supplied import supplied_masks
-from scenefuse.settings import ROOT, build, shipped_with
+from scenefuse.report.object_sheet import inner, upright
+from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.stage import read_json, run, value
-from scenefuse.viz.object_sheet import inner, upright
-from scenefuse.viz.render import orbit_camera, point_radii, render
 
 EXAMPLE = ROOT / "config/examples/alexander"
 WRONG = {"DSC05138.JPG"}
@@ -35,12 +35,12 @@ def alexander(*, results: Path, given: Path) -> None:
         given: folder of supplied masks.
     """
     folder, shipped = results / "objects/alexander", shipped_with(EXAMPLE / "config.yaml")
-    frames, _ = read_frames(folder / "cameras")
-    supplied = supplied_masks(given, folder / "sfm", frames)
+    frames, _ = read_frames(folder / "undistorted")
+    supplied = supplied_masks(given, folder / "sparse", frames)
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         make_masks(
-            cameras=folder / "cameras", cameras_json=folder / "cameras.json", sfm=folder / "sfm",
+            cameras=folder / "undistorted", cameras_json=folder / "undistorted.json", sfm=folder / "sparse",
             photos=folder / "photos.json", method="grabcut", prompts=EXAMPLE / "prompts.tsv", supplied=None,
             sam2_encoder=Path(), sam2_decoder=Path(), sam2_checkpoint=None, keep="object",
             settings=build(MaskSettings, shipped["object"]["masks"]),
@@ -71,8 +71,8 @@ def alexander(*, results: Path, given: Path) -> None:
             f"{value(report, 'photos_measured')} photos"
         )
     report = read_json(folder / "object.json")
-    print(f"cloud: {value(report, 'points')} points; photos deny {value(report, 'denied_share'):.1%} of the depths")
-    cloud = upright(read_cloud(folder / "object.ply"), folder / "cameras")
+    print(f"cloud: {value(report, 'points')} points; {value(report, 'inconsistent_share'):.1%} of depths inconsistent")
+    cloud = upright(read_cloud(folder / "object.ply"), folder / "undistorted")
     framed, radii = inner(cloud.points), point_radii(cloud.points)
     sides = [render(cloud, orbit_camera(framed, a, 10, (420, 420)), radii) for a in (220, 310, 130, 40)]
     cv2.imwrite(str(results / "bench/alexander.png"), np.hstack(sides)[..., ::-1])

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefuse.clouds import read_cloud
 from scenefuse.demo.cameras import Cameras
+from scenefuse.io.clouds import read_cloud
 from scenefuse.metrics.truth import CameraFit, fit_cameras, read_posed, registration_error
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
@@ -36,7 +36,7 @@ def line(name: str, fit: CameraFit) -> str:
 
 
 def castle_fountain(*, results: Path, truth: Path) -> None:
-    """Print errors of the cameras, and of every arm's similarity, against the truth.
+    """Print errors of the cameras, and of every variant's similarity, against the truth.
 
     Args:
         results: the results folder of the workflow.
@@ -60,10 +60,10 @@ def castle_fountain(*, results: Path, truth: Path) -> None:
             print(f"{path.parent.name}: {value(fine, 'status')} ({value(fine, 'reason')})")
             continue
         error = registration_error(Sim3.from_matrix(np.array(matrix)), scene_from_object, points.mean(0), diagonal)
-        verdict = f"{path.parent.name}: {value(fine, 'status')} ({value(fine, 'reason')})"
+        decision = f"{path.parent.name}: {value(fine, 'status')} ({value(fine, 'reason')})"
         shift = 100 * error.translation_over_diagonal
         print(
-            f"{verdict}; scale {error.scale_pct:.2f} %, rotation {error.rotation_deg:.2f} degrees, shift {shift:.2f} %"
+            f"{decision}; scale {error.scale_pct:.2f} %, rotation {error.rotation_deg:.2f} degrees, shift {shift:.2f} %"
         )
 
 

@@ -20,35 +20,35 @@ import pycolmap
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
+from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
+from scenefuse.depth.train_depth import DepthSettings, train_depth
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.metrics.truth import read_mesh, sample_surface
+from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.train import Schedule
-from scenefuse.objects.cloud import CloudSettings, object_cloud
-from scenefuse.objects.depth import DepthSettings, train_depth
-from scenefuse.objects.feedback import FeedbackSettings, refine_depth
-from scenefuse.objects.photo_refinement import RefinementSettings
-from scenefuse.objects.train_nerf import NerfSettings, train_nerf
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
+from scenefuse.nerf.training import Schedule
 from scenefuse.stage import quantity, run, write_json
 
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
-    ("scenefuse.objects.depth", "load_views"): "loading",
-    ("scenefuse.objects.depth", "network_inputs"): "plane sweep",
-    ("scenefuse.objects.depth", "train_networks"): "training",
-    ("scenefuse.objects.feedback", "load_views"): "loading",
-    ("scenefuse.objects.feedback", "network_inputs"): "plane sweep",
-    ("scenefuse.objects.feedback", "train_networks"): "training",
-    ("scenefuse.objects.train_nerf", "load_views"): "loading",
-    ("scenefuse.objects.train_nerf", "make_photos"): "loading",
-    ("scenefuse.objects.train_nerf", "_volume"): "visual hull",
-    ("scenefuse.objects.train_nerf", "train"): "training",
-    ("scenefuse.objects.train_nerf", "_render_all"): "rendering",
-    ("scenefuse.objects.train_nerf", "_confidence"): "confidence",
-    ("scenefuse.objects.cloud", "load_views"): "loading",
-    ("scenefuse.objects.cloud", "_maps"): "loading",
-    ("scenefuse.objects.cloud", "fuse_depths"): "fusion",
+    ("scenefuse.depth.train_depth", "load_views"): "loading",
+    ("scenefuse.depth.train_depth", "network_inputs"): "plane sweep",
+    ("scenefuse.depth.train_depth", "train_networks"): "training",
+    ("scenefuse.depth.refine_depth", "load_views"): "loading",
+    ("scenefuse.depth.refine_depth", "network_inputs"): "plane sweep",
+    ("scenefuse.depth.refine_depth", "train_networks"): "training",
+    ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
+    ("scenefuse.nerf.train_object_nerf", "make_photos"): "loading",
+    ("scenefuse.nerf.train_object_nerf", "_volume"): "visual hull",
+    ("scenefuse.nerf.train_object_nerf", "train"): "training",
+    ("scenefuse.nerf.train_object_nerf", "_render_all"): "rendering",
+    ("scenefuse.nerf.train_object_nerf", "_confidence"): "confidence",
+    ("scenefuse.nerf.object_cloud", "load_views"): "loading",
+    ("scenefuse.nerf.object_cloud", "_maps"): "loading",
+    ("scenefuse.nerf.object_cloud", "fuse_depths"): "fusion",
 }
 
 
@@ -56,7 +56,7 @@ def workspace(photos: Path, truth: Path, chosen: list[int], folder: Path, seed: 
     """An undistorted workspace, its report and masks from the capture's true cameras: only the cost is measured."""
     cameras = read_cameras(truth / "cameras.json")
     for name in ("images", "sparse"):
-        (folder / "cameras" / name).mkdir(parents=True)
+        (folder / "undistorted" / name).mkdir(parents=True)
     (folder / "masks").mkdir()
     model, k = pycolmap.Reconstruction(), cameras.intrinsics
     pinhole = [k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
@@ -87,7 +87,7 @@ def workspace(photos: Path, truth: Path, chosen: list[int], folder: Path, seed: 
         if len(track) > 1:
             model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
     model.write_binary(folder / "cameras/sparse")
-    write_json(folder / "cameras.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
+    write_json(folder / "undistorted.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
 
 
 def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str, float]:
@@ -96,12 +96,12 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     for (module, function), label in PARTS.items():
         home = importlib.import_module(module)
         setattr(home, function, timed(getattr(home, function), label, spent))
-    inputs: dict[str, Any] = {"cameras": folder / "cameras", "masks": folder / "masks"}
+    inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": folder / "masks"}
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
 
     def nerf(number: int, prior: int, previous: Path | None) -> None:
         settings = own["nerf"] | own["matching"] | own[f"stage{number}"]
-        train_nerf(
+        train_object_nerf(
             **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
             report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
             schedule=build(Schedule, settings), losses=build(LossWeights, settings),
@@ -124,9 +124,9 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     elif part == "stage4":
         nerf(4, 3, folder / "stage2")
     else:
-        object_cloud(
+        make_object_cloud(
             **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
-            cameras_report=folder / "cameras.json", cloud=folder / "object.ply", report=folder / "object.json",
+            cameras_report=folder / "undistorted.json", cloud=folder / "object.ply", report=folder / "object.json",
             refinement=build(RefinementSettings, own["cloud"] | own["matching"]),
             settings=build(CloudSettings, own["cloud"]),
         )  # fmt: skip

@@ -13,17 +13,17 @@ import numpy as np
 import torch
 
 from scenefuse.cores import use_threads
+from scenefuse.io.settings import build, shipped_with
+from scenefuse.mvs.views import load_views
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.quality import psnr, ssim
 from scenefuse.nerf.rays import Photos
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.train import Model, Schedule, new_model, train
-from scenefuse.objects.import_photos import import_photos
-from scenefuse.objects.train_nerf import NerfSettings, _volume, make_photos
-from scenefuse.objects.views import load_views
-from scenefuse.scenes.undistort import UndistortSettings
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.train_object_nerf import NerfSettings, _volume, make_photos
+from scenefuse.nerf.training import Model, Schedule, new_model, train
+from scenefuse.sfm.import_photos import import_photos
+from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import run
 
 GOALS_DB = (25, 28, 30, 32)

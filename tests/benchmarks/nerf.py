@@ -16,15 +16,15 @@ import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
 from scenefuse.cores import use_threads
+from scenefuse.io.settings import build, shipped_with
+from scenefuse.mvs.plane_sweep import DepthSettings, Photo, _Matcher
 from scenefuse.nerf import encoding, kernels
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import Prior, march
-from scenefuse.nerf.train import Schedule, keep_memory, new_model, train
-from scenefuse.scenes.plane_sweep import DepthSettings, Photo, _Matcher
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.training import Schedule, keep_memory, new_model, train
 from scenefuse.stage import run
 
 LEVELS, LOG2_TABLE, COARSEST, FINEST, SAMPLES = 16, 19, 16, 1024, 32768

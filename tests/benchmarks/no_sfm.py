@@ -15,18 +15,18 @@ import cv2
 import numpy as np
 import pycolmap
 
-from scenefuse.clouds import read_cloud
+from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
+from scenefuse.depth.train_depth import DepthSettings, train_depth
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.metrics.evaluation import cloud_results, read_object_truth
+from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.train import Schedule
-from scenefuse.objects.cloud import CloudSettings, object_cloud
-from scenefuse.objects.depth import DepthSettings, train_depth
-from scenefuse.objects.feedback import FeedbackSettings, refine_depth
-from scenefuse.objects.photo_refinement import RefinementSettings
-from scenefuse.objects.poses import PoseSettings, find_poses
-from scenefuse.objects.train_nerf import NerfSettings, train_nerf
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
+from scenefuse.nerf.training import Schedule
+from scenefuse.poses.find_poses import PoseSettings, find_poses
 from scenefuse.stage import quantity, run, value, write_json
 
 
@@ -53,7 +53,7 @@ def workspace(frames: Path, masks: Path, folder: Path) -> None:
 def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, seed: int) -> None:
     """All stages from a workspace to the cloud, as the workflow runs them."""
     find_poses(
-        cameras=folder / "cameras", posed=folder / "poses", report=folder / "poses.json",
+        cameras=folder / "undistorted", posed=folder / "poses", report=folder / "poses.json",
         settings=build(PoseSettings, settings["poses"]), seed=seed,
     )  # fmt: skip
     inputs: dict[str, Any] = {"cameras": folder / "poses", "masks": folder / "masks"}
@@ -64,7 +64,7 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
         own = settings["nerf"] | settings["matching"] | settings[name]
-        train_nerf(
+        train_object_nerf(
             **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
             field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
             refinement=build(RefinementSettings, own), settings=build(NerfSettings, own),
@@ -78,7 +78,7 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
     own = settings["cloud"] | settings["matching"]
-    object_cloud(
+    make_object_cloud(
         **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
         cloud=folder / "object.ply", report=folder / "object.json",
         refinement=build(RefinementSettings, own), settings=build(CloudSettings, own), seed=seed,

@@ -14,26 +14,26 @@ import numpy as np
 import pandas as pd
 import torch
 
-from scenefuse.clouds import read_cloud
+from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
+from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.mvs.views import load_views
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
 from scenefuse.nerf.quality import psnr
-from scenefuse.nerf.train import Schedule
-from scenefuse.objects.cloud import CloudSettings, object_cloud
-from scenefuse.objects.feedback import FeedbackSettings, refine_depth
-from scenefuse.objects.photo_refinement import RefinementSettings
-from scenefuse.objects.train_nerf import NerfSettings, train_nerf
-from scenefuse.objects.views import load_views
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
+from scenefuse.nerf.training import Schedule
 from scenefuse.stage import StageError, run, value
 
 OTHER_POSE_RATE = 5e-4
 
 
 @dataclass(frozen=True)
-class Arm:
+class Variant:
     """What differs from the full recipe."""
 
     nerf: dict[str, Any] = field(default_factory=dict)
@@ -44,53 +44,55 @@ class Arm:
     """stage 2 alone, with stage 4's epochs added"""
 
 
-def arms(settings: dict[str, Any]) -> dict[str, Arm]:
-    """All arms; that of the poses takes what the settings do not."""
+def variants(settings: dict[str, Any]) -> dict[str, Variant]:
+    """All variants; that of the poses takes what the settings do not."""
     refined = settings["nerf"]["pose_learning_rate"] > 0
     other = 0.0 if refined else OTHER_POSE_RATE
     return {
-        "full": Arm(),
-        "no_masks": Arm(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
-        "no_depth": Arm(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
-        "no_relative_depth": Arm(nerf={"rank_weight": 0}),
-        "prior_unrefined": Arm(nerf={"match_reach_px": 0}),
-        "no_feedback": Arm(feedback=False),
-        "poses_of_sfm" if refined else "poses_refined": Arm(nerf={"pose_learning_rate": other}),
-        "no_adaptive_grid": Arm(nerf={"edge_boost": 0}),
-        "stage2_longer": Arm(long=True),
+        "full": Variant(),
+        "no_masks": Variant(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
+        "no_depth": Variant(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
+        "no_relative_depth": Variant(nerf={"rank_weight": 0}),
+        "prior_unrefined": Variant(nerf={"match_reach_px": 0}),
+        "no_feedback": Variant(feedback=False),
+        "poses_of_sfm" if refined else "poses_refined": Variant(nerf={"pose_learning_rate": other}),
+        "no_adaptive_grid": Variant(nerf={"edge_boost": 0}),
+        "stage2_longer": Variant(long=True),
     }
 
 
-def one(folder: Path, truth: ObjectTruth, arm: Arm, seed: int, settings: dict[str, Any], photos: int) -> dict[str, Any]:
+def one(
+    folder: Path, truth: ObjectTruth, variant: Variant, seed: int, settings: dict[str, Any], photos: int
+) -> dict[str, Any]:
     """Stages 2 to 4 and the cloud of one object again, from the workflow's cameras, masks and stage 1, and measured."""
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
-        masks = folder / "masks" if arm.masks else white(folder / "masks", work / "masks")
-        inputs: dict[str, Any] = {"cameras": folder / "cameras", "masks": masks}
+        masks = folder / "masks" if variant.masks else white(folder / "masks", work / "masks")
+        inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": masks}
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
-            own = settings["nerf"] | settings["matching"] | arm.nerf | {"epochs": epochs}
-            train_nerf(
-                **inputs, **common, prior=prior if arm.prior else None, previous=previous, stage=work / f"stage{stage}",
-                report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
+            own = settings["nerf"] | settings["matching"] | variant.nerf | {"epochs": epochs}
+            train_object_nerf(
+                **inputs, **common, prior=prior if variant.prior else None, previous=previous,
+                stage=work / f"stage{stage}", report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
                 schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
                 refinement=build(RefinementSettings, own),
             )  # fmt: skip
 
         early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
-        nerf(2, folder / "stage1", None, early + late if arm.long else early)
+        nerf(2, folder / "stage1", None, early + late if variant.long else early)
         prior = folder / "stage1"
-        if arm.feedback and arm.prior and not arm.long:
+        if variant.feedback and variant.prior and not variant.long:
             prior = work / "stage3"
             refine_depth(
                 **inputs, **common, previous=folder / "stage1", rendered=work / "stage2", stage=prior,
                 report=work / "stage3.json", settings=build(FeedbackSettings, settings["stage3"]),
             )  # fmt: skip
-        if not arm.long:
+        if not variant.long:
             nerf(4, prior, work / "stage2", late)
-        last = work / ("stage2" if arm.long else "stage4")
+        last = work / ("stage2" if variant.long else "stage4")
         seconds, fusing = time.monotonic() - start, settings["cloud"] | settings["matching"]
         depth = depth_results([work / "stage2", last], truth, photos)
         return {
@@ -116,8 +118,8 @@ def cloud(
     """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
     path = last.with_name("object.ply")
     try:
-        object_cloud(
-            **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "cameras.json",
+        make_object_cloud(
+            **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "undistorted.json",
             cloud=path, report=path.with_suffix(".json"), refinement=build(RefinementSettings, settings),
             settings=build(CloudSettings, settings), seed=seed,
         )  # fmt: skip
@@ -139,8 +141,10 @@ def cloud(
 
 
 def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> float:
-    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every arm."""
-    views = load_views(folder / "cameras", folder / "masks", settings["nerf"]["width_px"], settings["hold_out_every"])
+    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every variant."""
+    views = load_views(
+        folder / "undistorted", folder / "masks", settings["nerf"]["width_px"], settings["hold_out_every"]
+    )
     scores = []
     for index in np.flatnonzero(views.held_out):
         render = cv2.imread(str(stage / "renders" / f"{Path(views.names[index]).stem}.png"))[..., ::-1].copy()
@@ -165,9 +169,9 @@ def object_ablation(
     only: tuple[str, ...] = (),
     settings: Path | None = None,
 ) -> None:
-    """Print mean and spread of every arm over seeds as Markdown; all runs go to bench/object_ablation.tsv.
+    """Print mean and spread of every variant over seeds as Markdown; all runs go to bench/object_ablation.tsv.
 
-    Stage 1 is the workflow's in every arm. `no_masks` calls everything the object, for the NeRF and for the cloud;
+    Stage 1 is the workflow's in every variant. `no_masks` calls everything the object, for the NeRF and for the cloud;
     its cloud thus holds the surroundings, which `F 1 %, cut` leaves out. `no_depth` has no prior at all,
     `prior_unrefined` one that photos did not move, `no_feedback` takes stage 1's depth in stage 4. Depth errors are
     medians over pixels that truly show the object.
@@ -176,7 +180,7 @@ def object_ablation(
         results: folder of a finished demo.
         objects: of the demo.
         seeds: 0 to this.
-        only: these arms; none for all.
+        only: these variants; none for all.
         settings: laid over the shipped ones, or none.
     """
     shipped = shipped_with(settings)
@@ -184,15 +188,17 @@ def object_ablation(
     out = results / "bench/object_ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
-    chosen = {name: arm for name, arm in arms(own).items() if not only or name in only}
+    chosen = {name: variant for name, variant in variants(own).items() if not only or name in only}
     for name in objects:
         folder, known = results / "objects" / name, results / "demo/demo/truth"
-        truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], shipped["seed"])
+        truth = read_object_truth(
+            folder / "undistorted", known / "scene", known / name, judge["samples"], shipped["seed"]
+        )
         for seed in range(seeds):
-            for arm in chosen:
-                print(f"{name} {arm} {seed}", flush=True)
-                measured = one(folder, truth, chosen[arm], seed, own, judge["max_photos"])
-                rows.append({"object": name, "arm": arm, "seed": seed} | measured)
+            for variant in chosen:
+                print(f"{name} {variant} {seed}", flush=True)
+                measured = one(folder, truth, chosen[variant], seed, own, judge["max_photos"])
+                rows.append({"object": name, "variant": variant, "seed": seed} | measured)
                 pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
     print_table(pd.DataFrame(rows), seeds)
 
@@ -215,10 +221,10 @@ HEAD = {
 
 
 def print_table(table: pd.DataFrame, seeds: int) -> None:
-    groups = table.groupby(["object", "arm"], sort=False)[list(HEAD)]
+    groups = table.groupby(["object", "variant"], sort=False)[list(HEAD)]
     means, spreads = groups.mean(), groups.std().fillna(0)
     print(f"\nMean ± standard deviation over {seeds} seeds; lengths in % of the object's diagonal.\n")
-    print("| object | arm | " + " | ".join(HEAD.values()) + " |")
+    print("| object | variant | " + " | ".join(HEAD.values()) + " |")
     print("|---|---|" + "---|" * len(HEAD))
     for key in means.index:
         cells = [f"{means.loc[key, c]:.3g} ± {spreads.loc[key, c]:.1g}" for c in HEAD]

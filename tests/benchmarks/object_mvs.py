@@ -13,15 +13,15 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from scenefuse.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
-from scenefuse.maps import read_depth, read_normals, write_depth
+from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
+from scenefuse.io.maps import read_depth, read_normals, write_depth
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.nerf.agreement import compare
-from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths
-from scenefuse.objects.views import Views, load_views
-from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
-from scenefuse.scenes.plane_sweep import DepthSettings
-from scenefuse.settings import build, shipped_with
+from scenefuse.mvs.consistency import compare
+from scenefuse.mvs.depth_maps import FusionSettings, estimate_depth_maps, fuse_depth_maps
+from scenefuse.mvs.plane_sweep import DepthSettings
+from scenefuse.mvs.views import Views, load_views
+from scenefuse.nerf.object_cloud import CloudSettings, clean, fuse_depths
 from scenefuse.stage import StageError, read_json, run, value
 
 # Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,
@@ -61,7 +61,7 @@ def fused(
         return fuse_depths(views, views.object_from_cam, depths, (depths > 0).astype(np.float32), normals, settings)[0]
     path = depth.with_name("fused.ply")
     fuse_depth_maps(
-        workspace=folder / "cameras", depth=[depth], depth_reports=[report], cloud=path,
+        workspace=folder / "undistorted", depth=[depth], depth_reports=[report], cloud=path,
         report=path.with_suffix(".json"), settings=build(FusionSettings, own["dense_cloud"] | over),
     )  # fmt: skip
     cloud = read_cloud(path)
@@ -75,14 +75,14 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
     """Every way to make depth maps with every way to fuse them."""
     own = settings["object"] | {key: settings["scene"][key] for key in ("depth_maps", "dense_cloud")}
     width = own["nerf"]["width_px"]
-    views = load_views(folder / "cameras", folder / "masks", width, 0)
+    views = load_views(folder / "undistorted", folder / "masks", width, 0)
     judge, rows = settings["evaluation"]["object"], []
     for maps, over in DEPTH.items():
         with tempfile.TemporaryDirectory() as temporary:
             depth, report = Path(temporary) / maps.replace(" ", "_"), Path(temporary) / "depth.json"
             start, began = time.monotonic(), os.times()
             estimate_depth_maps(
-                workspace=folder / "cameras", chunk=0, chunks=1, backend=own["depth_maps"]["backend"],
+                workspace=folder / "undistorted", chunk=0, chunks=1, backend=own["depth_maps"]["backend"],
                 settings=build(DepthSettings, own["depth_maps"] | {"max_image_size_px": width} | over),
                 seed=settings["seed"], depth=depth, report=report,
             )  # fmt: skip
@@ -116,7 +116,7 @@ def early_stages(folder: Path, truth: ObjectTruth, settings: dict[str, Any]) -> 
     for stage in ("stage1", "stage3"):
         depth = folder / stage
         width = read_depth(next(iter(sorted((depth / "depth_maps").glob("*.bin"))))).shape[1]
-        views = load_views(folder / "cameras", folder / "masks", width, 0)
+        views = load_views(folder / "undistorted", folder / "masks", width, 0)
         cloud = cleaned(fused(folder, depth, depth, views, own, None), folder, own)
         errors = depth_results([depth], truth, judge["max_photos"])
         rows.append(
@@ -192,7 +192,9 @@ def object_mvs(
     judge, known = chosen["evaluation"]["object"], results / "demo/demo/truth"
     for name in objects:
         folder = results / "objects" / name
-        truth = read_object_truth(folder / "cameras", known / "scene", known / name, judge["samples"], chosen["seed"])
+        truth = read_object_truth(
+            folder / "undistorted", known / "scene", known / name, judge["samples"], chosen["seed"]
+        )
         rows += [four_stages(results, name, truth, chosen), *early_stages(folder, truth, chosen)]
         rows += trials(folder, truth, chosen, out.parent / "object_mvs")
         pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")

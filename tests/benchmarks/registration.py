@@ -15,15 +15,15 @@ import open3d as o3d
 import pandas as pd
 from planted import SHAPES, Trial, errors, plant
 
-from scenefuse.clouds import Cloud
+from scenefuse.io.clouds import Cloud
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop import CropSettings, crop_cloud
+from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud
 from scenefuse.registration.evidence import Evidence
 from scenefuse.registration.fine import FineSettings, refine_hypotheses
 from scenefuse.registration.paper import paper_coarse, paper_fine
 from scenefuse.registration.refine import ScaleRange
 from scenefuse.registration.scale import estimates, prior_centre
-from scenefuse.settings import build, shipped_with
 from scenefuse.stage import run
 from scenefuse.transforms import Sim3
 
@@ -55,7 +55,7 @@ def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
     poses = [(h.pose, h.source) for h in found]
     outcome = refine_hypotheses(cloud, scene, poses, scales, evidence, build(FineSettings, CONFIG["fine"]), 0)
 
-    return Found(outcome.ranked[0].pose, outcome.verdict.registered, outcome.verdict.reason)
+    return Found(outcome.ranked[0].pose, outcome.decision.registered, outcome.decision.reason)
 
 
 def paper(trial: Trial, scene: Cloud) -> Found:

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefuse.clouds import read_cloud
-from scenefuse.registration.landmarks import read_landmarks
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.register import register_clouds
-from scenefuse.registration.witness import WitnessSettings, testify
-from scenefuse.settings import build, shipped_with
+from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
+from scenefuse.registration.shared_features.landmarks import read_landmarks
 from scenefuse.stage import run, value
 from scenefuse.transforms import Sim3, rotation_angle_deg
 
@@ -23,14 +23,14 @@ UP = np.array([0.0, 0.0, 1.0])
 
 
 def two_walks(*, results: Path, pictures: Path) -> None:
-    """Print the verdict of the clouds, the witness of the photos, and how far they are apart.
+    """Print the decision of the clouds, the alignment of the photos, and how far they are apart.
 
     Args:
         results: the results folder of the workflow.
         pictures: folder for the clouds on each other, by clouds and by photos.
     """
     settings = shipped_with(None)
-    witness_settings = build(WitnessSettings, settings["registration"]["witness"])
+    alignment_settings = build(AlignmentSettings, settings["registration"]["alignment"])
     pictures.mkdir(parents=True, exist_ok=True)
     for name, pair in PAIRS.items():
         folders = [results / "scenes" / part for part in pair]
@@ -40,20 +40,20 @@ def two_walks(*, results: Path, pictures: Path) -> None:
             read_landmarks(
                 folder / "georeferenced",
                 folder / "database.db",
-                witness_settings.most_points,
-                witness_settings.descriptors_per_point,
+                alignment_settings.most_points,
+                alignment_settings.descriptors_per_point,
             )
             for folder in folders
         )
-        witness = testify(ours, theirs, witness_settings, 0)
+        alignment = align_landmarks(ours, theirs, alignment_settings, 0)
         print(f"{name}, {len(obj)} points in {len(scene)}")
         print(f"  clouds  {'registered' if found.registered else 'unregistered'}: {found.reason}")
-        print(f"  photos  {'found' if value(witness, 'found') else 'not found'}: {value(witness, 'reason')}")
+        print(f"  photos  {'found' if value(alignment, 'found') else 'not found'}: {value(alignment, 'reason')}")
         if found.scene_from_object is not None:
             draw_alignment(pictures / f"{name}_clouds.png", obj, scene, found.scene_from_object, 0)
-        if not value(witness, "found"):
+        if not value(alignment, "found"):
             continue
-        pose = Sim3.from_matrix(np.array(value(witness, "scene_from_object")))
+        pose = Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))
         draw_alignment(pictures / f"{name}_photos.png", obj, scene, pose, 0)
         if found.scene_from_object is not None:
             centre, diagonal = obj.points.mean(0), obj.diagonal * pose.scale

@@ -9,7 +9,7 @@ import pytest
 import yaml
 from conftest import ROOT
 
-from scenefuse.clouds import read_cloud
+from scenefuse.io.clouds import read_cloud
 
 
 @pytest.fixture(scope="session")
@@ -35,14 +35,14 @@ def test_everything_a_user_reads_is_there(finished):
     assert {"before_after.png", "object.png"} <= {p.name for p in (results / "objects/house/figures").iterdir()}
 
 
-def verdict(directory, arm="full") -> dict:
-    """An arm's registration of the house."""
-    return json.loads((directory / f"results/objects/house/registration/{arm}/fine.json").read_text())
+def decision(directory, variant="full") -> dict:
+    """A variant's registration of the house."""
+    return json.loads((directory / f"results/objects/house/registration/{variant}/fine.json").read_text())
 
 
 def test_the_house_is_registered_where_it_is(finished):
     # The tiny capture is coarse; docs/results.md has the accuracy of the demo.
-    fine, truth = verdict(finished), json.loads((finished / "results/objects/house/truth.json").read_text())
+    fine, truth = decision(finished), json.loads((finished / "results/objects/house/truth.json").read_text())
     assert fine["status"]["value"] == "registered", fine["reason"]["value"]
     assert abs(truth["scale_error_pct"]["value"]) <= 2.0
     assert truth["rotation_error_deg"]["value"] <= 2.0
@@ -50,8 +50,10 @@ def test_the_house_is_registered_where_it_is(finished):
 
 
 def test_masks_find_the_house_in_the_scene_without_clicks(finished):
-    full, no_clicks = (np.array(verdict(finished, arm)["scene_from_object"]["value"]) for arm in ("full", "no_clicks"))
-    assert verdict(finished, "no_clicks")["status"]["value"] == "registered"
+    full, no_clicks = (
+        np.array(decision(finished, variant)["scene_from_object"]["value"]) for variant in ("full", "no_clicks")
+    )
+    assert decision(finished, "no_clicks")["status"]["value"] == "registered"
     assert np.linalg.norm(full[:3, 3] - no_clicks[:3, 3]) < 0.1  # metres
 
 
@@ -94,13 +96,13 @@ def test_a_second_run_does_nothing(finished, snakemake):
     [
         (
             {"metrics": {"tau_fraction": 0.02}},
-            {"metrics", "arm_metrics", "object_figures", "summary", "report_page", "all"},
+            {"metrics", "variant_metrics", "draw_object", "summary", "report_page", "all"},
         ),
         (
             {"fusion": {"fill_spacings": 2.0}},
             {
                 *("fuse", "complete_scene", "metrics", "evaluate_object"),
-                *("object_figures", "summary", "report_page", "all"),
+                *("draw_object", "summary", "report_page", "all"),
             },
         ),
     ],

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from scenefuse.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 

@@ -4,9 +4,9 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.completed_scene import complete_scene
-from scenefuse.fusion import FusionSettings, fuse_clouds
+from scenefuse.fusion.complete_scene import complete_scene
+from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 

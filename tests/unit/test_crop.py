@@ -9,11 +9,11 @@ import pycolmap
 import pytest
 from planted import plant
 
-from scenefuse.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.registration.crop import CropSettings, crop_cloud, crop_scene
-from scenefuse.registration.ground import fit_ground
-from scenefuse.registration.shapes import in_wide_hull, least_footprint
-from scenefuse.registration.vote import count, read_silhouettes, vote
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
+from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud, crop_scene
+from scenefuse.registration.crop.ground import fit_ground
+from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
+from scenefuse.registration.crop.vote import count, read_silhouettes, vote
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -195,7 +195,7 @@ def orbit(tmp_path_factory):
     model.write(folder / "cameras/sparse")
     write_cloud(folder / "dense.ply", trial.scene)
     pose = quantity(trial.scene_from_object.matrix, "")
-    write_json(folder / "witness.json", {"found": quantity(True, ""), "scene_from_object": pose})
+    write_json(folder / "alignment.json", {"found": quantity(True, ""), "scene_from_object": pose})
     return folder, trial
 
 
@@ -266,7 +266,7 @@ def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     files = stage_files(tmp_path, trial, trial.fiducials)
     crop_scene(**files, mode="fiducials", settings=SETTINGS)
     clicked = read_cloud(files["crop"]).points
-    files |= {"fiducials": None, "witness": folder / "witness.json"}
+    files |= {"fiducials": None, "alignment": folder / "alignment.json"}
     files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
     crop_scene(**files, mode="masks", settings=SETTINGS)
     voted, report = read_cloud(files["crop"]).points, read_json(files["report"])
@@ -278,15 +278,18 @@ def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
 
 def test_without_fiducials_and_without_a_witness_the_sentence_names_both_ways_out(orbit, tmp_path):
     folder, trial = orbit
-    files = stage_files(tmp_path, trial, trial.fiducials) | {"fiducials": None, "witness": tmp_path / "witness.json"}
+    files = stage_files(tmp_path, trial, trial.fiducials) | {
+        "fiducials": None,
+        "alignment": tmp_path / "alignment.json",
+    }
     files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
     denied = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
-    write_json(tmp_path / "witness.json", denied)
+    write_json(tmp_path / "alignment.json", denied)
     with pytest.raises(StageError, match=r"only 3 of 90 .* column fiducials .* or add photos"):
         crop_scene(**files, mode="masks", settings=SETTINGS)
     far = Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])) @ trial.scene_from_object
     elsewhere = {"found": quantity(True, ""), "scene_from_object": quantity(far.matrix, "")}
-    write_json(tmp_path / "witness.json", elsewhere)
+    write_json(tmp_path / "alignment.json", elsewhere)
     with pytest.raises(StageError, match="only 0 scene points are left in the box of .*masks"):
         crop_scene(**files, mode="masks", settings=SETTINGS)
     assert not files["crop"].exists()

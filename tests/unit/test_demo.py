@@ -11,7 +11,7 @@ from PIL import Image
 from scenefuse.demo import capture, clicks, textures
 from scenefuse.demo.cameras import look_at, read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
-from scenefuse.scenes.geodesy import LocalFrame
+from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import StageError, manifest, read_json, value
 
 FLIGHT = capture.FlightSettings(2, 2, 2, 40.0, 80, 60, 60.0, 1, 0.0, 0.0)

@@ -8,10 +8,10 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.clouds import read_cloud
-from scenefuse.maps import read_depth, read_normals
-from scenefuse.scenes.dense import FusionSettings, estimate_depth_maps, fuse_depth_maps
-from scenefuse.scenes.plane_sweep import DepthSettings, Photo, _Matcher
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.maps import read_depth, read_normals
+from scenefuse.mvs.depth_maps import FusionSettings, estimate_depth_maps, fuse_depth_maps
+from scenefuse.mvs.plane_sweep import DepthSettings, Photo, _Matcher
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from scenefuse.maps import read_depth
-from scenefuse.objects import depth as stage
-from scenefuse.objects.depth_consistency import (
+from scenefuse.depth import train_depth as stage
+from scenefuse.depth.consistency import (
     agreement_between_views,
     align_to_points,
     fuse_by_inverse_variance,
 )
-from scenefuse.objects.depth_inputs import make_frames, network_inputs
-from scenefuse.objects.depth_networks import (
+from scenefuse.depth.inputs import make_frames, network_inputs
+from scenefuse.depth.networks import (
     DepthNetwork,
     PoseNetwork,
     depth_from_disparity,
@@ -24,15 +23,16 @@ from scenefuse.objects.depth_networks import (
     parameters,
     rigid,
 )
-from scenefuse.objects.depth_training import Recipe, Supervision, train_networks, warmup_then_cosine
-from scenefuse.objects.self_supervision import (
+from scenefuse.depth.self_supervision import (
     minimum_reprojection,
     photometric_error,
     smoothness,
     ssim,
     warp,
 )
-from scenefuse.objects.views import Views
+from scenefuse.depth.training import Recipe, Supervision, train_networks, warmup_then_cosine
+from scenefuse.io.maps import read_depth
+from scenefuse.mvs.views import Views
 from scenefuse.stage import StageError
 
 INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])
@@ -252,7 +252,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
 
         with monkeypatch.context() as patch:
             patch.setattr(torch.optim.Adam, "step", step)
-            patch.setattr("scenefuse.objects.depth_training.CHECKPOINT_EVERY", 2)
+            patch.setattr("scenefuse.depth.training.CHECKPOINT_EVERY", 2)
             losses = train_networks(depth, pose, frames, Supervision(inputs, first), _recipe(), checkpoint, 3)
         return depth, losses
 

@@ -7,9 +7,9 @@ import pytest
 from test_depth import plane_views
 from test_photo_refinement import _speckled, _wrong
 
-from scenefuse.maps import write_depth
-from scenefuse.objects.depth_prior import read_prior
-from scenefuse.objects.photo_refinement import RefinementSettings
+from scenefuse.depth.prior import read_prior
+from scenefuse.io.maps import write_depth
+from scenefuse.mvs.photo_refinement import RefinementSettings
 
 MATCHING = RefinementSettings(8.0, 5, 0.6)
 AS_IT_IS = RefinementSettings(0.0, 5, 0.6)

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from scenefuse.maps import read_depth, write_depth
-from scenefuse.objects import depth, feedback
+from scenefuse.depth import refine_depth as feedback
+from scenefuse.depth import train_depth as depth
+from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.stage import StageError
 from tests.unit.test_depth import plane_views
 

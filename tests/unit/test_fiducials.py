@@ -2,7 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.fiducials import Clicks, ScenePoints, locate, read_points, triangulate
+from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate
 from scenefuse.stage import StageError
 
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}

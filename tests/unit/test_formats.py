@@ -8,8 +8,8 @@ import pytest
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
 
-from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.formats import bytes_of, las_crs
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.io.formats import bytes_of, las_crs
 from scenefuse.stage import StageError
 
 UTM = np.array([500_000.0, 5_572_094.0, 300.0])

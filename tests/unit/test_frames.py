@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.objects.frames import FrameSettings, extract_frames, original_sizes, sharpness, thin_out
-from scenefuse.photos import read_photos
+from scenefuse.sfm.frames import FrameSettings, extract_frames, original_sizes, sharpness, thin_out
+from scenefuse.sfm.photos import read_photos
 from scenefuse.stage import StageError, read_json, value
 
 SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64, jpeg_quality=95)

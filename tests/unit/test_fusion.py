@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.clouds import Cloud, read_cloud, spacing, write_cloud
-from scenefuse.fusion import FusionSettings, fuse, fuse_clouds, match_colors
+from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds, fuse_object, match_colors
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -113,7 +113,7 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
             "crs_from_scene": quantity(crs_from_scene.matrix, "m"),
         },
     )
-    fuse(
+    fuse_object(
         object=tmp_path / "object.ply",
         scene=tmp_path / "scene.ply",
         crop=tmp_path / "crop.ply",

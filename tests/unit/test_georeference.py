@@ -4,15 +4,15 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.photos import Photo, write_photos
-from scenefuse.scenes.geodesy import LocalFrame, local_frame
-from scenefuse.scenes.georeference import (
+from scenefuse.sfm.geodesy import LocalFrame, local_frame
+from scenefuse.sfm.georeference import (
     GeoreferenceSettings,
     camera_poses,
     fit_level,
     georegister,
     place_by_gps,
 )
+from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.stage import read_json, value
 from scenefuse.transforms import Sim3, rotation_angle_deg
 

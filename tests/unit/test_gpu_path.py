@@ -7,13 +7,13 @@ from painted_sphere import photos_of, sphere_views, sphere_volume
 from pretend_gpu import OnGpu, PretendGpu, to_pretended
 from test_depth import plane_views
 
+from scenefuse.io.settings import build, shipped_with
+from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.train import Schedule, new_model, train
-from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
-from scenefuse.settings import build, shipped_with
+from scenefuse.nerf.training import Schedule, new_model, train
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.gravity import estimate_up, roll_spread_deg
+from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 
 UP = np.array([0.0, 0.0, 1.0])
 

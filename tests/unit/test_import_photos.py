@@ -14,15 +14,14 @@ import yaml
 from painted_sphere import CENTER, RADIUS, sphere_views
 from scipy.spatial.transform import Rotation
 
-from scenefuse.clouds import read_cloud
+from scenefuse.io.clouds import read_cloud
+from scenefuse.mvs.views import load_views
 from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.rays import cube_from_cameras
 from scenefuse.nerf.render import Rendered
-from scenefuse.objects.import_photos import import_photos
-from scenefuse.objects.nerf_alone import nerf_files
-from scenefuse.objects.train_nerf import _held_out_quality
-from scenefuse.objects.views import load_views
-from scenefuse.scenes.undistort import UndistortSettings
+from scenefuse.nerf.train_object_nerf import _held_out_quality, train_nerf
+from scenefuse.sfm.import_photos import import_photos
+from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import StageError, read_json, value
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -382,7 +381,7 @@ def sphere_on_disk(root, form):
 def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
     data, out = sphere_on_disk(tmp_path / "in", form), tmp_path / "out"
     masks = data / "masks" if form == "colmap" else None
-    assert nerf_files(data=data, out=out, masks=masks, config=quick) == 0
+    assert train_nerf(data=data, out=out, masks=masks, config=quick) == 0
     report = read_json(out / "report.json")
     assert value(report["nerf"], "photos_measured") == 2 and value(report["nerf"], "psnr_held_out") > 15
     assert value(report, "settings").get("mask_band_px") == (0 if form == "blender" else 2)
@@ -422,7 +421,7 @@ def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):
     Path("file.txt").write_text("")
     Path("typo.yaml").write_text("object: {nerf_alone: {epoch: 3}}")
     with pytest.raises(StageError, match=words):
-        nerf_files(**({"data": Path("in"), "out": Path("out")} | options))
+        train_nerf(**({"data": Path("in"), "out": Path("out")} | options))
     assert not Path("out").exists()
 
 

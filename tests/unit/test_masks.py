@@ -11,16 +11,16 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.objects import masks as masks_module
-from scenefuse.objects.box import find_ground, upright_box
-from scenefuse.objects.cut import stamp
-from scenefuse.objects.grabcut import cleaned, second_trimap, stamp_seeds
-from scenefuse.objects.hull import Frame, agreement, carve, silhouette
-from scenefuse.objects.mask_algebra import kept_part, mask_folders
-from scenefuse.objects.masks import MaskSettings, make_masks
-from scenefuse.objects.sam2 import Sam2Transformers, check_weights
-from scenefuse.objects.sam2_weights import fetch_sam2_weights
-from scenefuse.objects.target import target_from_points
+from scenefuse.masks import make_masks as masks_module
+from scenefuse.masks.algebra import kept_part, mask_folders
+from scenefuse.masks.box import find_ground, upright_box
+from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
+from scenefuse.masks.grabcut_passes import stamp
+from scenefuse.masks.make_masks import MaskSettings, make_masks
+from scenefuse.masks.sam2 import Sam2Transformers, check_weights
+from scenefuse.masks.sam2_weights import fetch_sam2_weights
+from scenefuse.masks.target import target_from_points
+from scenefuse.mvs.visual_hull import Frame, agreement, carve, silhouette
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8

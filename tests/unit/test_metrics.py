@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from scenefuse.clouds import Cloud, write_cloud
+from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.metrics.completion import local_density, surface_variation
 from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.metrics.registration import MetricSettings, compute_metrics, registration_metrics

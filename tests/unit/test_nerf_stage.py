@@ -9,11 +9,11 @@ import torch
 from scipy.spatial.transform import Rotation
 from test_nerf_train import FIELD, WEIGHTS, sphere_views
 
-from scenefuse.maps import read_depth, write_depth
-from scenefuse.nerf.train import Schedule
-from scenefuse.objects.cloud import CloudSettings, object_cloud
-from scenefuse.objects.photo_refinement import RefinementSettings
-from scenefuse.objects.train_nerf import NerfSettings, train_nerf
+from scenefuse.io.maps import read_depth, write_depth
+from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
+from scenefuse.nerf.training import Schedule
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 MATCHING = RefinementSettings(0.0, 5, 0.6)
@@ -63,7 +63,7 @@ def _run(root, stage, previous=None, **changes):
         device="cpu",
         seed=0,
     )
-    train_nerf(**(arguments | changes))
+    train_object_nerf(**(arguments | changes))
 
 
 def test_two_stages_and_the_cloud(workspace):
@@ -81,7 +81,7 @@ def test_two_stages_and_the_cloud(workspace):
     saved = torch.load(workspace / "stage4/model.pt", weights_only=True)
     assert len(saved["names"]) == 12 and saved["nerf_from_object"].shape == (4, 4)
     assert not list((workspace / "checkpoints").rglob("*.pt"))
-    object_cloud(
+    make_object_cloud(
         cameras=workspace / "cameras",
         masks=workspace / "masks",
         stage=workspace / "stage4",

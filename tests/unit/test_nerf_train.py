@@ -5,14 +5,14 @@ import pytest
 import torch
 from painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
-from scenefuse.nerf.agreement import MOST_VIEWS, back_project, compare, normals_from_depth, others
+from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import cube_from_cameras, dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.train import Schedule, new_model, train
+from scenefuse.nerf.training import Schedule, new_model, train
 from scenefuse.transforms import Sim3
 
 

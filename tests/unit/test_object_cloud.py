@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from test_nerf_train import CENTER, RADIUS, sphere_views
 
-from scenefuse.clouds import Cloud
-from scenefuse.objects.cloud import CloudSettings, clean, fuse_depths, object_cloud, with_plane_normals
-from scenefuse.objects.photo_refinement import RefinementSettings
-from scenefuse.objects.views import Views
+from scenefuse.io.clouds import Cloud
+from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.mvs.views import Views
+from scenefuse.nerf.object_cloud import CloudSettings, clean, fuse_depths, make_object_cloud, with_plane_normals
 from scenefuse.stage import StageError
 
 SETTINGS = CloudSettings(3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
@@ -53,7 +53,7 @@ def test_cleaning_drops_a_small_group_and_far_points():
 
 def test_a_missing_model_is_named(tmp_path):
     with pytest.raises(StageError, match="model.pt does not exist; run the NeRF stage first"):
-        object_cloud(
+        make_object_cloud(
             cameras=tmp_path,
             masks=tmp_path,
             stage=tmp_path / "stage4",

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from test_depth import plane_views
 
-from scenefuse.nerf.agreement import back_project
-from scenefuse.objects.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.mvs.consistency import back_project
+from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 
 
 def _wrong(truth, share=0.05):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.photos import gps_positions, list_photos, read_photos
+from scenefuse.sfm.photos import gps_positions, list_photos, read_photos
 from scenefuse.stage import StageError, read_json, value
 
 

@@ -8,13 +8,13 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.objects.correspondences import Features, Pair, find_pairs, match, two_view_depths
-from scenefuse.objects.depth_inputs import make_frames
-from scenefuse.objects.joint_refinement import link, refine
-from scenefuse.objects.pair_scales import ScaleTraining, learn_lengths
-from scenefuse.objects.pose_graph import chain, close, largest_group
-from scenefuse.objects.poses import PoseSettings, find_poses, read_workspace, trajectory_error
-from scenefuse.objects.views import load_views
+from scenefuse.depth.inputs import make_frames
+from scenefuse.mvs.views import load_views
+from scenefuse.poses.baselines import ScaleTraining, learn_lengths
+from scenefuse.poses.bundle_adjustment import link, refine
+from scenefuse.poses.correspondences import Features, Pair, find_pairs, match, two_view_depths
+from scenefuse.poses.find_poses import PoseSettings, find_poses, read_workspace, trajectory_error
+from scenefuse.poses.pose_graph import chain, close, largest_group
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 

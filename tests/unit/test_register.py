@@ -1,4 +1,4 @@
-"""Registration on its own: two files in, a verdict, a transform in the files' own coordinates, an exit status."""
+"""Registration on its own: two files in, a decision, a transform in the files' own coordinates, an exit status."""
 
 import subprocess
 import sys
@@ -10,10 +10,10 @@ import yaml
 from planted import errors, plant
 from test_formats import UTM, write_e57
 
-from scenefuse.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.formats import las_crs
-from scenefuse.registration.register import register_clouds, register_files
-from scenefuse.settings import shipped_with
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.io.formats import las_crs
+from scenefuse.io.settings import shipped_with
+from scenefuse.registration.register import register, register_clouds
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
 
@@ -57,7 +57,7 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     write_laz(tmp_path / "scene.laz", house.scene, UTM, "EPSG:32632")
     out = tmp_path / "out"
     files = {"object": tmp_path / "house.e57", "scene": tmp_path / "scene.laz"}
-    assert register_files(**files, out=out, format="laz", config=quick) == 0
+    assert register(**files, out=out, format="laz", config=quick) == 0
     content = read_json(out / "transform.json")
     scale, angle, shift = in_files(content, house, UTM)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
@@ -81,7 +81,7 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
     out, true = tmp_path / "out", trial.scene_from_object.scale
     files = {"object": tmp_path / "house.xyz", "scene": tmp_path / "scene.ply", "fiducials": tmp_path / "marks.txt"}
     ups = {"up_object": tuple(trial.up_in_object), "up_scene": (0.0, 0.0, 1.0)}
-    assert register_files(**files, **ups, out=out, scale=true, config=quick) == 0
+    assert register(**files, **ups, out=out, scale=true, config=quick) == 0
     content = read_json(out / "transform.json")
     scale, angle, shift = in_files(content, trial, UTM)
     assert abs(scale) < 1e-6 and angle < 2 and shift < 0.01
@@ -149,5 +149,5 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
     Path("typo.yaml").write_text("registration: {fine: {min_fscore: 0.1}}")
     with pytest.raises(StageError, match=words):
-        register_files(**({"object": Path("scene.ply"), "scene": Path("scene.ply")} | options))
+        register(**({"object": Path("scene.ply"), "scene": Path("scene.ply")} | options))
     assert not Path("registered").exists()

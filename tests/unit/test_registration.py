@@ -7,19 +7,19 @@ import pytest
 from planted import errors, plant
 from scipy.spatial.transform import Rotation
 
-from scenefuse.clouds import Cloud, write_cloud
-from scenefuse.registration.audit import tilt_deg
+from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.settings import build, shipped_with
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
-from scenefuse.registration.evidence import Evidence, Witness
+from scenefuse.registration.evidence import Alignment, Evidence
 from scenefuse.registration.features import match, ransac_similarities
 from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely, scale_ledger
-from scenefuse.registration.ledger import round_trip, write_frame_ledger
+from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
 from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
 from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
 from scenefuse.registration.upright import upright_hypotheses
-from scenefuse.settings import build, shipped_with
+from scenefuse.registration.verify import tilt_deg
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -63,15 +63,15 @@ def test_a_planted_pose_is_found_and_accepted(name):
     scale, angle, shift = errors(
         outcome.ranked[0].pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal
     )
-    assert outcome.verdict.registered, outcome.verdict.reason
+    assert outcome.decision.registered, outcome.decision.reason
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
 
 
 def test_another_object_is_refused(house):
     other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
-    verdict = register(house, other, LITTLE).verdict
-    assert not verdict.registered
-    assert "F-score" in verdict.reason or "explains" in verdict.reason
+    decision = register(house, other, LITTLE).decision
+    assert not decision.registered
+    assert "F-score" in decision.reason or "explains" in decision.reason
 
 
 def test_two_runs_agree_bit_for_bit(house):
@@ -238,7 +238,7 @@ def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
         replace(FINE, turn_steps=2, min_f_score=0.0),
         0,
     )
-    assert not outcome.verdict.registered
+    assert not outcome.decision.registered
 
 
 def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
@@ -250,12 +250,12 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
     poses = [(Sim3.identity(), "one"), (turned, "other")]
     settings = replace(FINE, turn_steps=6, fine_voxel_fraction=0.02, score_fraction=0.04)
     outcome = refine_hypotheses(egg(0), egg(1), poses, ScaleRange(1.0, 0.2), Evidence((Z, Z)), settings, 0)
-    assert outcome.verdict.registered, outcome.verdict.reason
-    assert abs(outcome.verdict.free_axis @ Z) > 0.99
+    assert outcome.decision.registered, outcome.decision.reason
+    assert abs(outcome.decision.free_axis @ Z) > 0.99
 
 
-def shared(pose: Sim3) -> Witness:
-    return Witness(pose, Uncertainty.even(0.005, 0.3, 0.02), 40, None)
+def shared(pose: Sim3) -> Alignment:
+    return Alignment(pose, Uncertainty.even(0.005, 0.3, 0.02), 40, None)
 
 
 def test_photos_that_agree_settle_the_pose(house):
@@ -263,8 +263,8 @@ def test_photos_that_agree_settle_the_pose(house):
     prior = ScaleRange(truth.scale, 0.3)
     settings = replace(LITTLE[1], min_margin=1.0)
     alone, linked = (
-        refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, settings, 0).verdict
-        for evidence in (Evidence(), Evidence(witness=shared(truth)))
+        refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, settings, 0).decision
+        for evidence in (Evidence(), Evidence(alignment=shared(truth)))
     )
     assert not alone.registered and "margin" in alone.reason
     assert linked.registered and linked.decided_by == "both"
@@ -275,10 +275,10 @@ def test_the_surer_of_photos_and_clouds_has_the_last_word(house):
     prior = ScaleRange(truth.scale, 0.3)
     near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
     for sd, won in ((1e-4, True), (0.02, False)):
-        witness = Witness(near, Uncertainty.even(sd, 100 * sd, 10 * sd), 40, None)
-        evidence = Evidence((house.up_in_object, Z), None, witness)
+        alignment = Alignment(near, Uncertainty.even(sd, 100 * sd, 10 * sd), 40, None)
+        evidence = Evidence((house.up_in_object, Z), None, alignment)
         outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
-        assert outcome.verdict.decided_by == "both"
+        assert outcome.decision.decided_by == "both"
         assert (outcome.ranked[0].pose.scale == near.scale) == won
 
 
@@ -289,9 +289,9 @@ def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_surer(house
     alone = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, Evidence(), LITTLE[1], 0)
     for share, by_photos in ((0.9, False), (0.05, True)):
         sd = share * alone.spread.size(house.scene.diagonal) * house.scene.diagonal
-        evidence = Evidence(None, None, Witness(beside, Uncertainty.even(0.0, 0.0, sd), 40, None))
+        evidence = Evidence(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd), 40, None))
         outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
-        assert outcome.verdict.decided_by == "both"
+        assert outcome.decision.decided_by == "both"
         assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
 
 
@@ -304,7 +304,7 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     outcome = refine_hypotheses(
         house.object, house.scene, [(turned, "planted")], prior, evidence, replace(LITTLE[1], turn_steps=1), 0
     )
-    assert outcome.verdict.registered and outcome.verdict.decided_by == "photos"
+    assert outcome.decision.registered and outcome.decision.decided_by == "photos"
     scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
 
@@ -317,7 +317,7 @@ def test_an_object_where_the_cameras_saw_through_is_refused(house):
     evidence = Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
     prior = ScaleRange(truth.scale, 0.3)
     outcome = refine_hypotheses(house.object, house.scene, [(lifted, "planted")], prior, evidence, LITTLE[1], 0)
-    assert not outcome.verdict.registered and "saw through" in outcome.verdict.reason
+    assert not outcome.decision.registered and "saw through" in outcome.decision.reason
 
 
 def test_spread_of_a_pose_grows_with_noise():
@@ -335,7 +335,7 @@ def test_spread_of_a_pose_grows_with_noise():
 def test_scale_ledger_names_every_estimate_and_the_winner(house):
     outcome = register(house, settings=LITTLE)
     prior = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
-    witness = shared(house.scene_from_object)
-    rows = scale_ledger(prior, witness, outcome.ranked[0], outcome.spread, outcome.verdict)
+    alignment = shared(house.scene_from_object)
+    rows = scale_ledger(prior, alignment, outcome.ranked[0], outcome.spread, outcome.decision)
     assert [r["name"] for r in rows] == ["rms", "shared points", "clouds"]
     assert rows[-1]["use"].startswith("won") and rows[-1]["scale"] == outcome.ranked[0].pose.scale

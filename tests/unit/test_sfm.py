@@ -4,14 +4,14 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from scenefuse.photos import Photo, list_photos, write_photos
-from scenefuse.scenes.geodesy import LocalFrame
-from scenefuse.scenes.georeference import camera_poses
-from scenefuse.scenes.interrupt import cancellable
-from scenefuse.scenes.mapping import MapSettings, map_incremental
-from scenefuse.scenes.pairs import PairSettings, choose_pairs, sequential_pairs, spatial_pairs
-from scenefuse.scenes.sfm import FeatureSettings, MatchSettings, camera_groups, extract_features, match_features
-from scenefuse.scenes.undistort import UndistortSettings, undistort
+from scenefuse.sfm.features import FeatureSettings, MatchSettings, camera_groups, extract_features, match_features
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.sfm.georeference import camera_poses
+from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.mapping import MapSettings, map_photos
+from scenefuse.sfm.pairs import PairSettings, choose_pairs, sequential_pairs, spatial_pairs
+from scenefuse.sfm.photos import Photo, list_photos, write_photos
+from scenefuse.sfm.undistort import UndistortSettings, undistort_photos
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import fit_sim3
 
@@ -132,7 +132,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
             settings=MATCHES,
             seed=0,
         )
-        map_incremental(
+        map_photos(
             folder=folder / "photos",
             photos=folder / "photos.json",
             database=tmp_path / f"{name}.db",
@@ -154,7 +154,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     np.testing.assert_array_equal(centres, again)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
 
-    undistort(
+    undistort_photos(
         folder=folder / "photos",
         sparse=tmp_path / "first",
         dense=tmp_path / "dense",
@@ -165,7 +165,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     assert {c.model_name for c in dense.cameras.values()} == {"PINHOLE"}
     assert max(value(read_json(tmp_path / "dense.json"), "sizes_px")[0]) <= 120
     with pytest.raises(StageError, match=r"6 photos of the model .* are missing"):
-        undistort(
+        undistort_photos(
             folder=tmp_path,
             sparse=tmp_path / "first",
             dense=tmp_path / "none",
@@ -211,7 +211,7 @@ def test_too_few_registered_photos(tmp_path):
     names = [i.name for i in synthetic.images.values()] + [f"extra{i}.jpg" for i in range(5)]
     write_photos(tmp_path / "photos.json", [photo(n) for n in names], tmp_path, "photos", [])
     with pytest.raises(StageError, match=r"only 5 of 10 photos were registered.*extra0\.jpg.*min_registered_share"):
-        map_incremental(
+        map_photos(
             folder=tmp_path,
             photos=tmp_path / "photos.json",
             database=tmp_path / "database.db",

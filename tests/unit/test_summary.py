@@ -7,11 +7,11 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from scenefuse.report.tables import last_error, runtime_table
+from scenefuse.report.values import find, flatten, load, number
+from scenefuse.report.write_report import write_report
+from scenefuse.report.write_summary import write_summary
 from scenefuse.stage import StageError, quantity, write_json
-from scenefuse.viz.report import write_report
-from scenefuse.viz.summary import write_summary
-from scenefuse.viz.tables import last_error, runtime_table
-from scenefuse.viz.values import find, flatten, load, number
 
 HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
 
@@ -20,36 +20,38 @@ HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load
 def results(tmp_path):
     """A scene, a registered house, a refused balloon, and a sculpture whose masks failed."""
     scene = tmp_path / "scenes/demo"
-    for name in ("photos.json", "features.db", "matches.json", "dense.json", "depth/0.json", "depth/1.json"):
+    for name in ("photos.json", "features.db", "matches.json", "undistorted.json", "depth/0.json", "depth/1.json"):
         write_json(scene / name, {})
     write_json(scene / "sparse.json", {"total": quantity(60, "1"), "registered": quantity(59, "1")})
     write_json(scene / "georeference.json", {"length_unit": quantity("m", "")})
-    write_json(scene / "dense_cloud.json", {"points": quantity(5000, "1"), "fallback": quantity("CPU used", "")})
+    write_json(scene / "dense.json", {"points": quantity(5000, "1"), "fallback": quantity("CPU used", "")})
     completed = {"added_points": quantity({"house": 30}, "points"), "unregistered": quantity({"balloon": "weak"}, "")}
     write_json(scene / "completed.json", {"points": quantity(5030, "points"), **completed})
     for name, status in (("house", "registered"), ("balloon", "unregistered")):
         folder = tmp_path / "objects" / name
-        for stage in ("photos", "matches", "sfm", "cameras", "masks", "stage1", "stage2", "stage3", "witness"):
+        for stage in ("photos", "matches", "sparse", "undistorted", "masks", "stage1", "stage2", "stage3", "alignment"):
             write_json(folder / f"{stage}.json", {})
         (folder / "features.db").touch()
         quality = {"psnr_held_out": quantity(27.5, "dB"), "measured_on": quantity("training photos", "")}
         write_json(folder / "stage4.json", quality)
         write_json(folder / "object.json", {"points": quantity(1000, "1")})
-        for k, arm in enumerate(("full", "paper")):
+        for k, variant in enumerate(("full", "paper")):
             fine = {"status": quantity(status, ""), "reason": quantity("" if status == "registered" else "weak", "")}
-            write_json(folder / f"registration/{arm}/crop.json", {"diagonal": quantity(15.0, "m")})
+            write_json(folder / f"registration/{variant}/crop.json", {"diagonal": quantity(15.0, "m")})
             for stage in ("scale", "coarse"):
-                write_json(folder / f"registration/{arm}/{stage}.json", {})
+                write_json(folder / f"registration/{variant}/{stage}.json", {})
             scale = {"scale": quantity(2.0 + k, "scene units per object unit")}
-            write_json(folder / f"registration/{arm}/fine.json", fine | scale)
+            write_json(folder / f"registration/{variant}/fine.json", fine | scale)
             scores = {"fitness_source": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
-            write_json(folder / f"registration/{arm}/metrics.json", {"registration": scores})
+            write_json(folder / f"registration/{variant}/metrics.json", {"registration": scores})
         completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1"), "nue_scene": quantity(None, "1")}
         write_json(folder / "metrics.json", {"completion": completion})
         write_json(folder / "fusion.json", {"added_points": quantity(30, "points")})
-        arms = {arm: {"scale_error_pct": quantity(0.5 + k, "%")} for k, arm in enumerate(("full", "paper"))}
+        variants = {variant: {"scale_error_pct": quantity(0.5 + k, "%")} for k, variant in enumerate(("full", "paper"))}
         scene_scores = {f"scene_f_score_{w}": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
-        write_json(folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "arms": arms, **scene_scores})
+        write_json(
+            folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "variants": variants, **scene_scores}
+        )
         (folder / "fused.ply").write_text("points")
     (tmp_path / "logs/masks").mkdir(parents=True)
     (tmp_path / "logs/masks/sculpture.log").write_text("error: old\nloading\nerror: no <mask> matches a frame\n")
@@ -70,7 +72,7 @@ def summarise(results, names=("house", "balloon", "sculpture")):
         chunks=2,
         objects=[results / "objects" / name for name in names],
         scene_of=["demo"] * len(names),
-        arms=["full", "paper"],
+        variants=["full", "paper"],
         benchmarks=results / "benchmarks",
         logs=results / "logs",
         summary=results / "summary",
@@ -83,7 +85,7 @@ def read(summary, name, **options):
 
 
 def test_registration_holds_every_object_and_arm(results):
-    table = read(summarise(results), "registration").set_index(["object", "arm"])
+    table = read(summarise(results), "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "registered"
     assert table.loc[("house", "paper"), "fitness_source"] == pytest.approx(0.6)
     assert table.loc[("house", "paper"), "scale_error_pct"] == 1.5
@@ -96,7 +98,7 @@ def test_registration_holds_every_object_and_arm(results):
 def test_ablation_sets_the_arms_side_by_side(results):
     table = read(summarise(results), "ablation").set_index(["object", "measure"])
     assert table.loc[("house", "scale"), "unit"] == "m per object unit"
-    assert [float(table.loc[("house", "scale"), arm]) for arm in ("full", "paper")] == [2.0, 3.0]
+    assert [float(table.loc[("house", "scale"), variant]) for variant in ("full", "paper")] == [2.0, 3.0]
     assert table.loc[("sculpture", "status"), "full"] == "missing"
 
 
@@ -135,7 +137,7 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert max(len(line) for line in text.splitlines()) <= 100
     assert "object house: registered" in text and "object balloon: unregistered" in text
     assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
-    assert "dense_cloud.fallback: CPU used" in text
+    assert "dense.fallback: CPU used" in text
     assert "F-score 0.4 -> 0.9" in text
     assert "1 of 3 objects registered" in text
 
@@ -147,7 +149,7 @@ def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_ho
     assert "completed.ply" not in (summarise(results) / "summary.txt").read_text()
 
 
-@pytest.mark.parametrize("gone", ["features.db", "depth/1.json", "dense_cloud.json"])
+@pytest.mark.parametrize("gone", ["features.db", "depth/1.json", "dense.json"])
 def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gone):
     (results / "scenes/demo" / gone).unlink()
     (results / "logs/scene_sparse").mkdir()
@@ -156,33 +158,33 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     text = (summary / "summary.txt").read_text()
     assert "no dense cloud: only 3 photos [scene_sparse/demo.log]" in text and "5000" not in text
     assert "completed.ply" not in text
-    table = read(summary, "registration").set_index(["object", "arm"])
+    table = read(summary, "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "missing" and np.isnan(table.loc[("house", "full"), "scale"])
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
 
 
 def test_the_text_says_what_the_photos_alone_say(results):
     said = {"found": quantity(True, ""), "reason": quantity("9 of 12 points agree", ""), "scale": quantity(2.5, "")}
-    write_json(results / "objects/house/witness.json", said | {"scale_sd_log": quantity(0.0123, "1")})
+    write_json(results / "objects/house/alignment.json", said | {"scale_sd_log": quantity(0.0123, "1")})
     denied = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
-    write_json(results / "objects/balloon/witness.json", denied)
+    write_json(results / "objects/balloon/alignment.json", denied)
     text = (summarise(results) / "summary.txt").read_text()
-    assert re.search(r"witness +scale 2.5 \(standard deviation 1.23 %\), 9 of 12", text)
-    assert re.search(r"witness +not found: 3 of 12", text)
-    assert "witness.reason" not in text
+    assert re.search(r"alignment +scale 2.5 \(standard deviation 1.23 %\), 9 of 12", text)
+    assert re.search(r"alignment +not found: 3 of 12", text)
+    assert "alignment.reason" not in text
 
 
 def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
     (results / "objects/house/masks.json").unlink()
     summary = summarise(results)
-    assert read(summary, "registration").set_index(["object", "arm"]).loc[("house", "full"), "status"] == "missing"
+    assert read(summary, "registration").set_index(["object", "variant"]).loc[("house", "full"), "status"] == "missing"
     assert np.isnan(read(summary, "objects").set_index("object").loc["house", "stage4_psnr_db"])
     assert "F-score 0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
 
 
-def test_a_failed_arm_leaves_the_verdict_of_the_full_one(results):
+def test_a_failed_variant_leaves_the_verdict_of_the_full_one(results):
     (results / "objects/house/registration/paper/coarse.json").unlink()
-    table = read(summarise(results), "registration").set_index(["object", "arm"])
+    table = read(summarise(results), "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "registered"
     assert table.loc[("house", "paper"), "status"] == "missing"
 
@@ -193,7 +195,7 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
         chunks=2,
         objects=[tmp_path / "objects/house"],
         scene_of=["demo"],
-        arms=["full"],
+        variants=["full"],
         benchmarks=tmp_path / "benchmarks",
         logs=tmp_path / "logs",
         summary=tmp_path / "summary",
@@ -201,9 +203,9 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
     text = (tmp_path / "summary/summary.txt").read_text()
     assert "it has not run yet" in text and "no benchmark files yet" in text
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
-    with pytest.raises(StageError, match="no registration arm"):
+    with pytest.raises(StageError, match="no registration variant"):
         nothing = {"benchmarks": tmp_path, "logs": tmp_path, "summary": tmp_path}
-        write_summary(scenes=[], chunks=1, objects=[], scene_of=[], arms=[], **nothing)
+        write_summary(scenes=[], chunks=1, objects=[], scene_of=[], variants=[], **nothing)
 
 
 def test_the_last_error_is_that_of_the_named_object(tmp_path):

@@ -9,9 +9,9 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from scenefuse.clouds import Cloud, write_cloud
 from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
-from scenefuse.maps import write_depth
+from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.maps import write_depth
 from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluation import evaluate_object, evaluate_scene
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
@@ -111,9 +111,9 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_cloud(root / "after.ply", Cloud(scene_from_truth.apply(np.concatenate([surface, ground]))))
     exact = scene_from_truth @ TRUTH_FROM_OBJECT
     wrong = Sim3(exact.scale * 1.02, exact.rotation, exact.translation)
-    for arm, transform in (("full", exact), ("no_scale", wrong)):
+    for variant, transform in (("full", exact), ("no_scale", wrong)):
         content = {"status": quantity("registered", ""), "scene_from_object": quantity(transform.matrix, "")}
-        write_json(root / arm / "fine.json", content)
+        write_json(root / variant / "fine.json", content)
     write_json(
         root / "no_crop/fine.json", {"status": quantity("unregistered", ""), "scene_from_object": quantity(None, "")}
     )
@@ -154,8 +154,9 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     scene_of(planted, tmp_path / "s.json")
     evaluate_object(
         cameras=planted / "cameras", masks=planted / "masks", stages=[planted / "stage1", planted / "stage2"],
-        cloud=planted / "object.ply", arms=[planted / arm / "fine.json" for arm in ("full", "no_scale", "no_crop")],
-        witness=planted / "no_scale/fine.json", before=planted / "before.ply", after=planted / "after.ply",
+        cloud=planted / "object.ply",
+        variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
+        alignment=planted / "no_scale/fine.json", before=planted / "before.ply", after=planted / "after.ply",
         scene_evaluation=tmp_path / "s.json", truth_scene=planted / "truth/scene",
         truth_object=planted / "truth/thing", evaluation=tmp_path / "o.json", max_photos=5, samples=20000, seed=0,
     )  # fmt: skip
@@ -170,9 +171,9 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     assert value(result, "cloud_completeness_1pct") > 0.97
     assert value(result, "object_f_score") > 0.98
     assert value(result, "rotation_error_deg") < 1e-4
-    assert value(result["arms"]["no_scale"], "scale_error_pct") == pytest.approx(2.0, abs=1e-4)
-    assert value(result, "witness_scale_error_pct") == pytest.approx(2.0, abs=1e-4)
-    assert value(result["arms"]["no_crop"], "object_f_score") is None
+    assert value(result["variants"]["no_scale"], "scale_error_pct") == pytest.approx(2.0, abs=1e-4)
+    assert value(result, "alignment_scale_error_pct") == pytest.approx(2.0, abs=1e-4)
+    assert value(result["variants"]["no_crop"], "object_f_score") is None
     assert value(result, "scene_f_score_before") < 0.75 < 0.97 < value(result, "scene_f_score_after")
     assert value(result, "scene_precision_before") > 0.99
 

@@ -5,13 +5,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.clouds import Cloud, write_cloud
-from scenefuse.maps import write_depth
+from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.maps import write_depth
+from scenefuse.report.figures import draw_object, draw_scene
+from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
+from scenefuse.report.sheets import save_png
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Sim3
-from scenefuse.viz.figures import object_figures, scene_figure
-from scenefuse.viz.render import Camera, look_at, orbit_camera, point_radii, render
-from scenefuse.viz.sheets import save_png
 
 GREEN, RED, BLUE = (0, 200, 0), (220, 0, 0), (0, 0, 220)
 
@@ -158,7 +158,7 @@ def capture(tmp_path_factory):
 
 def draw(capture, fine, figures):
     write_json(capture / "fine.json", fine)
-    object_figures(
+    draw_object(
         name="box",
         scene=capture / "dense.ply",
         fused_scene=capture / "fused_scene.ply",
@@ -207,9 +207,9 @@ def test_an_object_far_from_the_scene_is_named(capture, tmp_path):
 def test_scene_figure(capture, tmp_path):
     figure = tmp_path / "scene.png"
     arguments = {"name": "demo", "dense": capture / "dense.ply", "georeferenced": capture / "cameras/sparse"}
-    scene_figure(**arguments, crops=[capture / "crop.ply"], objects=["box"], figure=figure)
+    draw_scene(**arguments, crops=[capture / "crop.ply"], objects=["box"], figure=figure)
     picture = cv2.imread(str(figure)).astype(int)
     # Camera markers are red on a grey scene.
     assert ((picture[..., 2] > 180) & (picture[..., 1] < 70)).sum() > 50
     with pytest.raises(StageError, match="1 crops but 2 object names"):
-        scene_figure(**arguments, crops=[capture / "crop.ply"], objects=["a", "b"], figure=figure)
+        draw_scene(**arguments, crops=[capture / "crop.ply"], objects=["a", "b"], figure=figure)

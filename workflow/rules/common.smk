@@ -9,8 +9,8 @@ import yaml
 from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import fingerprint
-from scenefuse.objects.mask_algebra import mask_folders
-from scenefuse.settings import merge, problem
+from scenefuse.masks.algebra import mask_folders
+from scenefuse.io.settings import merge, problem
 from scenefuse.stage import StageError
 
 ROOT = Path(workflow.basedir)
@@ -62,8 +62,9 @@ SCENES = table(config["scenes"], "scenes.schema.yaml")
 OBJECTS = table(config["objects"], "objects.schema.yaml")
 if not SCENES:
     raise WorkflowError(f"{config['scenes']} has no rows; add one for each scene")
-ARMS = {
-    name: merge(config["registration"], over) for name, over in config["arms"].items()
+VARIANTS = {
+    name: merge(config["registration"], over)
+    for name, over in config["variants"].items()
 }
 for name, row in OBJECTS.items():
     if row["scene"] not in SCENES:
@@ -75,7 +76,7 @@ for name, row in OBJECTS.items():
 wildcard_constraints:
     scene="[A-Za-z0-9_-]+",
     object="[A-Za-z0-9_-]+",
-    arm="[a-z_]+",
+    variant="[a-z_]+",
     stage="[1-4]",
     chunk="[0-9]+",
 
@@ -227,14 +228,14 @@ def mask_options(wildcards):
     )
 
 
-def arm_options(part):
-    """Params function: the settings of one step of an arm."""
-    return lambda wildcards: flags(ARMS[wildcards.arm][part])
+def variant_options(part):
+    """Params function: the settings of one step of a variant."""
+    return lambda wildcards: flags(VARIANTS[wildcards.variant][part])
 
 
 def crop_mode(wildcards):
-    """How an arm crops; without fiducials, the object's masks mark it."""
-    mode = ARMS[wildcards.arm]["crop"]["mode"]
+    """How a variant crops; without fiducials, the object's masks mark it."""
+    mode = VARIANTS[wildcards.variant]["crop"]["mode"]
     unmarked = not object_row(wildcards.object).get("fiducials")
     return "masks" if mode == "fiducials" and unmarked else mode
 
@@ -245,8 +246,8 @@ def crop_marks(wildcards):
     if mode == "masks":
         folder = f"results/objects/{wildcards.object}"
         return {
-            "witness": f"{folder}/witness.json",
-            "cameras": f"{folder}/cameras",
+            "alignment": f"{folder}/alignment.json",
+            "cameras": f"{folder}/undistorted",
             "masks": f"{folder}/masks",
         }
     return {"fiducials": row["fiducials"]} if mode == "fiducials" else {}
@@ -261,9 +262,9 @@ def crop_inputs(wildcards):
 
 
 def crop_options(wildcards):
-    """Settings of an arm's crop."""
+    """Settings of a variant's crop."""
     own = {"mode": crop_mode(wildcards)} | crop_marks(wildcards)
-    return flags(ARMS[wildcards.arm]["crop"] | own)
+    return flags(VARIANTS[wildcards.variant]["crop"] | own)
 
 
 def results_of(wildcards):
@@ -272,9 +273,9 @@ def results_of(wildcards):
         "metrics.json",
         "fusion.json",
         "frames.json",
-        *(f"registration/{arm}/metrics.json" for arm in ARMS),
+        *(f"registration/{variant}/metrics.json" for variant in VARIANTS),
     ]
-    scene_ends = ["dense_cloud.json", "completed.json"]
+    scene_ends = ["dense.json", "completed.json"]
     files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
     files += [f"results/objects/{name}/{end}" for name in OBJECTS for end in ends]
     files += [
@@ -305,8 +306,8 @@ def of_objects(path):
 def summary_command(log):
     """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
     return (
-        f"python {script('summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
+        f"python {script('report/write_summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
         f" --chunks {len(CHUNKS)} --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)}"
-        f" --scene-of {' '.join(row['scene'] for row in OBJECTS.values())} --arms {' '.join(ARMS)}"
+        f" --scene-of {' '.join(row['scene'] for row in OBJECTS.values())} --variants {' '.join(VARIANTS)}"
         f" --benchmarks results/benchmarks --logs results/logs --summary results/summary &> {log}"
     )

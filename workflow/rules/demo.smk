@@ -9,15 +9,15 @@
 DEMO_OBJECTS = "house|balloon|sculpture"
 
 
-rule demo_scene:
+rule render_scene:
     """Render the mapping flight."""
     output:
         photos=directory("results/demo/{scene}/scene/photos"),
         truth=directory("results/demo/{scene}/truth/scene"),
     log:
-        "results/logs/demo_scene/{scene}.log",
+        "results/logs/render_scene/{scene}.log",
     benchmark:
-        "results/benchmarks/demo_scene/{scene}.tsv"
+        "results/benchmarks/render_scene/{scene}.tsv"
     conda:
         "../../envs/reconstruction.yaml"
     threads: 8
@@ -27,8 +27,8 @@ rule demo_scene:
     params:
         options=flags(config["demo"]["flight"]),
         seed=config["seed"],
-        script=script("demo_scene.py"),
-        code=code("demo_scene.py"),
+        script=script("demo/render_scene.py"),
+        code=code("demo/render_scene.py"),
     message:
         "Demo {wildcards.scene}: rendering the flight"
     shell:
@@ -36,15 +36,15 @@ rule demo_scene:
         " {params.options} &> {log}"
 
 
-rule demo_object:
+rule render_object:
     """Render the photos around one object."""
     output:
         photos=directory("results/demo/{scene}/{object}/photos"),
         truth=directory("results/demo/{scene}/truth/{object}"),
     log:
-        "results/logs/demo_object/{scene}-{object}.log",
+        "results/logs/render_object/{scene}-{object}.log",
     benchmark:
-        "results/benchmarks/demo_object/{scene}-{object}.tsv"
+        "results/benchmarks/render_object/{scene}-{object}.tsv"
     wildcard_constraints:
         object=DEMO_OBJECTS,
     conda:
@@ -56,8 +56,8 @@ rule demo_object:
     params:
         options=flags(config["demo"]["orbit"]),
         seed=config["seed"],
-        script=script("demo_object.py"),
-        code=code("demo_object.py"),
+        script=script("demo/render_object.py"),
+        code=code("demo/render_object.py"),
     message:
         "Demo {wildcards.scene}: rendering the photos around the {wildcards.object}"
     shell:
@@ -65,16 +65,16 @@ rule demo_object:
         " --seed {params.seed} {params.options} &> {log}"
 
 
-rule demo_fiducials:
+rule click_fiducials:
     """Click the object in the flight's photos, as a person would: a pixel or so off, where it can be seen."""
     input:
         "results/demo/{scene}/truth/scene",
     output:
         "results/demo/{scene}/{object}/fiducials.tsv",
     log:
-        "results/logs/demo_fiducials/{scene}-{object}.log",
+        "results/logs/click_fiducials/{scene}-{object}.log",
     benchmark:
-        "results/benchmarks/demo_fiducials/{scene}-{object}.tsv"
+        "results/benchmarks/click_fiducials/{scene}-{object}.tsv"
     wildcard_constraints:
         object=DEMO_OBJECTS,
     conda:
@@ -85,8 +85,8 @@ rule demo_fiducials:
     params:
         options=flags(config["demo"]["fiducials"]),
         seed=config["seed"],
-        script=script("demo_clicks.py"),
-        code=code("demo_clicks.py"),
+        script=script("demo/click_points.py"),
+        code=code("demo/click_points.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in the flight's photos"
     shell:
@@ -94,16 +94,16 @@ rule demo_fiducials:
         " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"
 
 
-rule demo_prompts:
+rule click_prompts:
     """Click the object in a few of its own photos; these points prompt the masks."""
     input:
         "results/demo/{scene}/truth/{object}",
     output:
         "results/demo/{scene}/{object}/prompts.tsv",
     log:
-        "results/logs/demo_prompts/{scene}-{object}.log",
+        "results/logs/click_prompts/{scene}-{object}.log",
     benchmark:
-        "results/benchmarks/demo_prompts/{scene}-{object}.tsv"
+        "results/benchmarks/click_prompts/{scene}-{object}.tsv"
     wildcard_constraints:
         object=DEMO_OBJECTS,
     conda:
@@ -114,8 +114,8 @@ rule demo_prompts:
     params:
         options=flags(config["demo"]["prompts"]),
         seed=config["seed"],
-        script=script("demo_clicks.py"),
-        code=code("demo_clicks.py"),
+        script=script("demo/click_points.py"),
+        code=code("demo/click_points.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
     shell:

@@ -1,0 +1,83 @@
+"""The depth prior of a NeRF stage: maps of an earlier stage, moved to where the training photos match, and checked."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.io.maps import read_depth
+from scenefuse.mvs.consistency import compare, extent, surface_points
+from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.mvs.views import Views
+
+AGREEING_VIEWS = 2
+
+
+@dataclass(frozen=True)
+class DepthPrior:
+    """What is known of the surface before a NeRF is trained.
+
+    Attributes:
+        depths: (V, H, W) float32 along z in object units, 0 for none, at the size of the views; none in held-out views.
+        confidence: (V, H, W) float32 in 0..1.
+        refined_share: share of the prior's pixels that photos moved.
+        confident_share: share of the training photos' masks with a prior.
+    """
+
+    depths: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    refined_share: float
+    confident_share: float
+
+
+def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreement: float) -> DepthPrior:
+    """Read a stage's depth maps, move them by photos, and keep what photos do not deny and two other maps confirm.
+
+    Held-out photos take no part: neither their maps nor their pixels.
+
+    Args:
+        folder: of the earlier stage, with depth_maps/ and confidence_maps/.
+        views: photos, masks and cameras at the NeRF's size.
+        settings: of the refinement by photos.
+        agreement: largest difference of depth that agrees, share of the object's diagonal.
+    """
+    training = np.flatnonzero(~views.held_out)
+    names = [views.names[i] for i in training]
+    seen = replace(
+        views, names=names, images=views.images[training], mattes=views.mattes[training],
+        intrinsics=views.intrinsics[training], object_from_cam=views.object_from_cam[training],
+        held_out=views.held_out[training], tracks=[views.tracks[i] for i in training],
+    )  # fmt: skip
+    depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
+    certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
+    depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
+    asked = refine_by_photos(seen, seen.object_from_cam, depths, settings)
+    refined = float(asked.moved.sum() / max(int((depths > 0).sum()), 1))
+    depths = np.where(asked.denied, 0, asked.depths)
+    confidence = np.where(asked.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
+    depths = np.where(confidence > 0, depths, 0)
+    shape = views.masks.shape
+    whole = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    whole[0][training], whole[1][training] = depths, confidence
+    share = float((confidence > 0).sum() / max(int(seen.masks.sum()), 1))
+    return DepthPrior(*whole, refined, share)
+
+
+def _scaled(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """A map at another size, zeros where there is none."""
+    if not path.is_file():
+        return np.zeros(shape, np.float32)
+    return np.asarray(cv2.resize(read_depth(path), shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+
+
+def _confirmed(views: Views, depths: NDArray[np.float32], agreement: float) -> NDArray[np.bool_]:
+    """(V, H, W), True where enough other views have the same surface."""
+    known = [surface_points(*view) for view in zip(depths, views.intrinsics, views.object_from_cam)]
+    tolerance = agreement * extent(np.concatenate([points for points, _, _ in known]))
+    confirmed = np.zeros(depths.shape, bool)
+    for index, (points, rows, columns) in enumerate(known):
+        said = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
+        confirmed[index, rows, columns] = said.agree >= AGREEING_VIEWS
+    return confirmed

@@ -1,0 +1,265 @@
+"""Fusion: what the object knows and the scene lacks, added to the scene with its provenance."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
+from scenefuse.io.units import length_unit
+from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.transforms import Array, Sim3
+
+FROM_SCENE, FROM_OBJECT = 0, 1
+
+
+@dataclass(frozen=True)
+class FusionSettings:
+    """Settings of the fusion. Spacing is the median distance between neighbours in the scene crop."""
+
+    fill_spacings: float
+    """Object points farther than this many spacings from every scene point are new."""
+    fill_residuals: float
+    """The same distance is at least this many times the median distance between the clouds where both exist, so
+    that noise does not add a second layer."""
+    density: float
+    """Spacing of the added points over the scene's; 0 keeps every object point."""
+    feather_spacings: float
+    """Width of the seam in spacings: colours, and in `replace` positions too, blend over it."""
+    match_colors: bool
+    """Whether the object's colours get a gain and bias per channel from the overlap."""
+    min_confidence: float
+    """Object points with a lower confidence are not used."""
+
+
+@dataclass(frozen=True)
+class Fusion:
+    """The parts of a fused scene.
+
+    Attributes:
+        kept: (N,) bool over the scene's points.
+        added: new points in the scene frame, with `source`, `confidence`, `views`.
+        gain: (3,) colour gain of the object.
+        bias: (3,) colour bias, 0..255.
+        fill_distance: distance from the scene at which object points are new.
+    """
+
+    kept: NDArray[np.bool_]
+    added: Cloud
+    gain: Array
+    bias: Array
+    fill_distance: float
+
+
+def fuse_object(
+    *,
+    object: Path,
+    scene: Path,
+    crop: Path,
+    crop_report: Path,
+    fine: Path,
+    georeference: Path | None = None,
+    fused: Path,
+    fused_scene: Path,
+    fused_laz: Path,
+    report: Path,
+    mode: Literal["fill", "append", "replace"],
+    settings: FusionSettings,
+) -> None:
+    """Add a registered object to the scene (method F1, F2); an unregistered one leaves the scene as it is.
+
+    `append` adds every object point; `fill` those the scene lacks; `replace` takes the scene's points on the object
+    away and puts the object in their place, with a feathered seam.
+
+    Args:
+        object: object cloud (PLY) in its own frame.
+        scene: dense scene cloud (PLY).
+        crop: the scene's points on the object (PLY).
+        crop_report: JSON of the crop stage, for the box.
+        fine: JSON of the fine registration.
+        georeference: JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing.
+        fused: output PLY, the object's surroundings: the scene in the crop's box and what was added.
+        fused_scene: output PLY, the whole scene with what was added.
+        fused_laz: output LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one.
+        report: output JSON: counts, distances, gain, status.
+        mode: fill, append or replace.
+        settings: see FusionSettings.
+    """
+    start = time.perf_counter()
+    whole = with_provenance(read_cloud(scene), FROM_SCENE)
+    box = read_json(crop_report)
+    registration = read_json(fine)
+    status, reason = value(registration, "status"), value(registration, "reason")
+    part, obj = read_cloud(crop), read_cloud(object)
+    step = spacing(part.points)
+    fusion = fuse_registered(obj, whole, part, registration, mode, settings)
+    if status != "registered":
+        print(f"the object is not fused: {reason}", flush=True)
+    kept, added = whole[fusion.kept], fusion.added
+    level = np.array(value(box, "level_from_scene"))
+    low, high = np.array(value(box, "box_low")), np.array(value(box, "box_high"))
+    levelled = kept.points @ level.T
+    around = kept[((levelled >= low) & (levelled <= high)).all(1)]
+    write_cloud(fused, concatenate([around, added]) if len(added) else around)
+    crs = write_scene(fused_scene, fused_laz, concatenate([kept, added]) if len(added) else kept, georeference)
+    unit = length_unit(georeference)
+    write_json(
+        report,
+        {
+            "status": quantity("fused" if status == "registered" else "unregistered", ""),
+            "reason": quantity(reason, ""),
+            "mode": quantity(mode, ""),
+            "scene_points": quantity(len(whole), "points"),
+            "removed_points": quantity(int((~fusion.kept).sum()), "points"),
+            "added_points": quantity(len(added), "points"),
+            "object_points": quantity(len(obj), "points"),
+            "surroundings_points": quantity(len(around) + len(added), "points"),
+            "scene_spacing": quantity(step, unit),
+            "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
+            "fill_distance": quantity(fusion.fill_distance, unit),
+            "color_gain": quantity(fusion.gain, "1"),
+            "color_bias": quantity(fusion.bias, "of 255"),
+            "crs": quantity(crs, ""),
+            "seconds": quantity(time.perf_counter() - start, "s"),
+        },
+    )
+
+
+def fuse_registered(
+    obj: Cloud, scene: Cloud, part: Cloud, registration: dict[str, Any], mode: str, settings: FusionSettings
+) -> Fusion:
+    """`fuse_clouds` at the pose of a fine registration's JSON; an unregistered object leaves the scene as it is."""
+    if value(registration, "status") == "registered":
+        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
+        return fuse_clouds(obj, scene, part, pose, mode, settings)
+    nothing = with_provenance(obj, FROM_OBJECT)[np.zeros(len(obj), dtype=bool)]
+    return Fusion(np.ones(len(scene), dtype=bool), nothing, np.ones(3), np.zeros(3), 0.0)
+
+
+def fuse_clouds(
+    obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, mode: str, settings: FusionSettings
+) -> Fusion:
+    """Decide what is added and what is taken away; see `fuse`.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the whole scene, with provenance.
+        part: the scene's points on the object.
+        scene_from_object: the registration.
+        mode: fill, append or replace.
+        settings: see FusionSettings.
+    """
+    moved = with_provenance(obj, FROM_OBJECT).transformed(scene_from_object)
+    moved = moved[moved.fields["confidence"] >= settings.min_confidence]
+    step = spacing(part.points)
+    low, high = moved.points.min(0), moved.points.max(0)
+    reach = 10 * step
+    near = ((scene.points >= low - reach) & (scene.points <= high + reach)).all(1)
+    tree = cKDTree(scene.points[near] if near.any() else scene.points)
+    local = scene[near] if near.any() else scene
+    distance, partner = tree.query(moved.points, workers=threads())
+    fill = settings.fill_spacings * step
+    overlap = distance <= 3 * fill
+    if overlap.sum() > 50:
+        fill = max(fill, settings.fill_residuals * float(np.median(distance[overlap])))
+    gain, bias = np.ones(3), np.zeros(3)
+    if settings.match_colors and moved.colors is not None and local.colors is not None:
+        close = distance <= fill
+        if close.sum() >= 50:
+            gain, bias = match_colors(moved.colors[close], local.colors[partner[close]])
+            moved = replace(moved, colors=_bytes(moved.colors * gain + bias))
+    kept = np.ones(len(scene), dtype=bool)
+    if mode == "fill":
+        moved = moved[distance > fill]
+    elif mode == "replace":
+        index = np.flatnonzero(near)
+        to_object = cKDTree(moved.points).query(scene.points[index], workers=threads())[0]
+        kept[index[to_object <= fill]] = False
+    added = _thin(moved, settings.density * step) if settings.density > 0 and len(moved) > 10 else moved
+    if mode != "append" and len(added) and kept.any():
+        added = _feather(added, scene[kept & near], settings.feather_spacings * step, mode == "replace", fill)
+    return Fusion(kept, added, gain, bias, fill)
+
+
+def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Gain and bias (3,) per channel with gain a + bias = b, from medians and median deviations of pairs (M, 3)."""
+    mine, theirs = a.astype(np.float64), b.astype(np.float64)
+    middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
+    wide_a = np.abs(mine - middle_a).mean(0)
+    wide_b = np.abs(theirs - middle_b).mean(0)
+    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), 0.5, 2.0)
+    return gain, middle_b - gain * middle_a
+
+
+def with_provenance(cloud: Cloud, source: int) -> Cloud:
+    """The cloud with `source` (uint8), `confidence` (float32) and `views` (int32), measured ones where it has them."""
+    n, had = len(cloud), cloud.fields
+    fields: dict[str, NDArray[Any]] = {
+        "source": had.get("source", np.full(n, source)).astype(np.uint8),
+        "confidence": had.get("confidence", np.ones(n)).astype(np.float32),
+        "views": had.get("views", np.zeros(n)).astype(np.int32),
+    }
+    return replace(cloud, fields=fields)
+
+
+def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
+    """Write a cloud in the scene's frame as PLY, and as LAZ in the scene's CRS; returns that CRS, None without one."""
+    write_cloud(ply, cloud)
+    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
+    about_origin = replace(crs_from_scene, translation=np.zeros(3))
+    write_laz(laz, cloud.transformed(about_origin), crs_from_scene.translation, crs)
+    return crs
+
+
+def _thin(cloud: Cloud, wanted: float) -> Cloud:
+    """Thin a cloud to a median spacing of `wanted`; one that is sparser already stays as it is."""
+    if spacing(cloud.points) >= wanted:
+        return cloud
+    low, high = 0.3 * wanted, 2.0 * wanted
+    best = cloud
+    for _ in range(8):
+        middle = float(np.sqrt(low * high))
+        best = voxel_downsample(cloud, middle)
+        if len(best) < 10 or spacing(best.points) > wanted:
+            high = middle
+        else:
+            low = middle
+    return best
+
+
+def _feather(added: Cloud, kept: Cloud, width: float, move: bool, fill: float) -> Cloud:
+    """Blend added points into what is kept, over `width` from the seam: colours, and positions when `move` is set.
+
+    At the seam a point takes the mean of its own and its nearest kept neighbours' values; the share of the
+    neighbours falls linearly to nothing.
+    """
+    if width <= 0 or len(kept) < 8:
+        return added
+    distance, partner = cKDTree(kept.points).query(added.points, k=4, workers=threads())
+    share = 0.5 * np.clip(1 - (distance[:, :1] - fill) / width, 0, 1)
+    if added.colors is not None and kept.colors is not None:
+        around = kept.colors[partner].astype(np.float64).mean(1)
+        added = replace(added, colors=_bytes((1 - share) * added.colors + share * around))
+    if move and added.normals is not None:
+        offset = kept.points[partner].mean(1) - added.points
+        normal = added.normals.astype(np.float64)
+        height = np.clip((offset * normal).sum(1, keepdims=True), -fill, fill)
+        added = replace(added, points=added.points + share * height * normal)
+    return added
+
+
+def _crs_from_scene(georeference: Path | None) -> tuple[Sim3, str] | None:
+    """The transform into a georeferenced scene's CRS and the CRS, or None."""
+    content = {} if georeference is None else read_json(georeference)
+    crs, transform = content.get("crs"), content.get("crs_from_scene")
+    if not crs or not transform or not crs["value"] or transform["value"] is None:
+        return None
+    return Sim3.from_matrix(np.array(transform["value"])), str(crs["value"])
+
+
+def _bytes(colors: Array) -> NDArray[np.uint8]:
+    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)

@@ -1,0 +1,186 @@
+"""Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+from scipy.spatial import cKDTree
+
+from scenefuse.io.formats import COLOR, NORMAL, POSITION, bytes_of, read_columns
+from scenefuse.stage import StageError, atomic_file
+from scenefuse.transforms import Sim3
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """A point cloud in one frame.
+
+    Attributes:
+        points: (N, 3) float64 positions.
+        normals: (N, 3) float32 unit vectors, or None.
+        colors: (N, 3) uint8 RGB, or None.
+        fields: further values per point, name -> (N,) array (`source`, `confidence`, `views`, ...).
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float32] | None = None
+    colors: NDArray[np.uint8] | None = None
+    fields: dict[str, NDArray[Any]] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __getitem__(self, index: NDArray[Any]) -> "Cloud":
+        """The points that a mask or an index array selects."""
+        return Cloud(
+            self.points[index],
+            None if self.normals is None else self.normals[index],
+            None if self.colors is None else self.colors[index],
+            {name: values[index] for name, values in self.fields.items()},
+        )
+
+    def transformed(self, b_from_a: Sim3) -> "Cloud":
+        """The same points in frame b; normals turn, fields stay."""
+        normals = None if self.normals is None else b_from_a.rotate(self.normals).astype(np.float32)
+        return replace(self, points=b_from_a.apply(self.points), normals=normals)
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the axis-aligned bounding box's diagonal."""
+        return float(np.linalg.norm(np.ptp(self.points, axis=0))) if len(self) else 0.0
+
+
+def concatenate(clouds: list[Cloud]) -> Cloud:
+    """One cloud after the other; normals, colours and fields are kept where every cloud has them."""
+    names = set.intersection(*(set(c.fields) for c in clouds))
+    normals = [c.normals for c in clouds if c.normals is not None]
+    colors = [c.colors for c in clouds if c.colors is not None]
+    return Cloud(
+        np.concatenate([c.points for c in clouds]),
+        np.concatenate(normals) if len(normals) == len(clouds) else None,
+        np.concatenate(colors) if len(colors) == len(clouds) else None,
+        {name: np.concatenate([c.fields[name] for c in clouds]) for name in sorted(names)},
+    )
+
+
+def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
+    """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value."""
+    group, counts = _voxels(cloud.points, voxel)
+    means = _group_means(cloud.points, group, counts)
+    distance = ((cloud.points - means[group]) ** 2).sum(1)
+    order = np.lexsort((distance, group))
+    first = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    return cloud[np.sort(order[first])]
+
+
+def voxel_average(cloud: Cloud, voxel: float) -> Cloud:
+    """One point per occupied voxel: the mean of its points, normals and colours, less noisy than any of them.
+
+    Normals whose mean vanishes (two sides of a thin sheet) are those of one of the points. Fields are left out.
+    """
+    group, counts = _voxels(cloud.points, voxel)
+    normals, colors = cloud.normals, cloud.colors
+    if normals is not None:
+        mean = _group_means(normals, group, counts)
+        length = np.linalg.norm(mean, axis=1, keepdims=True)
+        anyone = normals[np.unique(group, return_index=True)[1]]
+        normals = np.where(length > 0.2, mean / np.maximum(length, 1e-12), anyone).astype(np.float32)
+    if colors is not None:
+        colors = np.rint(_group_means(colors, group, counts)).astype(np.uint8)
+    return Cloud(_group_means(cloud.points, group, counts), normals, colors)
+
+
+def _voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The occupied voxel of every point (N,), numbered from 0, and the points in each."""
+    cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)
+    size = cells.max(0) + 1
+    keys = (cells[:, 0] * size[1] + cells[:, 1]) * size[2] + cells[:, 2]
+    _, group, counts = np.unique(keys, return_inverse=True, return_counts=True)
+    return group, counts
+
+
+def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
+    return np.stack([np.bincount(group, rows[:, k]) / counts for k in range(rows.shape[1])], axis=1)
+
+
+def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> float:
+    """Median distance from a point to its nearest neighbour, over a seeded sample, in the cloud's unit."""
+    tree = cKDTree(points)
+    chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
+    return float(np.median(tree.query(points[chosen], k=2)[0][:, 1]))
+
+
+def read_cloud(path: Path) -> Cloud:
+    """Read PLY, LAS, LAZ, E57, PCD, or text (XYZ, PTS, TXT, ASC, CSV). Rows without a finite position are left out.
+
+    Raises:
+        StageError: the file is missing, damaged, of an unknown ending, or holds no points.
+    """
+    columns = read_columns(Path(path))
+    points = np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1)
+    finite = np.isfinite(points).all(1)
+    if not finite.all():
+        print(f"{path}: {np.sum(~finite)} of {len(points)} rows have no finite position and are left out", flush=True)
+        if not finite.any():
+            raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
+        points, columns = points[finite], {name: values[finite] for name, values in columns.items()}
+    normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
+    colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
+    return Cloud(
+        points,
+        None if normals is None else np.nan_to_num(normals.astype(np.float32)),
+        None if colors is None else bytes_of(colors),
+        {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
+    )
+
+
+def write_cloud(path: Path, cloud: Cloud) -> None:
+    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are."""
+    columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
+    if cloud.normals is not None:
+        columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
+    if cloud.colors is not None:
+        columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
+    # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
+    columns |= {
+        name: v.astype(np.float64) if v.dtype in (np.int64, np.uint64) else v for name, v in cloud.fields.items()
+    }
+    vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
+    for name, values in columns.items():
+        vertex[name] = values
+    with atomic_file(path) as temporary:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+
+
+def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
+    """Write LAZ 1.4, coordinates to a millimetre; without a CRS to 1e-8 of the cloud's diagonal.
+
+    Args:
+        path: output, .laz or .las.
+        cloud: with the axes of the CRS, relative to `origin`, which is added.
+        origin: (3,) coordinates of the cloud's local origin.
+        crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
+    """
+    import laspy
+    import pyproj
+
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    step = 0.001 if crs is not None else max(cloud.diagonal, 1e-300) * 1e-8
+    header.scales, header.offsets = np.full(3, step), np.floor(origin)
+    if crs is not None:
+        header.add_crs(pyproj.CRS.from_user_input(crs))
+    taken = set(header.point_format.dimension_names)
+    names = {name: (f"{name}_" if name in taken else name)[:32] for name in cloud.fields}  # LAS allows 32 letters
+    for name, values in cloud.fields.items():
+        header.add_extra_dim(laspy.ExtraBytesParams(names[name], f"{values.dtype.kind}{values.dtype.itemsize}"))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (cloud.points + origin).T
+    if cloud.colors is not None:
+        las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * 257
+    for name, values in cloud.fields.items():
+        las[names[name]] = values
+    with atomic_file(path) as temporary:
+        las.write(str(temporary))

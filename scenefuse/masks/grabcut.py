@@ -1,0 +1,188 @@
+"""Masks by GrabCut (Rother et al. 2004), seeded by what the sparse reconstruction knows of object and background."""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+from scipy.spatial import Delaunay
+
+from scenefuse.mvs.visual_hull import Mask
+
+Trimap = NDArray[np.uint8]
+COLOUR_BINS = 32
+
+
+def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spanning_px: NDArray[np.float64]) -> Trimap:
+    """GrabCut labels of a photo before any mask is known, (H, W).
+
+    Args:
+        size: (height, width).
+        outline_px: (N, 2) pixels; nothing outside their convex hull is object.
+        spanning_px: (M, 2) projected points of the object, seen or hidden; their convex hull is likely object.
+    """
+    trimap = np.full(size, cv2.GC_BGD, dtype=np.uint8)
+    fill_hull(trimap, outline_px, cv2.GC_PR_BGD)
+    likely = np.zeros(size, dtype=np.uint8)
+    fill_hull(likely, spanning_px, 1)
+    trimap[(trimap == cv2.GC_PR_BGD) & (likely > 0)] = cv2.GC_PR_FGD
+    return trimap
+
+
+def prefer_colour(trimap: Trimap, evidence: NDArray[np.float32], threshold: float = 1.5) -> None:
+    """Turn a likely label where the colour speaks clearly for the other side, in place.
+
+    Args:
+        trimap: (H, W) labels.
+        evidence: (H, W) log ratio of the colour's densities, object over background.
+        threshold: what counts as clearly.
+    """
+    trimap[(trimap == cv2.GC_PR_FGD) & (evidence < -threshold)] = cv2.GC_PR_BGD
+    trimap[(trimap == cv2.GC_PR_BGD) & (evidence > threshold)] = cv2.GC_PR_FGD
+
+
+@dataclass(frozen=True)
+class Colours:
+    """Colour densities of object and background over all photos: one photo alone shows too little of either.
+
+    Attributes:
+        log_ratio: (B, B, B) log of object over background density, per cell of Lab.
+    """
+
+    log_ratio: NDArray[np.float32]
+
+    def evidence(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """(H, W) log ratios of a (H, W, 3) BGR photo."""
+        cells = _cells(image)
+        return self.log_ratio[cells[..., 0], cells[..., 1], cells[..., 2]]
+
+
+def learn_colours(images: list[NDArray[np.uint8]], own: list[Mask], others: list[Mask]) -> Colours:
+    """Colours of the pixels that are surely object and of those that are surely not, over all photos."""
+    counts = np.zeros((2, COLOUR_BINS, COLOUR_BINS, COLOUR_BINS), dtype=np.float32)
+    for image, *sides in zip(images, own, others):
+        cells = _cells(image)
+        for k, side in enumerate(sides):
+            flat = np.ravel_multi_index(tuple(cells[side].T), counts.shape[1:])
+            counts[k] += np.bincount(flat, minlength=COLOUR_BINS**3).reshape(counts.shape[1:])
+    smooth = np.stack([ndimage.gaussian_filter(c / max(c.sum(), 1), 0.7) for c in counts])
+    return Colours(np.log((smooth[0] + 2e-5) / (smooth[1] + 2e-5)).astype(np.float32))
+
+
+def _cells(image: NDArray[np.uint8]) -> NDArray[np.intp]:
+    """(H, W, 3) cell of each pixel of a BGR photo in Lab; a and b are stretched: photographs use little of them."""
+    lab = cv2.cvtColor(image, cv2.COLOR_BGR2LAB).astype(np.float32)
+    lab[..., 1:] = (lab[..., 1:] - 128) * 2 + 128
+    return np.clip(lab * (COLOUR_BINS / 256), 0, COLOUR_BINS - 1).astype(np.intp)
+
+
+def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band_px: float) -> Trimap:
+    """GrabCut labels from the hull's outline and the mask so far, (H, W).
+
+    Certain is only what both and the colours agree on, away from the outline; beyond two bands outside it
+    nothing is object, whatever the mask says. Elsewhere the three vote.
+
+    Args:
+        outline: the hull as the photo sees it.
+        mask: the photo's own mask.
+        evidence: (H, W) log ratio of the colour's densities; where it is strong it overrules both.
+        band_px: half width of the band along the outline that is never certain.
+    """
+    inner = ndimage.distance_transform_edt(outline)
+    outer = ndimage.distance_transform_edt(~outline)
+    # One pixel's colour is noise: its neighbours within half a band have their say.
+    colour = cv2.GaussianBlur(np.clip(evidence, -3, 3), (0, 0), band_px / 4)
+    votes = colour + np.where(outline, 1, -1) + np.where(mask, 1, -1)
+    trimap = np.where(votes > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
+    trimap[(inner > band_px) & mask & (colour > 0)] = cv2.GC_FGD
+    trimap[(outer > band_px) & ~mask & (colour < 0) | (outer > 2 * band_px)] = cv2.GC_BGD
+    return trimap
+
+
+def stamp_seeds(
+    trimap: Trimap,
+    pixels: NDArray[np.float64],
+    positions: NDArray[np.float64],
+    kind: NDArray[np.int8],
+    radius_px: float,
+    max_edge: float,
+) -> None:
+    """Mark what the sparse points make certain, in place: a disc around each, and small triangles between
+    those on the object.
+
+    Args:
+        trimap: (H, W) labels.
+        pixels: (K, 2) where the photo sees the points.
+        positions: (K, 3) of the points.
+        kind: (K,) 1 on the object, -1 not on it, 0 unknown.
+        radius_px: of the discs.
+        max_edge: longest side of a triangle, in the unit of the positions: smaller than the holes of the object.
+    """
+    own = kind > 0
+    if len(np.unique(np.round(pixels, 1), axis=0)) >= 4 and own.sum() >= 3:
+        corners = Delaunay(pixels, qhull_options="Qbb Qc QJ").simplices
+        corners = corners[own[corners].all(1)]
+        edges = np.linalg.norm(positions[corners] - positions[np.roll(corners, 1, axis=1)], axis=2).max(1)
+        for triangle in corners[edges < max_edge]:
+            cv2.fillConvexPoly(trimap, pixels[triangle].astype(np.int32), cv2.GC_FGD)
+    for label, wanted in ((cv2.GC_BGD, kind < 0), (cv2.GC_FGD, own)):
+        for x, y in pixels[wanted]:
+            cv2.circle(trimap, (int(x), int(y)), max(1, round(radius_px)), label, -1)
+
+
+def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations: int) -> Mask:
+    """The object's pixels, (H, W).
+
+    Args:
+        image: (H, W, 3) uint8 BGR.
+        trimap: (H, W) OpenCV's labels.
+        width_px: the cut runs on an image at most this wide, cropped to the object's surroundings.
+        iterations: rounds of learning colours and cutting.
+    """
+    height, width = trimap.shape
+    unknown = trimap != cv2.GC_BGD
+    if not unknown.any():
+        return np.zeros((height, width), dtype=bool)
+    rows, columns = np.flatnonzero(unknown.any(1)), np.flatnonzero(unknown.any(0))
+    pad = max(8, (rows[-1] - rows[0] + columns[-1] - columns[0]) // 8)
+    top, bottom = max(0, rows[0] - pad), min(height, rows[-1] + pad + 1)
+    left, right = max(0, columns[0] - pad), min(width, columns[-1] + pad + 1)
+    scale = min(1.0, width_px / width)
+    size = (max(8, round((right - left) * scale)), max(8, round((bottom - top) * scale)))
+    picture = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
+    labels = cv2.resize(trimap[top:bottom, left:right], size, interpolation=cv2.INTER_NEAREST)
+    certain = (
+        ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).sum(),
+        ((labels == cv2.GC_BGD) | (labels == cv2.GC_PR_BGD)).sum(),
+    )
+    # GrabCut learns five colours of each side and needs pixels to learn from.
+    if min(certain) >= 10:
+        models = np.zeros((1, 65)), np.zeros((1, 65))
+        cv2.setRNGSeed(0)
+        cv2.grabCut(picture, labels, (0, 0, 1, 1), models[0], models[1], iterations, cv2.GC_INIT_WITH_MASK)
+    found = ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).astype(np.float32)
+    mask = np.zeros((height, width), dtype=bool)
+    found = cv2.resize(found, (right - left, bottom - top), interpolation=cv2.INTER_LINEAR)
+    mask[top:bottom, left:right] = found > 0.5
+    return mask
+
+
+def cleaned(mask: Mask, smallest_share: float = 0.02) -> Mask:
+    """The mask without specks and pinholes: parts smaller than a share of the mask's area change side."""
+    area = np.count_nonzero(mask)
+    for side in (True, False):
+        labels, count = ndimage.label(mask == side)
+        if count > 1:
+            sizes = np.bincount(labels.ravel(), minlength=count + 1)
+            small = sizes < smallest_share * area
+            small[0] = False
+            mask = np.where(small[labels], not side, mask)
+    return mask
+
+
+def fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int) -> None:
+    """Fill the convex hull of (N, 2) pixels."""
+    # cv2 draws with 16-bit coordinates internally: far-away corners are clipped to a frame around the photo.
+    clipped = np.clip(points, -4 * max(canvas.shape), 5 * max(canvas.shape)).astype(np.int32)
+    cv2.fillConvexPoly(canvas, cv2.convexHull(clipped.reshape(-1, 1, 2)), value)

@@ -1,0 +1,195 @@
+"""Masks by SAM 2 (Ravi et al. 2024): hiera-tiny run by ONNX Runtime from weights whose hashes are checked, or any
+checkpoint run by transformers, on a GPU where there is one."""
+
+from pathlib import Path
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+from scenefuse.masks.grabcut import cleaned
+from scenefuse.masks.target import Target
+from scenefuse.mvs.visual_hull import Frame, Mask, agreement
+from scenefuse.stage import StageError, sha256
+
+SIDE_PX = 1024
+"""Side of the square image the network takes."""
+LOGITS_PX = 256
+"""Side of the masks it gives and takes."""
+BOX_GROWTH = 0.05
+"""Growth of the box around the prompts, as a share of its longer side."""
+
+Array = NDArray[np.float64]
+
+
+class Sam2(Protocol):
+    """The network, loaded: an encoder of photos and a decoder of prompts."""
+
+    def encode(self, image: NDArray[np.uint8]) -> Any:
+        """Features of a (H, W, 3) uint8 BGR photo, for any number of prompts."""
+
+    def masks(self, features: Any, size: tuple[int, int], points_px: Array, box_px: Array) -> tuple[list[Mask], Array]:
+        """Three masks (H, W), a part, a larger part and the whole, and how good the network thinks they are, (3,).
+
+        Args:
+            features: of the photo.
+            size: its (height, width).
+            points_px: (P, 2) pixels on the object.
+            box_px: (2, 2) corners of a box around it, upper left first.
+        """
+
+
+class Sam2Onnx:
+    """SAM 2 by ONNX Runtime."""
+
+    def __init__(self, encoder: Path, decoder: Path, threads: int) -> None:
+        """Load both networks onto the CPU (or CUDA, where ONNX Runtime has it)."""
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        options.log_severity_level = 3
+        providers = [
+            p for p in ("CUDAExecutionProvider", "CPUExecutionProvider") if p in onnxruntime.get_available_providers()
+        ]
+        self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
+        self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
+
+    def encode(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
+        """See Sam2; 17 MB."""
+        names = [o.name for o in self._encoder.get_outputs()]
+        outputs = self._encoder.run(None, {self._encoder.get_inputs()[0].name: _blob(image)})
+        return dict(zip(names, outputs))
+
+    def masks(
+        self, features: dict[str, NDArray[np.float32]], size: tuple[int, int], points_px: Array, box_px: Array
+    ) -> tuple[list[Mask], Array]:
+        """See Sam2."""
+        points, labels = _prompts(size, points_px, box_px)
+        inputs = features | {
+            "point_coords": points[None],
+            "point_labels": labels[None],
+            "mask_input": np.zeros((1, 1, LOGITS_PX, LOGITS_PX), dtype=np.float32),
+            "has_mask_input": np.zeros(1, dtype=np.float32),
+        }
+        wanted = {i.name for i in self._decoder.get_inputs()}
+        outputs = self._decoder.run(None, {k: v for k, v in inputs.items() if k in wanted})
+        found = next(o for o in outputs if o.ndim == 4)[0]
+        quality = next(o for o in outputs if o.ndim == 2)[0].astype(np.float64)
+        return _enlarged(found, size), quality
+
+
+class Sam2Transformers:
+    """SAM 2 by transformers, on CUDA where it is."""
+
+    def __init__(self, checkpoint: Path) -> None:
+        """Load a checkpoint from its folder; nothing is downloaded.
+
+        Raises:
+            StageError: transformers is not installed, or the folder holds no checkpoint of SAM 2.
+        """
+        try:
+            from transformers import Sam2Model
+        except ImportError as error:
+            raise StageError(
+                f"object.masks.sam2_checkpoint needs transformers, which cannot be loaded ({error}): "
+                "pip install transformers==5.23.0"
+            ) from None
+        try:
+            network: Any = Sam2Model.from_pretrained(checkpoint, local_files_only=True)
+        except (OSError, ValueError) as error:
+            reason = str(error).splitlines()[0]
+            raise StageError(f"{checkpoint} is no folder of a SAM 2 checkpoint for transformers: {reason}") from None
+        self._device = "cuda" if torch.cuda.is_available() else "cpu"
+        self._network = network.to(self._device).eval()
+
+    def encode(self, image: NDArray[np.uint8]) -> list[torch.Tensor]:
+        """See Sam2."""
+        with torch.inference_mode():
+            return self._network.get_image_embeddings(torch.from_numpy(_blob(image)).to(self._device))
+
+    def masks(
+        self, features: list[torch.Tensor], size: tuple[int, int], points_px: Array, box_px: Array
+    ) -> tuple[list[Mask], Array]:
+        """See Sam2."""
+        points, labels = (torch.from_numpy(a)[None, None].to(self._device) for a in _prompts(size, points_px, box_px))
+        with torch.inference_mode():
+            found = self._network(
+                image_embeddings=features, input_points=points, input_labels=labels.int(), multimask_output=True
+            )
+        quality = found.iou_scores[0, 0].double().cpu().numpy()
+        return _enlarged(found.pred_masks[0, 0].float().cpu().numpy(), size), quality
+
+
+def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """A BGR photo as the (1, 3, 1024, 1024) input of the encoder."""
+    rgb = cv2.cvtColor(cv2.resize(image, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
+    normalised = (rgb / 255.0 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    return np.ascontiguousarray(normalised.transpose(2, 0, 1)[None], dtype=np.float32)
+
+
+def _prompts(size: tuple[int, int], points_px: Array, box_px: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Points and the box's corners (P + 2, 2) in the network's pixels, and their labels: 1, 2 and 3."""
+    height, width = size
+    points = np.concatenate([points_px, box_px]) * [SIDE_PX / width, SIDE_PX / height]
+    labels = [1.0] * len(points_px) + [2.0, 3.0]
+    return points.astype(np.float32), np.array(labels, dtype=np.float32)
+
+
+def _enlarged(logits: NDArray[np.float32], size: tuple[int, int]) -> list[Mask]:
+    """The network's (3, 256, 256) answers at the photo's size."""
+    height, width = size
+    return [cv2.resize(m.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0 for m in logits]
+
+
+def ask(network: Sam2, target: Target, frame: Frame, outline: Mask | None) -> Mask:
+    """The object in one photo: asked for by all prompts, as this photo sees them, and the box around them.
+
+    A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+
+    Args:
+        network: SAM 2.
+        target: prompts that span the object.
+        frame: the photo.
+        outline: (H, W) what the other photos make of the object; then the box is its own, and the answer most like it
+            is taken. The network does not see it: it would only give it back.
+
+    Returns:
+        (H, W), of the network's answers the one with most prompts in it and the best quality, or the most like the
+        outline; empty where no prompt is in the photo.
+    """
+    size = frame.image.shape[:2]
+    pixels, depth = frame.project(target.spanning)
+    front = depth > 0
+    inside = front & (pixels >= 0).all(1) & (pixels < size[::-1]).all(1)
+    if not inside.any():
+        return np.zeros(size, dtype=bool)
+    spanned = pixels[front] if outline is None or not outline.any() else np.argwhere(outline)[:, ::-1] + 0.5
+    low, high = spanned.min(0), spanned.max(0)
+    grow = BOX_GROWTH * (high - low).max()
+    box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
+    answers, quality = network.masks(network.encode(frame.image), size, pixels[inside], box)
+    u, v = pixels[inside].astype(int).T
+    if outline is not None:
+        quality = np.array([agreement(m, outline) for m in answers])
+    return cleaned(answers[int(np.argmax([m[v, u].mean() * q for m, q in zip(answers, quality)]))])
+
+
+def check_weights(path: Path, expected_sha256: str, what: str) -> Path:
+    """The path of a weight file that is there and is the right one.
+
+    Raises:
+        StageError: no such file, or another hash.
+    """
+    if not path.is_file():
+        raise StageError(
+            f"the SAM 2 {what} weights {path} do not exist; fetch them (rule sam2_weights), or use grabcut"
+        )
+    found = sha256(path)
+    if found != expected_sha256:
+        raise StageError(
+            f"the SAM 2 {what} weights {path} have SHA-256 {found[:16]}..., expected {expected_sha256[:16]}...; "
+            "fetch them again (rule sam2_weights)"
+        )
+    return path

@@ -1,0 +1,116 @@
+"""Where an object is, by the sparse model and a few points on it: box, ground, and which sparse points are its own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import Delaunay
+
+from scenefuse.masks.box import Ground, find_ground, in_hull, span, upright_box
+from scenefuse.mvs.visual_hull import Box, Frame, Mask
+from scenefuse.stage import StageError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Target:
+    """What the sparse model and the prompts say about the object.
+
+    Attributes:
+        box: where it is.
+        ground: under which nothing belongs to it.
+        ground_found: whether the ground was measured; otherwise it is the box's bottom.
+        spanning: (N, 3) points on the object that span it: the prompts.
+        margin: how far the object may reach beyond them, in object units.
+        parts: (K, 4) rows of them whose tetrahedron is taken for object.
+        sparse: (P, 3) sparse points.
+        kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
+    """
+
+    box: Box
+    ground: Ground
+    ground_found: bool
+    spanning: Array
+    margin: float
+    parts: NDArray[np.intp]
+    sparse: Array
+    kind: NDArray[np.int8]
+
+    def outline(self, frame: Frame) -> Array:
+        """Pixels (N, 2) in whose convex hull the object is; all of the photo where that ends behind the camera."""
+        pixels, depth = frame.project(span(self.spanning, self.margin))
+        height, width = frame.image.shape[:2]
+        return pixels if (depth > 0).all() else np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+
+
+def target_from_points(
+    points: Array,
+    frames: list[Frame],
+    sparse: Array,
+    up: Array,
+    box_margin: float,
+    ground_margin: float,
+    seed: int,
+) -> Target:
+    """Box, ground and the kind of each sparse point, from (N, 3) points that span the object.
+
+    A sparse point is on the object when it lies above the ground in the convex hull of the points, grown
+    by a quarter of the margin; not on it when outside the hull grown by the whole margin, or below the ground; in
+    between nobody knows. Nobody knows either of a point of two photos: two rays that are mismatched along their
+    epipolar lines meet somewhere all the same.
+
+    Args:
+        points: (N, 3) points on the object.
+        frames: the photos, which know the sparse points that they see.
+        sparse: (P, 3) sparse points.
+        up: (3,) the direction against gravity.
+        box_margin: growth on each side, as a share of the diagonal of the points' box.
+        ground_margin: a sparse point is on the object only this much above the ground, as a share of the box's
+            diagonal.
+        seed: seed of the ground's RANSAC.
+    """
+    box = upright_box(points, up, box_margin)
+    x_in_box = box.to_box(sparse)
+    ground, found = find_ground(x_in_box, box, box.to_box(points), seed)
+    height = ground.height_of(x_in_box)
+    above = ground_margin * box.diagonal
+    grow = box_margin * float(np.linalg.norm(np.ptp(points, axis=0)))
+    kind = np.zeros(len(sparse), dtype=np.int8)
+    kind[~in_hull(sparse, span(points, grow))] = -1
+    if found:
+        kind[height < 0.5 * above] = -1
+    kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
+    kind[np.bincount(np.concatenate([f.point_rows for f in frames]), minlength=len(sparse)) < 3] = 0
+    return Target(box, ground, found, points, grow, _parts(points, 0.12 * box.diagonal), sparse, kind)
+
+
+def points_in_masks(frames: list[Frame], masks: list[Mask], sparse: Array, up: Array) -> Array:
+    """(N, 3) sparse points that lie in the (H, W) masks wherever they are seen, without the outermost: they span it.
+
+    Raises:
+        StageError: there are fewer than ten of them.
+    """
+    seen, hit = np.zeros(len(sparse)), np.zeros(len(sparse))
+    for frame, mask in zip(frames, masks):
+        u, v = np.clip(frame.observed.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        np.add.at(seen, frame.point_rows, 1)
+        np.add.at(hit, frame.point_rows, mask[v, u])
+    own = sparse[(seen >= 2) & (hit > 0.8 * seen)]
+    if len(own) < 10:
+        raise StageError(
+            f"only {len(own)} sparse points lie in the supplied masks; "
+            "are they white on the object, and of these photos?"
+        )
+    x = upright_box(own, up, 0.0).to_box(own)
+    low, high = np.percentile(x, [0.5, 99.5], axis=0)
+    return own[((x >= low) & (x <= high)).all(1)]
+
+
+def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:
+    """(K, 4) rows of (N, 3) prompts, tetrahedra with short edges: close clicks mark the corners of a small part."""
+    if len(points) < 5:
+        return np.empty((0, 4), dtype=np.intp)
+    corners = Delaunay(points, qhull_options="Qbb Qc QJ").simplices.astype(np.intp)
+    edges = np.linalg.norm(points[corners][:, :, None] - points[corners][:, None], axis=-1)
+    return corners[edges.max((1, 2)) < max_edge]

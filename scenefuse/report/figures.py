@@ -1,0 +1,299 @@
+"""The figures of an object and of a scene: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.report.object_sheet import SIDES_DEG, inner, object_sheet, read_model, upright
+from scenefuse.report.render import orbit_camera, point_radii, render
+from scenefuse.report.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
+from scenefuse.report.values import find, flatten, number
+from scenefuse.stage import StageError, atomic_directory, read_json, value
+from scenefuse.transforms import Array, Sim3, rotation_between
+
+SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
+CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
+
+
+@dataclass(frozen=True)
+class _Join:
+    """The clouds of one object in the scene's frame, turned so that z points up.
+
+    Attributes:
+        before: the scene around the object.
+        after: the same part of the scene after fusion.
+        crop: the object's part of the scene, as registration saw it.
+        object_cloud: the object at its estimated pose, or None when there is no pose.
+        framed: (N, 3) points every picture has to show.
+        registered: whether the object was accepted and fused.
+        decision: one line: status, reason, scores.
+    """
+
+    before: Cloud
+    after: Cloud
+    crop: Cloud
+    object_cloud: Cloud | None
+    framed: Array
+    registered: bool
+    decision: str
+
+
+def draw_object(
+    *,
+    name: str,
+    scene: Path,
+    fused_scene: Path,
+    crop: Path,
+    crop_report: Path,
+    object_cloud: Path,
+    fine: Path,
+    metrics: Path,
+    cameras: Path,
+    masks: Path,
+    stage1: Path,
+    stage2: Path,
+    stage3: Path,
+    stage4: Path,
+    figures: Path,
+) -> None:
+    """Draw the figures of one object (paper Figures 2, 3 and 5).
+
+    Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
+    after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
+    registration.png (object over crop, with the decision) and object.png (frames, masks, depth of the four stages,
+    renders, the object's cloud).
+
+    Args:
+        name: the object's name, for titles.
+        scene: the scene's dense cloud, scene frame.
+        fused_scene: the whole scene after fusion, with the field `source` (0 scene, 1 object).
+        crop: the object's part of the scene, scene frame.
+        crop_report: JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent.
+        object_cloud: the object's cloud in its own frame.
+        fine: JSON of the fine registration: status, reason, scene_from_object.
+        metrics: JSON of the metrics, for the scores in titles.
+        cameras: the object's undistorted COLMAP workspace (images/, sparse/).
+        masks: folder of the object's masks, {photo}.png.
+        stage1: folder of stage 1 (depth_maps/).
+        stage2: folder of stage 2 (depth_maps/).
+        stage3: folder of stage 3 (depth_maps/).
+        stage4: folder of stage 4 (depth_maps/, renders/).
+        figures: output folder of PNG files, each below 1 MB.
+
+    Raises:
+        StageError: a cloud or JSON is missing or damaged.
+    """
+    join = _load_join(name, scene, fused_scene, crop, crop_report, object_cloud, fine, metrics)
+    with atomic_directory(figures) as folder:
+        save_png(folder / "before_after.png", _before_after(name, join))
+        print("before_after.png", flush=True)
+        save_png(folder / "provenance.png", _provenance(name, join))
+        print("provenance.png", flush=True)
+        save_png(folder / "registration.png", _registration(name, join))
+        print("registration.png", flush=True)
+        for label, picture in zip(("before", "after"), _most_changed(join)):
+            save_png(folder / f"{label}.png", picture)
+        cloud = join.object_cloud or upright(read_cloud(object_cloud), cameras)
+        save_png(folder / "object.png", object_sheet(name, cloud, cameras, masks, [stage1, stage2, stage3, stage4]))
+        print("object.png", flush=True)
+
+
+def draw_scene(
+    *, name: str, dense: Path, georeferenced: Path, crops: list[Path], objects: list[str], figure: Path
+) -> None:
+    """Draw a scene from above and obliquely with its camera positions and the boxes of its objects.
+
+    Args:
+        name: the scene's name, for the title.
+        dense: the scene's dense cloud.
+        georeferenced: COLMAP model in the same frame.
+        crops: one cloud per object, scene frame; its bounding box is drawn.
+        objects: the objects' names, in the order of `crops`.
+        figure: output PNG, below 1 MB.
+
+    Raises:
+        StageError: `crops` and `objects` differ in length, or an input is missing.
+    """
+    if len(crops) != len(objects):
+        raise StageError(f"{len(crops)} crops but {len(objects)} object names; give one name for each crop")
+    cloud = read_cloud(dense)
+    centres = np.array([i.projection_center() for i in read_model(georeferenced).images.values() if i.has_pose])
+    boxes = {label: _box_corners(read_cloud(crop).points) for label, crop in zip(objects, crops)}
+    radii = point_radii(cloud.points)
+    low, high = np.percentile(cloud.points, [1, 99], axis=0)
+    ground = _box_corners(np.stack([low, high]))
+    views = {
+        "from above": orbit_camera(ground, -90.0, 90.0, (640, 520), orthographic=True),
+        "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, (760, 520)),
+    }
+    size = (640 + 760 + 24, 520 + 66)
+    sheet = new_figure(size)
+    sheet.text(8 / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=12, fontweight="bold", va="top")
+    note = f"{len(cloud):,} points, {len(centres)} cameras (red), {len(boxes)} objects (boxes)"
+    sheet.text(8 / size[0], 1 - 32 / size[1], note, fontsize=9.5, color="#444444", va="top")
+    left = 8
+    for title, camera in views.items():
+        axes = add_axes(sheet, (left, 60, camera.width_px, camera.height_px), size)
+        axes.imshow(render(cloud, camera, radii))
+        axes.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0))
+        axes.text(8, 20, title, fontsize=10, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none"})
+        x, y = camera.project(centres)[0].T
+        axes.scatter(x, y, s=14, c="#d6261f", edgecolors="white", linewidths=0.5, zorder=3)
+        for label, corners in boxes.items():
+            _draw_box(axes, camera.project(corners)[0], label)
+        left += camera.width_px + 8
+    save_png(figure, to_image(sheet))
+
+
+def _load_join(
+    name: str, scene: Path, fused_scene: Path, crop: Path, crop_report: Path, cloud: Path, fine: Path, metrics: Path
+) -> _Join:
+    """Read the clouds and turn them upright; the surroundings are cut to a box around the object."""
+    report, scores = read_json(fine), flatten(read_json(metrics))
+    up = read_json(crop_report).get("up_in_scene", {}).get("value")
+    level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    crop_cloud = read_cloud(crop).transformed(level)
+    pose = report.get("scene_from_object", {}).get("value")
+    placed = None
+    if pose is not None:
+        placed = read_cloud(cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
+    registered = value(report, "status") == "registered"
+    shown = placed if registered and placed is not None else crop_cloud
+    low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
+    reach = np.array([0.35, 0.35, 0.15]) * float(np.linalg.norm(high - low))
+    before, after = (
+        _inside(read_cloud(path).transformed(level), low - reach, high + reach) for path in (scene, fused_scene)
+    )
+    if not len(before):
+        raise StageError(f"{scene} has no points around {name}; look at the crop and at the registration's log")
+    return _Join(before, after, crop_cloud, placed, inner(shown.points), registered, _decision(report, scores))
+
+
+def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
+    """One line: the status, the reason of a refusal, and the scores that there are."""
+    fields = flatten(report) | scores
+    parts = [str(value(report, "status"))]
+    reason = find(fields, "reason")
+    if parts[0] != "registered" and reason:
+        parts.append(str(reason))
+    for label, keys in (
+        ("scale", ("scale",)),
+        ("F-score", ("registration.f_score", "f_score")),
+        ("fitness", ("registration.fitness_source", "fitness_source")),
+        ("inlier RMSE / diagonal", ("registration.inlier_rmse_over_diagonal",)),
+        ("normal consistency", ("registration.normal_consistency_cross",)),
+        ("margin", ("margin",)),
+    ):
+        found = find(fields, *keys)
+        if isinstance(found, (int, float)):
+            parts.append(f"{label} {number(found)}")
+    return ", ".join(parts)
+
+
+def _inside(cloud: Cloud, low: Array, high: Array) -> Cloud:
+    """The points within an axis-aligned box."""
+    return cloud[np.all((cloud.points >= low) & (cloud.points <= high), axis=1)]
+
+
+def _box_corners(points: Array) -> Array:
+    """The eight corners of the points' bounding box, x slowest."""
+    low, high = points.min(0), points.max(0)
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
+def _added(cloud: Cloud) -> NDArray[np.bool_]:
+    """(N,) True for the points that came from the object."""
+    return cloud.fields["source"] == 1 if "source" in cloud.fields else np.zeros(len(cloud), dtype=bool)
+
+
+def _radii(cloud: Cloud) -> NDArray[np.float32]:
+    """Disc radii from the spacing of scene points and of added points each: neither closes the other's holes."""
+    radii, added = np.zeros(len(cloud), dtype=np.float32), _added(cloud)
+    for part in (added, ~added):
+        if part.any():
+            radii[part] = point_radii(cloud.points[part])
+    return radii
+
+
+def _before_after(name: str, join: _Join) -> Image:
+    """Rows before and after; four sides from slightly above, and from below with the surroundings cut away."""
+    tile = (350, 290)
+    low, high = join.framed.min(0), join.framed.max(0)
+    margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
+    rows: list[list[Image | None]] = []
+    for cloud in (join.before, join.after):
+        radii = _radii(cloud)
+        sides = [render(cloud, orbit_camera(join.framed, a, 22.0, tile), radii) for a in SIDES_DEG]
+        near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
+        from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
+        rows.append([*sides, render(cloud[near], from_below, radii[near])])
+    after = "after" if join.registered else "after (not fused)"
+    columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG] + ["from below, surroundings cut away"]
+    return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
+
+
+def _provenance(name: str, join: _Join) -> Image:
+    """Scene points grey, added points coloured."""
+    tile, added, radii = (430, 350), _added(join.after), _radii(join.after)
+    shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
+    colors = (np.where(added[:, None], ADDED_COLOR, SCENE_COLOR) * shade).astype(np.uint8)
+    images: list[Image | None] = [
+        render(join.after, orbit_camera(join.framed, a, 22.0, tile), radii, colors) for a in SIDES_DEG
+    ]
+    note = f"grey: {(~added).sum():,} points of the scene; orange: {added.sum():,} points added from the object"
+    columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG]
+    return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
+
+
+def _registration(name: str, join: _Join) -> Image:
+    """The object over the crop from three sides."""
+    tile, radii = (480, 390), 0.6 * point_radii(join.crop.points)
+    colors, framed = np.tile(np.array(CROP_COLOR, dtype=np.uint8), (len(join.crop), 1)), join.crop.points
+    if join.object_cloud is not None:
+        framed = np.concatenate([framed, join.object_cloud.points])
+        radii = np.concatenate([radii, point_radii(join.object_cloud.points)])
+        colors = np.concatenate([colors, np.tile(np.array(OBJECT_COLOR, dtype=np.uint8), (len(join.object_cloud), 1))])
+    # Small dots of the crop over the closed surface of the object; without normals both are shaded by depth alone.
+    cloud = Cloud(framed)
+    views = {"side, azimuth 30°": (30.0, 12.0), "side, azimuth 120°": (120.0, 12.0), "from above": (-90.0, 90.0)}
+    images: list[Image | None] = [
+        render(cloud, orbit_camera(framed, a, e, tile, orthographic=True), radii, colors) for a, e in views.values()
+    ]
+    note = f"{join.decision}. Blue: crop of the scene, orange: object" + (
+        "" if join.object_cloud is not None else " (no pose)"
+    )
+    return draw_sheet(Sheet(f"{name}: registration", note, [images], [], list(views), {}, tile))
+
+
+def _most_changed(join: _Join) -> tuple[Image, Image]:
+    """The same large view before and after, from the azimuth where the pictures differ most."""
+    clouds = [(cloud, _radii(cloud)) for cloud in (join.before, join.after)]
+
+    def pair(azimuth_deg: float, size_px: tuple[int, int]) -> tuple[Image, Image]:
+        camera = orbit_camera(join.framed, azimuth_deg, 15.0, size_px, margin=0.1)
+        first, second = (render(cloud, camera, radii) for cloud, radii in clouds)
+        return first, second
+
+    azimuths = np.arange(0.0, 360.0, 45.0)
+    changes = [float(np.abs(np.subtract(*pair(a, (120, 90)), dtype=np.float32)).mean()) for a in azimuths]
+    return pair(float(azimuths[int(np.argmax(changes))]), (840, 600))
+
+
+def _brightness(cloud: Cloud) -> Array:
+    """(N,) brightness 0 to 1 of the points' colours; 1 where there are none."""
+    return np.ones(len(cloud)) if cloud.colors is None else cloud.colors @ np.array([0.299, 0.587, 0.114]) / 255.0
+
+
+def _draw_box(axes: Any, corners_px: Array, label: str) -> None:
+    """The twelve edges of a projected box, and its name above it."""
+    for a in range(8):
+        for bit in (1, 2, 4):
+            if not a & bit:
+                axes.plot(*corners_px[[a, a | bit]].T, color="#0b4ea2", linewidth=1.2, zorder=4)
+    x, y = corners_px[:, 0].mean(), corners_px[:, 1].min() - 6
+    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
+    axes.text(x, y, label, ha="center", va="bottom", fontsize=9.5, color="#0b4ea2", zorder=5, bbox=box)

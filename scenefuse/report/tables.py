@@ -1,0 +1,327 @@
+"""The tables of a run: what every stage measured, side by side.
+
+A run may be partial: a value that does not exist is empty, an object without results carries its last error.
+"""
+
+import itertools
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from scenefuse.report.values import Fields, find, load, number, unit_of
+
+# What each step leaves, in the order in which the steps run.
+_OBJECT_FILES = (
+    *("photos.json", "features.db", "matches.json", "sparse.json", "undistorted.json", "masks.json"),
+    *("stage1.json", "stage2.json", "stage3.json", "stage4.json", "object.json"),
+)
+_SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
+_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
+# Columns of registration.tsv and rows of ablation.tsv: name, and where a value may stand, best first.
+REGISTRATION: dict[str, tuple[str, ...]] = {
+    "scale": ("fine.scale",),
+    "f_score": ("metrics.registration.f_score", "fine.f_score"),
+    "fitness_source": ("metrics.registration.fitness_source", "fine.fitness_source"),
+    "fitness_target": ("metrics.registration.fitness_target", "fine.fitness_target"),
+    "inlier_rmse": ("metrics.registration.inlier_rmse", "fine.inlier_rmse"),
+    "inlier_rmse_over_diagonal": ("metrics.registration.inlier_rmse_over_diagonal", "fine.inlier_rmse_over_diagonal"),
+    "normal_consistency_cross": ("metrics.registration.normal_consistency_cross",),
+    "normal_consistency_self": ("metrics.registration.normal_consistency_self",),
+    "margin": ("fine.margin",),
+    "threshold": ("metrics.registration.tau",),
+    "scale_error_pct": ("truth.scale_error_pct",),
+    "rotation_error_deg": ("truth.rotation_error_deg",),
+    "translation_error_over_diagonal": ("truth.translation_error_over_diagonal",),
+    "object_f_score": ("truth.object_f_score",),
+}
+_AROUND = [f"scene_{score}_{when}" for score in ("f_score", "precision", "recall") for when in ("before", "after")]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a run has left of one object.
+
+    Attributes:
+        name: the object's name.
+        stages: its own stages' quantities, `stage4.psnr` for instance.
+        variants: variant -> quantities of its registration, `fine.scale` for instance.
+        fusion: quantities of the fusion.
+        missing: the first file that should be there and is not, or "".
+        reason: the last error in its logs, when something is missing.
+    """
+
+    name: str
+    stages: Fields
+    variants: dict[str, Fields]
+    fusion: Fields
+    missing: str
+    reason: str
+
+
+def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
+    """One row an object and variant: status, reason, scores, errors against truth; lengths in the scene's unit."""
+    rows: list[dict[str, Any]] = []
+    for item in objects:
+        for variant in variants:
+            fields = item.variants.get(variant, {})
+            row = {
+                "object": item.name,
+                "variant": variant,
+                "status": status_of(item, variant),
+                "reason": reason_of(item, variant),
+            }
+            rows.append({**row, **{name: number_in(fields, *keys) for name, keys in REGISTRATION.items()}})
+    return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *REGISTRATION])
+
+
+def ablation_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
+    """One row an object and measure, one column a variant, all at the same thresholds."""
+    rows: list[dict[str, Any]] = []
+    for item in objects:
+        rows.append({"object": item.name, "measure": "status", "unit": ""} | {a: status_of(item, a) for a in variants})
+        for name, keys in REGISTRATION.items():
+            values = {variant: number_in(item.variants.get(variant, {}), *keys) for variant in variants}
+            if any(v is not None for v in values.values()):
+                unit = next(
+                    u for variant in variants if (u := unit_of(item.variants.get(variant, {}), *keys)) is not None
+                )
+                rows.append(
+                    {"object": item.name, "measure": name, "unit": unit} | {a: _six(v) for a, v in values.items()}
+                )
+    return pd.DataFrame(rows, columns=["object", "measure", "unit", *variants])
+
+
+def completion_table(objects: list[Collected], variant: str) -> pd.DataFrame:
+    """One row an object and measure: its value, the value of a matched random cloud (null), and the scene's own."""
+    rows = []
+    for item in objects:
+        fields = item.variants.get(variant, {})
+        group = {k.split("completion.", 1)[1]: v for k, v in fields.items() if k.startswith("metrics.completion.")}
+        of_measure: dict[str, dict[str, Any]] = {}
+        for key, entry in group.items():
+            name, column = _measure(key)
+            cells = of_measure.setdefault(name, {"unit": entry["unit"]})
+            cells[column] = plain(entry["value"])
+        rows += [{"object": item.name, "measure": name, **cells} for name, cells in of_measure.items()]
+        for name in _AROUND:
+            amount = number_in(item.stages, f"truth.{name}")
+            if amount is not None:
+                rows.append({"object": item.name, "measure": name, "unit": "1", "value": amount})
+    return pd.DataFrame(rows, columns=["object", "measure", "unit", "value", "null", "scene"])
+
+
+def runtime_table(benchmarks: Path) -> pd.DataFrame:
+    """One row a rule and a last row `total`: jobs, seconds summed over its jobs, the longest, the largest memory."""
+    rows = []
+    for path in sorted(benchmarks.rglob("*.tsv")) if benchmarks.is_dir() else []:
+        try:
+            table = pd.read_csv(path, sep="\t", na_values=["-", "NA"])
+            seconds, memory = table["s"].astype(float).sum(), table["max_rss"].astype(float).max()
+        except (OSError, ValueError, KeyError, pd.errors.ParserError):
+            continue
+        rows.append((path.relative_to(benchmarks).parts[0].removesuffix(".tsv"), seconds, memory))
+    jobs = pd.DataFrame(rows, columns=["rule", "seconds", "max_rss_mb"])
+    table = jobs.groupby("rule", sort=True).agg(
+        jobs=("seconds", "size"),
+        seconds=("seconds", "sum"),
+        longest_seconds=("seconds", "max"),
+        max_rss_mb=("max_rss_mb", "max"),
+    )
+    table = table.sort_values("seconds", ascending=False).reset_index()
+    total = [len(jobs), jobs["seconds"].sum(), jobs["seconds"].max(), jobs["max_rss_mb"].max()]
+    table.loc[len(table)] = ["total", *total]
+    return table
+
+
+def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
+    """One row a scene: photos, cameras, georeference, cloud, errors against truth."""
+    rows = []
+    for name, fields in scenes.items():
+        added = find(fields, "completed.added_points")
+        row: dict[str, Any] = {
+            "scene": name,
+            "photos": number_in(fields, "sparse.total", "photos.count"),
+            "registered": number_in(fields, "sparse.registered"),
+            "reprojection_error_px": number_in(fields, "sparse.mean_reprojection_error_px"),
+            "length_unit": plain(find(fields, "georeference.length_unit")),
+            "gps_residual_median_m": number_in(fields, "georeference.gps_residual_median_m"),
+            "points": number_in(fields, "dense.points"),
+            "spacing": number_in(fields, "dense.spacing"),
+            "backend": plain(find(fields, "dense.backend")),
+            "completed_points": number_in(fields, "completed.points"),
+            "completed_by": None if added is None else ", ".join(added) or "none",
+        }
+        row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
+        row["error"] = None if find(fields, "dense.points") is not None else last_error(logs, name)
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def objects_table(objects: list[Collected]) -> pd.DataFrame:
+    """One row an object: cameras, masks, the four stages, the cloud against truth."""
+    rows = []
+    for item in objects:
+        fields = item.stages
+        row: dict[str, Any] = {
+            "object": item.name,
+            "frames": number_in(fields, "sparse.total", "photos.count"),
+            "registered": number_in(fields, "sparse.registered"),
+            "reprojection_error_px": number_in(fields, "sparse.mean_reprojection_error_px"),
+            "masks": number_in(fields, "masks.masks"),
+            "mask_iou": number_in(fields, "truth.mask_iou_mean"),
+        }
+        for stage in (2, 4):
+            row[f"stage{stage}_psnr_db"] = number_in(fields, f"stage{stage}.psnr_held_out")
+            row[f"stage{stage}_ssim"] = number_in(fields, f"stage{stage}.ssim")
+            row[f"stage{stage}_measured_on"] = find(fields, f"stage{stage}.measured_on")
+        for stage in (1, 2, 3, 4):
+            row[f"stage{stage}_depth_error_over_diagonal"] = number_in(fields, f"truth.stage{stage}_depth_error")
+            row[f"stage{stage}_depth_within_1pct"] = number_in(fields, f"truth.stage{stage}_depth_within_1pct")
+        row["points"] = number_in(fields, "object.points")
+        row["accuracy_pct_of_diagonal"] = number_in(fields, "truth.cloud_accuracy_median")
+        for name in ("precision", "completeness", "f_score"):
+            row[f"{name}_1pct"] = number_in(fields, f"truth.cloud_{name}_1pct")
+        row["missing"] = item.missing or None
+        row["error"] = item.reason or None
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def last_error(logs: Path, name: str) -> str:
+    """The last error line in the newest log of a scene or object that holds one; '' when there is none."""
+    named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(name)}($|[^A-Za-z0-9_])")
+    found = [p for p in logs.rglob("*.log") if named.search(p.relative_to(logs).with_suffix("").as_posix())]
+    for path in sorted(found, key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True):
+        lines = path.read_text(errors="replace").splitlines()
+        errors = [line.strip() for line in lines if re.match(r"\s*(error:|Killed|[\w.]*(Error|Exception)\b)", line)]
+        if errors:
+            return f"{errors[-1].removeprefix('error: ')} [{path.relative_to(logs).as_posix()}]"
+    return ""
+
+
+def records(table: pd.DataFrame) -> list[dict[str, Any]]:
+    """The rows of a table, column -> cell."""
+    return [{str(k): v for k, v in row.items()} for row in table.to_dict("records")]
+
+
+def truth_numbers(fields: Fields) -> Fields:
+    """The numbers among the comparisons with truth; matrices and lists are left out."""
+    return {k: v for k, v in fields.items() if k.startswith("truth.") and isinstance(v["value"], (int, float))}
+
+
+def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
+    """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
+
+    Args:
+        folder: the scene's results.
+        chunks: jobs that its depth maps are split into.
+    """
+    there, gap = unbroken(folder, (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)), "dense.json"))
+    found = read_fields(folder, [name for name in there if "/" not in name])
+    return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
+
+
+def collect(folder: Path, variants: list[str], logs: Path, scene: str = "", scene_gap: str = "") -> Collected:
+    """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
+
+    Args:
+        folder: the object's results.
+        variants: registration variants, the one that is fused first.
+        logs: folder of the rules' logs.
+        scene: name of the scene that the object lies in.
+        scene_gap: the first file that this scene lacks, or "".
+    """
+    there, gap = unbroken(folder, _OBJECT_FILES)
+    stages = read_fields(folder, [*there, *([] if gap else ["alignment.json"])])
+    if find(stages, "stage1.workspace") == "poses":
+        stages |= read_fields(folder, ["poses.json"])
+    who = folder.name
+    if not gap and scene_gap:
+        gap, who = f"{scene_gap} of the scene {scene}", scene
+    if not gap:
+        there, gap = unbroken(folder, ("alignment.json",))
+        stages |= read_fields(folder, there)
+    per_variant: dict[str, Fields] = {variant: {} for variant in variants}
+    fusion: Fields = {}
+    for variant in [] if gap else variants:
+        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
+        per_variant[variant] = read_fields(folder / "registration" / variant, there)
+        gap = gap or (lacking and f"registration/{variant}/{lacking}")
+    if "fine.status" in per_variant[variants[0]]:
+        there, lacking = unbroken(folder, ("fusion.json", "metrics.json"))
+        fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
+        per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
+        gap = gap or lacking
+    judged = fusion and all("fine.status" in fields for fields in per_variant.values())
+    truth = read_fields(folder, ["truth.json"]) if judged else {}
+    for variant in variants:
+        prefix = f"truth.variants.{variant}."
+        per_variant[variant] |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
+    stages |= {key: item for key, item in truth.items() if not key.startswith("truth.variants.")}
+    unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
+    per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
+    reason = (last_error(logs, who) or "no error in its logs; it has not run yet") if gap else ""
+    return Collected(folder.name, stages, per_variant, fusion, gap, reason)
+
+
+def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
+    """The files of a chain before the first that is missing, and that one, or "".
+
+    Snakemake removes what a rule wrote before it runs the rule again: what is behind a gap is from an earlier run.
+    """
+    there = list(itertools.takewhile(lambda name: (folder / name).is_file(), names))
+    return there, names[len(there)] if len(there) < len(names) else ""
+
+
+def read_fields(folder: Path, names: Sequence[str]) -> Fields:
+    """The quantities of the JSONs among some files of a folder, each prefixed by its file's name."""
+    stems = [name.removesuffix(".json") for name in names if name.endswith(".json")]
+    return {f"{stem}.{key}": item for stem in stems for key, item in load(folder / f"{stem}.json").items()}
+
+
+def _in_unit(fields: Fields, unit: str) -> Fields:
+    """The quantities with the scene's own unit of length where a stage knows it as "scene units" only."""
+    return {k: {**item, "unit": item["unit"].replace("scene units", unit)} for k, item in fields.items()}
+
+
+def status_of(item: Collected, variant: str) -> str:
+    """registered, unregistered, or missing."""
+    return str(find(item.variants.get(variant, {}), "fine.status") or "missing")
+
+
+def reason_of(item: Collected, variant: str) -> str | None:
+    """Why an object is not registered in a variant."""
+    if status_of(item, variant) == "missing":
+        return item.reason or None
+    return find(item.variants[variant], "fine.reason") or None
+
+
+def _six(item: float | int | None) -> str | None:
+    """Six significant digits: in a column that also holds text, pandas would print all seventeen."""
+    return None if item is None else f"{item:.6g}"
+
+
+def number_in(fields: Fields, *names: str) -> float | int | None:
+    """The first of the named values when it is a number."""
+    found = find(fields, *names)
+    return found if isinstance(found, (int, float)) else None
+
+
+def plain(item: Any) -> Any:
+    """One table cell: text and numbers as they are, lists and mappings as text."""
+    if isinstance(item, dict):
+        return ", ".join(f"{k} {number(v)}" for k, v in item.items())
+    return ", ".join(number(v) for v in item) if isinstance(item, list) else item
+
+
+def _measure(key: str) -> tuple[str, str]:
+    """A completion key as (measure, column): `nue_null` and `null_nue` and `nue.null` are the null of `nue`."""
+    for column in ("null", "scene"):
+        name = re.sub(rf"(^{column}[._]|[._]{column}(?=$|_)|[._]of_{column}$)", "", key)
+        if name != key and name:
+            return name, column
+    return key.removesuffix(".value"), "value"

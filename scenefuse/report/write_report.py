@@ -1,0 +1,191 @@
+"""One HTML page of a run that opens anywhere without a network: pictures embedded, tables, notes for reading them."""
+
+import base64
+import csv
+import io
+from html import escape
+from pathlib import Path
+
+from PIL import Image as Picture
+
+from scenefuse.report.page import SCRIPT, STYLE
+from scenefuse.report.values import number
+from scenefuse.stage import StageError, atomic_file
+
+_TABLES = {
+    "scenes": "Scenes",
+    "objects": "Objects by themselves",
+    "registration": "Registration",
+    "completion": "Completion",
+    "ablation": "Ablation",
+    "runtime": "Time and memory",
+}
+_NOTES = {
+    "scenes": "How many photos the scene model holds, how well it fits them, and the cloud that came out. Lengths are "
+    "in the unit named in the row: metres only where GPS made it so.",
+    "objects": "PSNR (dB) and SSIM compare renders with photos: higher is better; `measured_on` says whether training "
+    "saw those photos. Depth error, "
+    "accuracy, completeness and F-score exist only where the true surface is known.",
+    "registration": "Fitness: share of object (source) or scene (target) points with a partner within the threshold. "
+    "F-score: both at once, 1 is perfect; a wrong pose can have a high fitness, hardly a high F-score. Inlier RMSE is "
+    "in the scene's unit, and as a share of the crop's diagonal. Normal consistency, cross: how parallel the two "
+    "surfaces are where they meet (0.5 is chance). Margin: lead over the second-best pose; near zero, two poses "
+    "explain the data equally well. Below its limits an object is refused and left out of the scene.",
+    "completion": "Every measure stands beside its null, the same measure on a matched random cloud: only a clear "
+    "distance from the null says something. Surface variation: 0 smooth to 1/3. NUE: evenness of the density after "
+    "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
+    "cloud is denser. Primitive fitting: share of added points on planes, spheres or cylinders.",
+    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published "
+    "recipe, `clouds_only` looks at the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the crop.",
+    "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
+    "largest resident size of one job.",
+}
+# Few rows and many columns read better with one column a scene or object.
+_TURNED = {"scenes", "objects"}
+_TOLD_ABOVE = {"reason", "missing", "error"}
+_OBJECT_FIGURES = {
+    "before_after": "The scene around the object before and after fusion, same cameras.",
+    "provenance": "Grey: measured in the scene. Orange: added from the object.",
+    "registration": "The object (orange) over the scene's crop (blue dots).",
+    "object": "Frames, masks, depth of the four stages on one scale, renders beside their photos, the object's cloud.",
+}
+
+
+def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], title: str, report: Path) -> None:
+    """Write the report page of a run: before and after of every object, figures, tables with notes, the text summary.
+
+    Everything is in the one file: no script, font or picture is fetched.
+
+    Args:
+        summary: folder with the summary's TSV files and summary.txt; an absent table is left out.
+        scenes: result folders of the scenes; scene.png in it is shown.
+        objects: result folders of the objects; figures/ in it is shown. One without figures is named as such.
+        title: heading of the page.
+        report: output, one HTML file.
+
+    Raises:
+        StageError: the summary folder holds no summary.txt.
+    """
+    text = summary / "summary.txt"
+    if not text.is_file():
+        raise StageError(f"{text} does not exist; write the summary first")
+    tables = {name: _read_table(summary / f"{name}.tsv") for name in _TABLES}
+    links = [*(f.name for f in objects), *(f"table-{name}" for name in _TABLES if tables[name])]
+    body = [
+        f"<h1>{escape(title)}</h1>",
+        "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
+        "<nav>" + "".join(f'<a href="#{escape(n)}">{escape(n.removeprefix("table-"))}</a>' for n in links) + "</nav>",
+        *(_object_section(folder, tables["registration"]) for folder in objects),
+        *(_scene_section(folder, tables["scenes"]) for folder in scenes),
+        *(_table_section(name, rows) for name, rows in tables.items() if rows),
+        f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
+    ]
+    content = "\n".join(body)
+    page = (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style>\n</head>\n'
+        f"<body>\n{content}\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
+    )
+    with atomic_file(report) as temporary:
+        temporary.write_text(page, encoding="utf-8")
+    print(f"{report}: {len(page) / 1e6:.1f} MB", flush=True)
+
+
+def _scene_section(folder: Path, scenes: list[dict[str, str]]) -> str:
+    """Heading, the completed scene's files, and the figure; nothing without a figure."""
+    path = folder / "scene.png"
+    if not path.is_file():
+        return ""
+    row = next((r for r in scenes if r.get("scene") == folder.name), {})
+    parts = [f"<h2>Scene {escape(folder.name)}</h2>"]
+    if row.get("completed_points", "-") not in ("-", ""):
+        parts.append(
+            f"<p><code>{escape(str(folder))}/completed.ply</code> and <code>completed.laz</code>: the scene with all "
+            f"registered objects in it ({escape(row['completed_by'])}), {escape(row['completed_points'])} points; "
+            "<code>source</code> says where each is from, <code>completed.json</code> what its numbers mean.</p>"
+        )
+    return "\n".join([*parts, _picture(path, "From above and obliquely: cameras red, objects boxed.")])
+
+
+def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
+    """Heading with the decision, before/after slider, the figures that exist."""
+    row = next((r for r in registration if r.get("object") == folder.name), {})
+    status, reason = row.get("status", "-"), row.get("reason", "-")
+    badge = f'<span class="badge {"ok" if status == "registered" else "no"}">{escape(status)}</span>'
+    parts = [f'<h2 id="{escape(folder.name)}">{escape(folder.name)}{badge}</h2>']
+    if reason not in ("-", ""):
+        parts.append(f"<p>{escape(reason)}</p>")
+    figure_folder = folder / "figures"
+    before, after = figure_folder / "before.png", figure_folder / "after.png"
+    if before.is_file() and after.is_file():
+        parts.append(
+            f'<div class="slider"><figure class="before">{_image(before, "before")}<figcaption>before</figcaption>'
+            f'</figure><figure class="after">{_image(after, "after")}<figcaption>after</figcaption></figure></div>'
+            '<input class="range" type="range" min="0" max="100" value="50" aria-label="before and after">'
+        )
+    figures = [(figure_folder / f"{name}.png", caption) for name, caption in _OBJECT_FIGURES.items()]
+    parts += [_picture(path, caption) for path, caption in figures if path.is_file()]
+    if len(parts) < 3 and not any(path.is_file() for path, _ in figures):
+        parts.append("<p>No figures: the object's stages did not finish.</p>")
+    return "\n".join(parts)
+
+
+def _table_section(name: str, rows: list[dict[str, str]]) -> str:
+    """A table with its note; columns of text are set left, numbers right and short; empty columns are left out."""
+    columns = [c for c in rows[0] if c not in _TOLD_ABOVE and any(row[c] not in ("-", "") for row in rows)]
+    grid = [columns, *([row[c] for c in columns] for row in rows)]
+    if name in _TURNED:
+        grid = [list(column) for column in zip(*grid)]
+    textual = [any(_number(line[k]) is None for line in grid[1:] if line[k] != "-") for k in range(len(grid[0]))]
+    # A break may fall after an underscore.
+    heads = [f"<th{_left(t)}>{escape(c).replace('_', '_<wbr>')}</th>" for c, t in zip(grid[0], textual)]
+    cells = [
+        "<tr>" + "".join(f"<td{_left(t)}>{escape(_short(c))}</td>" for c, t in zip(line, textual)) + "</tr>"
+        for line in grid[1:]
+    ]
+    return (
+        f'<h2 id="table-{name}">{_TABLES[name]}</h2><p>{escape(_NOTES[name])}</p>'
+        f'<div class="wide"><table><thead><tr>{"".join(heads)}</tr></thead>'
+        f"<tbody>{''.join(cells)}</tbody></table></div>"
+    )
+
+
+def _left(text: bool) -> str:
+    return ' class="text"' if text else ""
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
+
+
+def _short(cell: str) -> str:
+    """A number with four significant digits, any other cell as it is."""
+    found = _number(cell)
+    return cell if found is None else number(int(found) if found == int(found) and abs(found) < 1e15 else found)
+
+
+def _read_table(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with open(path, newline="", encoding="utf-8") as file:
+        return [{k: v or "" for k, v in row.items() if k} for row in csv.DictReader(file, delimiter="\t")]
+
+
+def _picture(path: Path, caption: str) -> str:
+    return f"<figure>{_image(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _image(path: Path, alt: str) -> str:
+    """The picture inside the page, as WebP: a third of the PNG's size."""
+    buffer = io.BytesIO()
+    try:
+        with Picture.open(path) as opened:
+            size = opened.size
+            opened.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
+    except OSError as error:
+        raise StageError(f"{path} is not a readable picture ({error}); draw the figures again") from None
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f'<img src="data:image/webp;base64,{data}" width="{size[0]}" height="{size[1]}" alt="{escape(alt)}">'

@@ -1,0 +1,175 @@
+"""An object's frames: copies of photos from a folder, or the sharpest frames of a video."""
+
+import shutil
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageOps
+
+from scenefuse.sfm.photos import Photo, inspect_photo, photo_names, photo_notes, write_photos
+from scenefuse.stage import StageError, atomic_directory, quantity, threads
+
+VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
+
+
+@dataclass(frozen=True)
+class FrameSettings:
+    """Which frames are taken, and at what size."""
+
+    frame_step: int
+    """Take every n-th photo, or one frame out of each n of a video."""
+    max_frames: int
+    """Most frames; more are thinned out evenly. 0 sets no limit."""
+    max_width_px: int
+    """Widest frame; wider ones are scaled down."""
+    jpeg_quality: int
+    """Quality of frames that have to be encoded, 1 to 100."""
+
+
+def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameSettings) -> None:
+    """Take an object's frames from a folder of photos or from a video.
+
+    Photos keep their file names; one that is neither too wide nor rotated is copied byte by byte. A video is cut into
+    windows of equal length and the sharpest frame of each is kept (largest variance of the Laplacian,
+    Pech-Pacheco et al. 2000).
+
+    Args:
+        source: folder of photos, or video file.
+        frames: output, folder of frames.
+        photos: output, JSON list of them, with the size of each frame's original.
+        settings: choice and size.
+
+    Raises:
+        StageError: the source is missing, holds no photos, cannot be decoded, or yields fewer than three frames.
+    """
+    if not source.exists():
+        raise StageError(f"the object's photos {source} do not exist; check the path in the table of objects")
+    if source.is_file() and source.suffix.lower() not in VIDEO_SUFFIXES:
+        raise StageError(
+            f"{source} is neither a folder of photos nor a video; use one of {' '.join(sorted(VIDEO_SUFFIXES))}"
+        )
+    with atomic_directory(frames) as temporary:
+        kind = "video" if source.is_file() else "photos"
+        origin = (_from_video if source.is_file() else _from_folder)(source, temporary, settings)
+        listed = [inspect_photo(temporary, name) for name in sorted(origin)]
+    if len(listed) < 3:
+        shutil.rmtree(frames)
+        raise StageError(f"{source} yields {len(listed)} frames, at least 3 are needed; lower frame_step")
+    notes = photo_notes(listed)
+    print(f"{len(listed)} frames from {source}", flush=True)
+    for note in notes:
+        print(f"note: {note}", flush=True)
+    write_photos(photos, listed, frames, kind, notes, origin=quantity(origin, ""))
+
+
+def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:
+    """Frame name -> (width, height) of the photo it was made from, from the content of photos.json."""
+    if "origin" not in content:
+        return {p["name"]: (p["width"], p["height"]) for p in content["photos"]}
+    return {name: (entry["width"], entry["height"]) for name, entry in content["origin"]["value"].items()}
+
+
+def thin_out(count: int, step: int, limit: int) -> list[int]:
+    """Indices 0, step, 2 step, ... below count; spread evenly over the same range where more than `limit` (0: none)."""
+    chosen = list(range(0, count, max(step, 1)))
+    if 0 < limit < len(chosen):
+        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, limit).round().astype(int)]
+    return chosen
+
+
+def sharpness(frame: NDArray[Any]) -> float:
+    """Variance of the Laplacian of a (H, W, 3) BGR frame at no more than 640 columns: larger is sharper."""
+    grey = cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+    scale = min(1.0, 640.0 / grey.shape[1])
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    return float(cv2.Laplacian(small, cv2.CV_64F).var())
+
+
+def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:
+    names = photo_names(source)
+    flat: dict[str, str] = {}
+    for name in (names[i] for i in thin_out(len(names), settings.frame_step, settings.max_frames)):
+        stem = Path(name.replace("/", "_")).stem
+        if stem in flat:
+            raise StageError(f"{flat[stem]} and {name} in {source} would share the mask {stem}.png; rename one of them")
+        flat[stem] = name
+
+    def copy(name: str) -> tuple[str, dict[str, Any]]:
+        photo = inspect_photo(source, name)
+        target = output / name.replace("/", "_")
+        size = _copy_photo(source / name, photo, target, settings)
+        return target.name, {"source": name, "width": size[0], "height": size[1]}
+
+    with ThreadPoolExecutor(threads()) as pool:
+        return dict(pool.map(copy, flat.values()))
+
+
+def _copy_photo(source: Path, photo: Photo, target: Path, settings: FrameSettings) -> tuple[int, int]:
+    """Copy or scale one photo; returns the upright original's (width, height)."""
+    if photo.orientation == 1 and photo.width <= settings.max_width_px:
+        shutil.copyfile(source, target)
+        return photo.width, photo.height
+    with Image.open(source) as image:
+        exif = image.getexif()
+        upright = ImageOps.exif_transpose(image)
+        exif.pop(0x0112, None)
+        width = min(upright.width, settings.max_width_px)
+        height = round(upright.height * width / upright.width)
+        resized = upright.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
+        resized.save(target, quality=settings.jpeg_quality, subsampling=0, exif=exif)
+        return upright.size
+
+
+def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:
+    cv2.setNumThreads(threads())
+    count = sum(1 for _ in _decode(source, pictures=False))
+    if count == 0:
+        raise StageError(f"the video {source} cannot be decoded; convert it to H.264 in an .mp4 file")
+    starts = thin_out(count, settings.frame_step, settings.max_frames)
+    window_of = np.searchsorted(starts, np.arange(count), side="right") - 1
+    origin: dict[str, dict[str, Any]] = {}
+    best: tuple[float, int, NDArray[Any]] | None = None
+    for index, frame in _decode(source, pictures=True):
+        if best is not None and index < count and window_of[index] != window_of[best[1]]:
+            origin |= _write_frame(output, best, settings)
+            best = None
+        score = sharpness(frame)
+        if best is None or score > best[0]:
+            best = (score, min(index, count - 1), frame)
+    if best is not None:
+        origin |= _write_frame(output, best, settings)
+    return origin
+
+
+def _decode(source: Path, pictures: bool) -> Iterator[tuple[int, NDArray[Any]]]:
+    """Frames of a video in order; without `pictures` they are only counted, which is much faster."""
+    video = cv2.VideoCapture(str(source))
+    try:
+        index = 0
+        while video.grab():
+            frame: NDArray[Any] | None = video.retrieve()[1] if pictures else np.zeros(0)
+            if frame is not None:
+                yield index, frame
+            index += 1
+    finally:
+        video.release()
+
+
+def _write_frame(
+    output: Path, best: tuple[float, int, NDArray[Any]], settings: FrameSettings
+) -> dict[str, dict[str, Any]]:
+    score, index, frame = best
+    height, width = frame.shape[:2]
+    scale = min(1.0, settings.max_width_px / width)
+    if scale < 1.0:
+        size = (settings.max_width_px, round(height * scale))
+        frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
+    name = f"frame_{index:06d}.jpg"
+    cv2.imwrite(str(output / name), frame, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
+    return {name: {"frame": index, "width": width, "height": height, "sharpness": round(score, 3)}}

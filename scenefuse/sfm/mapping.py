@@ -1,0 +1,161 @@
+"""Incremental mapping with COLMAP, the second half of structure from motion; the same code serves scenes and objects.
+
+He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver, zero tolerances.
+"""
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+
+from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.photos import read_photos
+from scenefuse.stage import StageError, atomic_directory, quantity, threads, write_json
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """Incremental mapping and bundle adjustment."""
+
+    ba_iterations: int
+    """Most iterations of a global bundle adjustment."""
+    ba_linear_solver_iterations: int
+    """Most iterations of the linear solver within one of them."""
+    ba_tolerance: float
+    """Function, gradient and parameter tolerance of the last bundle adjustment; 0 runs all iterations."""
+    max_reprojection_error_px: float
+    """Observations with a larger error are dropped."""
+    init_min_inliers: int
+    """Fewest matches of the first pair of photos."""
+    min_registered_share: float
+    """Smallest share of the photos that have to be registered, 0 to 1; fewer is an error."""
+
+
+def map_photos(
+    *, folder: Path, photos: Path, database: Path, sparse: Path, report: Path, settings: MapSettings, seed: int
+) -> None:
+    """Recover cameras and sparse points by incremental mapping, then a last bundle adjustment.
+
+    Args:
+        folder: folder of photos (for the points' colours).
+        photos: JSON list of them.
+        database: COLMAP database with verified matches.
+        sparse: output, COLMAP model, the one with most photos.
+        report: output, JSON: photos registered, errors, models left out.
+        settings: mapping settings.
+        seed: of RANSAC and of the choice of the first pair.
+
+    Raises:
+        StageError: too small a share of the photos is registered.
+    """
+    names = [p.name for p in read_photos(photos)]
+    sparse.parent.mkdir(parents=True, exist_ok=True)
+    pycolmap.set_random_seed(seed)
+    with tempfile.TemporaryDirectory(dir=sparse.parent, prefix=".mapping-") as work:
+        models = cancellable(
+            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(settings, len(names), seed)
+        )
+    ranked = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    _check_registered(ranked, names, settings.min_registered_share)
+    model = ranked[0]
+    before_px = model.compute_mean_reprojection_error()
+    adjust(model, settings)
+    summary = describe(model, names)
+    print(
+        f"{summary['registered']['value']} of {len(names)} photos registered, "
+        f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points",
+        flush=True,
+    )
+    left_out = [
+        {
+            "photos": sorted(_registered_names(m)),
+            "reason": "not connected to the largest model by enough verified matches",
+        }
+        for m in ranked[1:]
+    ]
+    for entry in left_out:
+        print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
+    with atomic_directory(sparse) as temporary:
+        model.write(temporary)
+    content = {
+        **summary,
+        "mean_reprojection_error_before_last_adjustment_px": quantity(before_px, "px"),
+        "models_left_out": quantity(left_out, ""),
+        "seed": quantity(seed, "1"),
+    }
+    write_json(report, content)
+
+
+def adjust(model: pycolmap.Reconstruction, settings: MapSettings) -> None:
+    """Bundle-adjust a model in place with the given limits, then drop observations with large errors."""
+    options = pycolmap.BundleAdjustmentOptions()
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = settings.ba_iterations
+    solver.max_linear_solver_iterations = settings.ba_linear_solver_iterations
+    solver.function_tolerance = settings.ba_tolerance
+    solver.gradient_tolerance = settings.ba_tolerance
+    solver.parameter_tolerance = settings.ba_tolerance
+    solver.num_threads = threads()
+    options.print_summary = False
+    cancellable(pycolmap.bundle_adjustment, model, options)
+    observations = pycolmap.ObservationManager(model)
+    observations.filter_all_points3D(settings.max_reprojection_error_px, min_tri_angle=1.5)
+    observations.filter_observations_with_negative_depth()
+    model.update_point_3d_errors()
+
+
+def describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
+    """What a model holds, as quantities: photos registered, errors, points, cameras, photos left out."""
+    registered = _registered_names(model)
+    cameras = [
+        {"model": c.model_name, "width": c.width, "height": c.height, "params": list(c.params)}
+        for _, c in sorted(model.cameras.items())
+    ]
+    return {
+        "registered": quantity(len(registered), "1"),
+        "total": quantity(len(names), "1"),
+        "registered_share": quantity(len(registered) / len(names), "1"),
+        "mean_reprojection_error_px": quantity(model.compute_mean_reprojection_error(), "px"),
+        "points": quantity(model.num_points3D(), "1"),
+        "mean_track_length": quantity(model.compute_mean_track_length(), "1"),
+        "not_registered": quantity(sorted(set(names) - registered), ""),
+        "cameras": quantity(cameras, "px"),
+    }
+
+
+def _mapper_options(settings: MapSettings, photos: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+    options = pycolmap.IncrementalPipelineOptions()
+    options.num_threads = threads()
+    options.random_seed = seed
+    options.mapper.random_seed = seed
+    options.triangulation.random_seed = seed
+    options.ba_global_max_num_iterations = settings.ba_iterations
+    options.mapper.init_min_num_inliers = settings.init_min_inliers
+    options.mapper.filter_max_reproj_error = settings.max_reprojection_error_px
+    options.min_model_size = 3
+    # A second attempt from another pair stops, by default, once it shares twenty photos with the first, however small
+    # that one stayed; here every attempt goes on as far as it can, and the largest is taken.
+    options.max_model_overlap = photos
+    return options
+
+
+def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], share: float) -> None:
+    """StageError when the largest model holds too few of the photos."""
+    count = models[0].num_reg_images() if models else 0
+    if count >= 3 and count >= share * len(names):
+        return
+    others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
+    missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
+    raise StageError(
+        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} asked for "
+        f"by min_registered_share; not registered: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}. "
+        f"Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs "
+        f"that were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower "
+        f"min_registered_share"
+    )
+
+
+def _registered_names(model: pycolmap.Reconstruction) -> set[str]:
+    return {model.images[i].name for i in model.reg_image_ids()}

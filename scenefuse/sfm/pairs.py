@@ -1,0 +1,114 @@
+"""Which pairs of photos are compared: all of them, neighbours by GPS, or neighbours in time with loops."""
+
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial.distance import cdist
+
+from scenefuse.sfm.geodesy import local_frame
+from scenefuse.sfm.photos import Photo, gps_positions
+
+Pair = tuple[str, str]
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """The choice of pairs."""
+
+    pairs: Literal["auto", "exhaustive", "spatial", "sequential"]
+    """auto: by GPS where most photos have it, in sequence for a video, all pairs of a small set, else in sequence."""
+    spatial_from: int
+    """auto compares GPS neighbours only from this many photos on."""
+    exhaustive_up_to: int
+    """auto compares all pairs up to this many photos."""
+    neighbours: int
+    """spatial: nearest photos (horizontal distance) that each photo is compared with."""
+    overlap: int
+    """sequential: following photos that each photo is compared with."""
+    loop_every: int
+    """sequential: every n-th photo is compared with every other n-th photo, which closes loops."""
+    gps_accuracy_m: float
+    """Standard error of a GPS position; positions that spread less than five times this are not used."""
+
+
+def choose_pairs(photos: list[Photo], is_video: bool, settings: PairSettings) -> tuple[str, str, list[Pair]]:
+    """The kind of pairs, why, and the pairs themselves, sorted by the photos' order (method M5).
+
+    Args:
+        photos: in name order.
+        is_video: whether they are frames of a video, in order of time.
+        settings: see there.
+    """
+    names = [p.name for p in photos]
+    kind, reason = settings.pairs, "as configured"
+    if kind == "auto":
+        kind, reason = _automatic(photos, is_video, settings)
+    if kind == "spatial" and not _gps_usable(photos, settings.gps_accuracy_m):
+        kind, reason = "exhaustive", "spatial pairs were asked for, but too few photos have a useful GPS position"
+    if kind == "exhaustive":
+        return kind, reason, list(combinations(names, 2))
+    if kind == "spatial":
+        return kind, reason, spatial_pairs(photos, settings.neighbours)
+    return kind, reason, sequential_pairs(names, settings.overlap, settings.loop_every)
+
+
+def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
+    """Each photo with its nearest ones by GPS, with all photos where its own position is unknown.
+
+    A minimum spanning tree over the positions is added, so that no group of photos stays apart.
+    """
+    names = [p.name for p in photos]
+    known, positions = gps_positions(photos)
+    at = {name: row for row, name in enumerate(known)}
+    order = {name: index for index, name in enumerate(names)}
+    horizontal = local_frame(positions).apply(positions)[:, :2]
+    chosen = {_ordered(a, b, order) for a in names if a not in at for b in names if a != b}
+    distance = cdist(horizontal, horizontal)
+    nearest = np.argsort(distance, axis=1, kind="stable")
+    for row, name in enumerate(known):
+        others = [c for c in nearest[row] if c != row][:neighbours]
+        chosen |= {_ordered(name, known[c], order) for c in others}
+    # Coincident positions would be no edge at all in a sparse graph, hence the small constant.
+    tree = minimum_spanning_tree(distance + 1e-6).tocoo()
+    chosen |= {_ordered(known[a], known[b], order) for a, b in zip(tree.row, tree.col)}
+    return sorted(chosen, key=lambda pair: (order[pair[0]], order[pair[1]]))
+
+
+def sequential_pairs(names: list[str], overlap: int, loop_every: int) -> list[Pair]:
+    """Each frame with the next `overlap` ones, and every `loop_every`-th frame with all others of these."""
+    count = len(names)
+    chosen = {(i, j) for i in range(count) for j in range(i + 1, min(i + overlap, count - 1) + 1)}
+    chosen |= set(combinations(range(0, count, max(loop_every, 1)), 2))
+    return [(names[i], names[j]) for i, j in sorted(chosen)]
+
+
+def gps_spread_m(positions: NDArray[np.float64]) -> float:
+    """RMS horizontal distance of WGS84 positions (N, 3) from their mean, in metres."""
+    horizontal = local_frame(positions).apply(positions)[:, :2]
+    return float(np.sqrt(((horizontal - horizontal.mean(0)) ** 2).sum(1).mean()))
+
+
+def _automatic(
+    photos: list[Photo], is_video: bool, settings: PairSettings
+) -> tuple[Literal["exhaustive", "spatial", "sequential"], str]:
+    count = len(photos)
+    if count >= settings.spatial_from and _gps_usable(photos, settings.gps_accuracy_m):
+        return "spatial", f"{count} photos with GPS, {settings.neighbours} neighbours each"
+    if is_video and count > settings.overlap * 2:
+        return "sequential", "frames of a video"
+    if count <= settings.exhaustive_up_to:
+        return "exhaustive", f"{count} photos, no more than {settings.exhaustive_up_to}"
+    return "sequential", f"{count} photos without GPS, more than {settings.exhaustive_up_to}"
+
+
+def _gps_usable(photos: list[Photo], accuracy_m: float) -> bool:
+    known, positions = gps_positions(photos)
+    return len(known) >= max(3, 0.8 * len(photos)) and gps_spread_m(positions) > 5.0 * accuracy_m
+
+
+def _ordered(a: str, b: str, order: dict[str, int]) -> Pair:
+    return (a, b) if order[a] < order[b] else (b, a)

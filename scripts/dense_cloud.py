@@ -1,7 +1,0 @@
-"""Fuse a scene's depth maps into its dense cloud."""
-
-from scenefuse.scenes.dense import fuse_depth_maps
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(fuse_depth_maps)

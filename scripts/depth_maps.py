@@ -1,7 +1,0 @@
-"""Estimate depth and normal maps for one chunk of a scene's photos."""
-
-from scenefuse.scenes.dense import estimate_depth_maps
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(estimate_depth_maps)

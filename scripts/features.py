@@ -1,7 +1,0 @@
-"""Find SIFT features in every photo."""
-
-from scenefuse.scenes.sfm import extract_features
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(extract_features)

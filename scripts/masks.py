@@ -1,7 +1,0 @@
-"""Make a mask of the object for every photo."""
-
-from scenefuse.objects.masks import make_masks
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(make_masks)

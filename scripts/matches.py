@@ -1,7 +1,0 @@
-"""Match features between chosen pairs of photos."""
-
-from scenefuse.scenes.sfm import match_features
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(match_features)

@@ -1,0 +1,7 @@
+"""Fuse a scene's depth maps into its dense cloud."""
+
+from scenefuse.mvs.depth_maps import fuse_depth_maps
+from scenefuse.stage import run
+
+if __name__ == "__main__":
+    run(fuse_depth_maps)

@@ -1,0 +1,7 @@
+"""Match features between chosen pairs of photos."""
+
+from scenefuse.sfm.features import match_features
+from scenefuse.stage import run
+
+if __name__ == "__main__":
+    run(match_features)

@@ -1,0 +1,271 @@
+"""The alignment from shared features finds a planted similarity, says how sure it is, and says no where nothing is shared."""
+
+import os
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+
+from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_models
+from scenefuse.registration.shared_features.landmarks import match_landmarks, read_landmarks
+from scenefuse.registration.shared_features.reprojection import match_errors, observations, refine
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import Sim3, rotation_angle_deg
+
+SETTINGS = AlignmentSettings(
+    most_points=10000,
+    descriptors_per_point=3,
+    max_ratio=0.85,
+    ransac_samples=50000,
+    max_error_px=6,
+    min_points=15,
+    min_photos=3,
+    nearest_points=200,
+    max_rival_share=0.5,
+    max_scale_sd_log=0.05,
+    max_rotation_sd_deg=3,
+    bootstrap_draws=100,
+)
+
+
+@dataclass(frozen=True)
+class World:
+    """Points, what they look like (unit vectors, 128), and photos that look at them: centre, target, focal length."""
+
+    points: np.ndarray
+    looks: np.ndarray
+
+
+def world(seed, count=400, spread=(5, 5, 2)):
+    rng = np.random.default_rng(seed)
+    return World(rng.uniform(-1, 1, (count, 3)) * spread, rng.gamma(0.5, 1, (count, 128)))
+
+
+def ring(radius, height, count, target=(0, 0, 0)):
+    angles = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    centres = np.stack([radius * np.cos(angles), radius * np.sin(angles), np.full(count, float(height))], axis=1)
+    return [(centre + target, np.array(target, float)) for centre in centres]
+
+
+def capture(folder, name, seen, views, seed, *, model_from_world=None, noise_px=0.3, focal=700.0, names=None):
+    """A sparse model of some points from some views, in its own frame, and the database with the descriptors."""
+    rng = np.random.default_rng(seed)
+    move = model_from_world or Sim3.identity()
+    camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=800, height=600, params=[focal, 400, 300, 0.05], camera_id=1)
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    tracks = [[] for _ in seen.points]
+    with pycolmap.Database.open(folder / f"{name}.db") as database:
+        database.write_camera(camera, use_camera_id=True)
+        for k, (centre, target) in enumerate(views, 1):
+            z = (target - centre) / np.linalg.norm(target - centre)
+            x = np.cross(z, [0, 0.1, 1.0])
+            x /= np.linalg.norm(x)
+            rotation = np.stack([x, np.cross(z, x), z])
+            in_cam = (seen.points - centre) @ rotation.T
+            xy = np.asarray(camera.img_from_cam(in_cam)).reshape(-1, 2)
+            inside = (in_cam[:, 2] > 0.5) & (xy > 0).all(1) & (xy < [800, 600]).all(1)
+            rows = np.flatnonzero(inside)
+            rows = rng.permutation(rows)[: int(0.8 * len(rows))]
+            noisy = xy[rows] + rng.normal(0, noise_px, (len(rows), 2))
+            looks = seen.looks[rows] * rng.uniform(0.7, 1.3, (len(rows), 128))
+            looks = np.sqrt(looks / looks.sum(1, keepdims=True))
+            image = pycolmap.Image(
+                name=names[k - 1] if names else f"{name}{k}.jpg",
+                camera_id=1,
+                image_id=k,
+                points2D=[pycolmap.Point2D(p) for p in noisy],
+            )
+            turned = rotation @ move.rotation.T
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turned), -turned @ move.apply(centre))
+            model.add_image_with_trivial_frame(image, pose)
+            database.write_image(pycolmap.Image(name=image.name, camera_id=1, image_id=k), use_image_id=True)
+            database.write_descriptors(
+                k, pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, (512 * looks).astype(np.uint8))
+            )
+            for j, row in enumerate(rows):
+                tracks[row].append(pycolmap.TrackElement(k, j))
+    points = move.apply(seen.points) + move.scale * rng.normal(0, 0.002, seen.points.shape)
+    for point, track in zip(points, tracks):
+        if len(track) >= 2:
+            model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    (folder / name).mkdir()
+    model.write(folder / name)
+    return folder / name, folder / f"{name}.db"
+
+
+def ask(folder, obj, scene, settings=SETTINGS, seed=0):
+    align_models(
+        object_model=obj[0],
+        object_features=obj[1],
+        scene_model=scene[0],
+        scene_features=scene[1],
+        alignment=folder / "alignment.json",
+        seed=seed,
+        settings=settings,
+    )
+    return read_json(folder / "alignment.json")
+
+
+OBJECT_FROM_WORLD = Sim3(
+    3.7, Rotation.from_euler("xyz", [130, -40, 75], degrees=True).as_matrix(), np.array([4.0, -9, 2])
+)
+
+
+def part(whole, chosen):
+    return World(whole.points[chosen], whole.looks[chosen])
+
+
+def near(whole, radius=2.5):
+    return part(whole, np.linalg.norm(whole.points[:, :2], axis=1) < radius)
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory):
+    """A flight over a world, and an orbit of its middle in another frame; each also sees points of its own."""
+    folder = tmp_path_factory.mktemp("pair")
+    whole, strange = world(1), world(2, 150, (2, 2, 1))
+    scene = capture(folder, "scene", whole, ring(6, 14, 12), 3)
+    middle = near(whole)
+    both = World(np.concatenate([middle.points, strange.points]), np.concatenate([middle.looks, strange.looks]))
+    obj = capture(folder, "object", both, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
+    return obj, scene
+
+
+def test_a_planted_similarity_is_found(pair, tmp_path):
+    found = ask(tmp_path, *pair)
+    assert value(found, "found") is True
+    truth = OBJECT_FROM_WORLD.inverse()
+    pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
+    assert value(found, "scale") == pytest.approx(pose.scale, rel=1e-12)
+    assert pose.scale == pytest.approx(truth.scale, rel=3e-3)
+    assert rotation_angle_deg(pose.rotation @ truth.rotation.T) < 0.2
+    centre = OBJECT_FROM_WORLD.apply(np.zeros(3))
+    assert np.linalg.norm(pose.apply(centre) - truth.apply(centre)) < 0.02
+    # The errors are a few standard deviations at most.
+    assert abs(np.log(pose.scale / truth.scale)) < 5 * value(found, "scale_sd_log") < 0.02
+    assert value(found, "shared_points") > 40 and value(found, "reprojection_px") < 2
+    assert value(found, "object_photos") == 10 and value(found, "scene_photos") == 12
+
+
+def test_camera_centres_say_the_same(pair, tmp_path):
+    found = ask(tmp_path, *pair)
+    assert value(found, "centres_photos") >= 8
+    assert value(found, "scale_from_centres") == pytest.approx(OBJECT_FROM_WORLD.inverse().scale, rel=0.02)
+    assert value(found, "centres_rotation_deg") < 1 and value(found, "centres_shift") < 0.1
+
+
+def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos_look_at(tmp_path):
+    whole = world(1)
+    far = np.maximum(np.linalg.norm(whole.points, axis=1) - 3, 0)
+    bent = replace(whole, points=whole.points + np.outer(0.02 * far, [1, 0, 0]))
+    scene = capture(tmp_path, "scene", bent, ring(6, 14, 12), 3)
+    obj = capture(tmp_path, "object", whole, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
+    truth, centre = OBJECT_FROM_WORLD.inverse(), OBJECT_FROM_WORLD.apply(np.zeros(3))
+    shifts = []
+    for count in (100, 1000):
+        found = ask(tmp_path, obj, scene, replace(SETTINGS, nearest_points=count))
+        pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
+        shifts.append(np.linalg.norm(pose.apply(centre) - truth.apply(centre)))
+        if count == 100:
+            assert shifts[0] < 3 * value(found, "translation_sd")
+    assert shifts[0] < 0.5 * shifts[1]
+
+
+def test_the_same_input_gives_the_same_output(pair, tmp_path):
+    first, second = (ask(tmp_path, *pair) for _ in range(2))
+    del first["seconds"], second["seconds"]
+    assert first == second
+
+
+def test_another_place_is_not_found(pair, tmp_path):
+    elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
+    found = ask(tmp_path, pair[0], elsewhere)
+    assert value(found, "found") is False and value(found, "scene_from_object") is None
+    # Without a ratio test every point has a partner, and still nothing is believed.
+    found = ask(tmp_path, pair[0], elsewhere, replace(SETTINGS, max_ratio=1.0))
+    assert value(found, "matches") > 50
+    assert value(found, "found") is False and "are needed" in value(found, "reason")
+
+
+def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
+    """Its twin looks the same where it looks like anything: each half of the matches believes another place."""
+    whole = world(1)
+    middle = near(whole)
+    rng = np.random.default_rng(0)
+    half = rng.random(len(middle.points)) < 0.5
+    twin = World(middle.points[half] + [12, 0, 0], middle.looks[half])
+    rest = part(whole, np.linalg.norm(whole.points[:, :2], axis=1) >= 2.5)
+    own = part(middle, ~half)
+    points = np.concatenate([rest.points, own.points, twin.points])
+    looks = np.concatenate([rest.looks, own.looks, twin.looks])
+    scene = capture(tmp_path, "scene", World(points, looks), ring(6, 25, 12, (6, 0, 0)), 3)
+    obj = capture(tmp_path, "object", middle, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
+    found = ask(tmp_path, obj, scene)
+    assert value(found, "found") is False and "twice" in value(found, "reason")
+
+
+def test_points_along_one_line_leave_the_rotation_open(tmp_path):
+    whole = world(1, 300)
+    line = World(whole.points.copy(), whole.looks)
+    line.points[:40] = np.linspace([-2, 0, 0], [2, 0, 0], 40) + 0.002 * line.points[:40]
+    scene = capture(tmp_path, "scene", line, ring(6, 14, 12), 3)
+    obj = capture(
+        tmp_path, "object", part(line, np.arange(40)), ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD
+    )
+    found = ask(tmp_path, obj, scene)
+    assert value(found, "found") is False and "rotation open" in value(found, "reason")
+
+
+def test_photos_in_both_models(tmp_path):
+    """The scene made from every second photo of the object: the same files, the same features."""
+    whole = near(world(1))
+    views = ring(6, 2.5, 12)
+    names = [f"{k}.jpg" for k in range(12)]
+    obj = capture(tmp_path, "object", whole, views, 4, model_from_world=OBJECT_FROM_WORLD, names=names)
+    scene = capture(tmp_path, "scene", whole, views[::2], 4, names=names[::2])
+    found = ask(tmp_path, obj, scene)
+    assert value(found, "found") is True
+    assert value(found, "scale") == pytest.approx(1 / 3.7, rel=2e-3)
+
+
+def test_refinement_undoes_a_wrong_start(pair):
+    obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
+    seen = observations(obj, scene, match_landmarks(obj, scene, 0.8))
+    truth = OBJECT_FROM_WORLD.inverse()
+    seen = seen.subset(match_errors(seen, truth) < 6)
+    tilt = Rotation.from_rotvec([0.06, -0.03, 0.09]).as_matrix()
+    start = Sim3(1.06, tilt, np.array([0.15, 0.06, -0.12])) @ truth
+    assert np.median(match_errors(seen, start)) > 6
+    found = refine(seen, start, 3.0, 30)
+    assert np.median(match_errors(seen, found)) < 2
+    assert found.scale == pytest.approx(truth.scale, rel=3e-3)
+
+
+def test_a_cap_keeps_the_points_seen_most(pair):
+    few, all_points = (read_landmarks(*pair[1], most, 2) for most in (50, 10000))
+    assert len(few.points) == 50 < len(all_points.points)
+    assert np.diff(few.start).min() >= np.sort(np.diff(all_points.start))[-50]
+    assert len(few.rays) == few.start[-1]
+
+
+def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
+    obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
+    whole = match_landmarks(obj, scene, 0.85)
+    monkeypatch.setattr("scenefuse.registration.shared_features.landmarks.BLOCK", 37)
+    np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85), whole)
+
+
+def test_a_database_of_other_photos_is_refused(pair, tmp_path):
+    with pytest.raises(StageError, match="rerun the matching"):
+        ask(tmp_path, (pair[0][0], pair[1][1]), pair[1])
+
+
+def test_inputs_are_not_written_to(pair, tmp_path):
+    databases = [side[1] for side in pair]
+    for database in databases:
+        os.utime(database, (1e9, 1e9))
+    ask(tmp_path, *pair)
+    assert [database.stat().st_mtime for database in databases] == [1e9, 1e9]

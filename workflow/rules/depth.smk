@@ -1,0 +1,86 @@
+# Depth and pose networks of an object: stage 1 trains them, stage 3 refines them by what the NeRF renders.
+#
+# INPUTS    results/objects/{object}/undistorted/ (or poses/), masks/; config: object.stage1, object.stage3
+# OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
+
+
+STAGE1 = dict(config["object"]["stage1"])
+# The workspace that the training stages read; both have the same photos, and poses in the same frame.
+POSED = {
+    "sfm": "results/objects/{object}/undistorted",
+    "network": "results/objects/{object}/poses",
+}[STAGE1.pop("pose_source")]
+HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
+
+
+rule train_depth:
+    """Self-supervised depth and pose networks (paper 3.2 and 4.2.2, stage 1)."""
+    input:
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
+        masks="results/objects/{object}/masks",
+        masks_json="results/objects/{object}/masks.json",
+    output:
+        stage=directory("results/objects/{object}/stage1"),
+        report="results/objects/{object}/stage1.json",
+    log:
+        "results/logs/train_depth/{object}.log",
+    benchmark:
+        "results/benchmarks/train_depth/{object}.tsv"
+    conda:
+        "../../envs/training.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        runtime=lambda wildcards, attempt: 240 * attempt,
+        gpu=config["gpu"],
+    params:
+        options=flags(STAGE1 | HELD_OUT),
+        checkpoints="results/checkpoints/{object}/stage1",
+        seed=config["seed"],
+        script=script("depth/train_depth.py"),
+        code=code("depth/train_depth.py"),
+    message:
+        "{wildcards.object}: stage 1, depth and pose networks"
+    shell:
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stage {output.stage} --report {output.report}"
+        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
+
+
+rule refine_depth:
+    """Feedback: depth rendered by the NeRF refines the networks (stage 3)."""
+    input:
+        cameras=POSED,
+        cameras_json=f"{POSED}.json",
+        masks="results/objects/{object}/masks",
+        masks_json="results/objects/{object}/masks.json",
+        previous="results/objects/{object}/stage1",
+        previous_json="results/objects/{object}/stage1.json",
+        rendered="results/objects/{object}/stage2",
+        rendered_json="results/objects/{object}/stage2.json",
+    output:
+        stage=directory("results/objects/{object}/stage3"),
+        report="results/objects/{object}/stage3.json",
+    log:
+        "results/logs/refine_depth/{object}.log",
+    benchmark:
+        "results/benchmarks/refine_depth/{object}.tsv"
+    conda:
+        "../../envs/training.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        runtime=lambda wildcards, attempt: 240 * attempt,
+        gpu=config["gpu"],
+    params:
+        options=flags(config["object"]["stage3"] | HELD_OUT),
+        checkpoints="results/checkpoints/{object}/stage3",
+        seed=config["seed"],
+        script=script("depth/refine_depth.py"),
+        code=code("depth/refine_depth.py"),
+    message:
+        "{wildcards.object}: stage 3, feedback"
+    shell:
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --previous {input.previous}"
+        " --rendered {input.rendered} --stage {output.stage} --report {output.report}"
+        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"

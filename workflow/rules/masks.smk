@@ -1,0 +1,73 @@
+# Where an object is in each of its photos.
+#
+# INPUTS    config/objects.tsv: prompts or masks; results/objects/{object}/undistorted/; config: object.masks
+# OUTPUTS   results/objects/{object}/masks/, masks.json, masks.png
+#           results/weights/                                                SAM 2's, for masks by it
+
+
+rule fetch_sam2_weights:
+    """SAM 2's weights for ONNX Runtime; not asked for where the config names others."""
+    output:
+        encoder="results/weights/sam2_encoder.ort",
+        decoder="results/weights/sam2_decoder.onnx",
+    log:
+        "results/logs/fetch_sam2_weights.log",
+    localrule: True
+    conda:
+        "../../envs/reconstruction.yaml"
+    params:
+        options=flags(
+            {
+                "package": config["object"]["masks"]["sam2_package"],
+                "sam2_encoder_sha256": config["object"]["masks"][
+                    "sam2_encoder_sha256"
+                ],
+                "sam2_decoder_sha256": config["object"]["masks"][
+                    "sam2_decoder_sha256"
+                ],
+            }
+        ),
+        script=script("masks/fetch_sam2_weights.py"),
+        code=code("masks/fetch_sam2_weights.py"),
+    message:
+        "SAM 2's weights"
+    shell:
+        "exec python {params.script} --sam2-encoder {output.encoder} --sam2-decoder {output.decoder} {params.options} &> {log}"
+
+
+rule make_masks:
+    """Where the object is in each frame: SAM 2, GrabCut, or your own masks (paper 3.2)."""
+    input:
+        mask_inputs,
+        photos="results/objects/{object}/photos.json",
+        sfm="results/objects/{object}/sparse",
+        cameras="results/objects/{object}/undistorted",
+        cameras_json="results/objects/{object}/undistorted.json",
+    output:
+        masks=directory("results/objects/{object}/masks"),
+        report="results/objects/{object}/masks.json",
+        sheet=report(
+            "results/objects/{object}/masks.png",
+            category="Objects",
+            subcategory="{object}",
+            caption="../report/masks.rst",
+        ),
+    log:
+        "results/logs/make_masks/{object}.log",
+    benchmark:
+        "results/benchmarks/make_masks/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
+    params:
+        options=mask_options,
+        seed=config["seed"],
+        script=script("masks/make_masks.py"),
+        code=code("masks/make_masks.py"),
+    message:
+        "{wildcards.object}: masks"
+    shell:
+        "exec python {params.script} --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm} --photos {input.photos}"
+        " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"

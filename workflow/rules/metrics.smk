@@ -1,0 +1,145 @@
+# Registration and completion metrics, and errors against truth where it is known.
+#
+# INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth; config: metrics, evaluation
+# OUTPUTS   results/objects/{object}/metrics.json, registration/{variant}/metrics.json
+#           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
+
+
+rule compute_metrics:
+    """Registration and completion metrics, each with its null value (paper 3.3.1 and 3.3.2; G1 to G5)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/full/crop.ply",
+        crop_json="results/objects/{object}/registration/full/crop.json",
+        fine="results/objects/{object}/registration/full/fine.json",
+        fused="results/objects/{object}/fused.ply",
+    output:
+        "results/objects/{object}/metrics.json",
+    log:
+        "results/logs/compute_metrics/{object}.log",
+    benchmark:
+        "results/benchmarks/compute_metrics/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        options=flags(config["metrics"]),
+        seed=config["seed"],
+        script=script("metrics/compute_metrics.py"),
+        code=code("metrics/compute_metrics.py"),
+    message:
+        "{wildcards.object}: metrics"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
+        " --fused {input.fused} --metrics {output} --seed {params.seed} {params.options} &> {log}"
+
+
+rule compute_variant_metrics:
+    """Registration metrics of one variant, at the full variant's thresholds and on its crop."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/full/crop.ply",
+        crop_json="results/objects/{object}/registration/full/crop.json",
+        fine="results/objects/{object}/registration/{variant}/fine.json",
+    output:
+        "results/objects/{object}/registration/{variant}/metrics.json",
+    log:
+        "results/logs/compute_variant_metrics/{object}-{variant}.log",
+    benchmark:
+        "results/benchmarks/compute_variant_metrics/{object}-{variant}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["metrics"]),
+        seed=config["seed"],
+        script=script("metrics/compute_metrics.py"),
+        code=code("metrics/compute_metrics.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: metrics"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
+        " --fused None --metrics {output} --seed {params.seed} {params.options} &> {log}"
+
+
+rule evaluate_scene:
+    """Judge a scene whose truth is known: cameras, georeferencing, dense cloud (G8)."""
+    input:
+        model="results/scenes/{scene}/georeferenced",
+        georeference="results/scenes/{scene}/georeference.json",
+        cloud="results/scenes/{scene}/dense.ply",
+        truth=lambda wildcards: scene_truth(wildcards.scene),
+    output:
+        "results/scenes/{scene}/truth.json",
+    log:
+        "results/logs/evaluate_scene/{scene}.log",
+    benchmark:
+        "results/benchmarks/evaluate_scene/{scene}.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["evaluation"]["scene"]),
+        seed=config["seed"],
+        script=script("metrics/evaluate_scene.py"),
+        code=code("metrics/evaluate_scene.py"),
+    message:
+        "Scene {wildcards.scene}: comparing with the truth"
+    shell:
+        "exec python {params.script} --model {input.model} --georeference {input.georeference} --cloud {input.cloud}"
+        " --truth {input.truth:q} --evaluation {output} --seed {params.seed} {params.options} &> {log}"
+
+
+rule evaluate_object:
+    """Judge an object whose truth is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
+    input:
+        cameras=POSED,
+        masks="results/objects/{object}/masks",
+        stages=expand(
+            "results/objects/{object}/stage{stage}",
+            stage=[1, 2, 3, 4],
+            allow_missing=True,
+        ),
+        cloud="results/objects/{object}/object.ply",
+        variants=expand(
+            "results/objects/{object}/registration/{variant}/fine.json",
+            variant=VARIANTS,
+            allow_missing=True,
+        ),
+        alignment="results/objects/{object}/alignment.json",
+        before=in_scene("dense.ply"),
+        after="results/objects/{object}/fused_scene.ply",
+        scene=in_scene("truth.json"),
+        truth_scene=lambda wildcards: scene_truth(object_row(wildcards.object)["scene"]),
+        truth_object=lambda wildcards: object_row(wildcards.object)["truth"],
+    output:
+        "results/objects/{object}/truth.json",
+    log:
+        "results/logs/evaluate_object/{object}.log",
+    benchmark:
+        "results/benchmarks/evaluate_object/{object}.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["evaluation"]["object"]),
+        seed=config["seed"],
+        script=script("metrics/evaluate_object.py"),
+        code=code("metrics/evaluate_object.py"),
+    message:
+        "{wildcards.object}: comparing with the truth"
+    shell:
+        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
+        " --cloud {input.cloud} --variants {input.variants} --alignment {input.alignment} --before {input.before} --after {input.after}"
+        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
+        " --evaluation {output} --seed {params.seed} {params.options} &> {log}"

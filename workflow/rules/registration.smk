@@ -1,0 +1,208 @@
+# Where the object lies in the scene.
+#
+# INPUTS    config/objects.tsv: fiducials, where there are any; the scene's cloud and model; the object's cloud; config: registration
+# OUTPUTS   results/objects/{object}/alignment.json                          where shared features of the photos alone put the object
+#           results/objects/{object}/registration/{variant}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png
+#           results/objects/{object}/frames.json
+#
+# `full` is the variant that is fused; the others (`paper`, `clouds_only`, `no_scale`, `no_crop`) run beside it by the same scripts and are
+# measured at the same thresholds.
+
+
+rule align_models:
+    """Find the object in the scene by features that their photos share (R14)."""
+    input:
+        object_model="results/objects/{object}/sparse",
+        object_json="results/objects/{object}/sparse.json",
+        object_features="results/objects/{object}/features.db",
+        scene_model=in_scene("georeferenced"),
+        scene_json=in_scene("georeference.json"),
+        scene_features=in_scene("features.db"),
+    output:
+        "results/objects/{object}/alignment.json",
+    log:
+        "results/logs/align_models/{object}.log",
+    benchmark:
+        "results/benchmarks/align_models/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["registration"]["alignment"]),
+        seed=config["seed"],
+        script=script("registration/align_models.py"),
+        code=code("registration/align_models.py"),
+    message:
+        "{wildcards.object}: alignment from shared features"
+    shell:
+        "exec python {params.script} --object-model {input.object_model} --object-features {input.object_features}"
+        " --scene-model {input.scene_model} --scene-features {input.scene_features} --alignment {output}"
+        " --seed {params.seed} {params.options} &> {log}"
+
+
+rule crop_scene:
+    """Cut the object's surroundings out of the scene by its fiducials, or by its masks' votes (paper 3.3; C1 to C3)."""
+    input:
+        crop_inputs,
+        scene=in_scene("dense.ply"),
+        model=in_scene("georeferenced"),
+        model_json=in_scene("georeference.json"),
+    output:
+        crop="results/objects/{object}/registration/{variant}/crop.ply",
+        report="results/objects/{object}/registration/{variant}/crop.json",
+    log:
+        "results/logs/crop_scene/{object}-{variant}.log",
+    benchmark:
+        "results/benchmarks/crop_scene/{object}-{variant}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=crop_options,
+        script=script("registration/crop_scene.py"),
+        code=code("registration/crop_scene.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: crop"
+    shell:
+        "exec python {params.script} --scene {input.scene} --model {input.model} --georeference {input.model_json}"
+        " --crop {output.crop} --report {output.report} {params.options} &> {log}"
+
+
+rule estimate_scale:
+    """How large the object's unit is in the scene (paper 3.3; R1 to R4)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/{variant}/crop.ply",
+        crop_json="results/objects/{object}/registration/{variant}/crop.json",
+        cameras="results/objects/{object}/undistorted.json",
+    output:
+        "results/objects/{object}/registration/{variant}/scale.json",
+    log:
+        "results/logs/estimate_scale/{object}-{variant}.log",
+    benchmark:
+        "results/benchmarks/estimate_scale/{object}-{variant}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=variant_options("scale"),
+        script=script("registration/estimate_scale.py"),
+        code=code("registration/estimate_scale.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: scale"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        " --report {output} {params.options} &> {log}"
+
+
+rule register_coarsely:
+    """Hypotheses of the object's pose in the scene (R3, R6)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/{variant}/crop.ply",
+        crop_json="results/objects/{object}/registration/{variant}/crop.json",
+        cameras="results/objects/{object}/undistorted.json",
+        scale="results/objects/{object}/registration/{variant}/scale.json",
+    output:
+        "results/objects/{object}/registration/{variant}/coarse.json",
+    log:
+        "results/logs/register_coarsely/{object}-{variant}.log",
+    benchmark:
+        "results/benchmarks/register_coarsely/{object}-{variant}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        options=variant_options("coarse"),
+        seed=config["seed"],
+        script=script("registration/register_coarsely.py"),
+        code=code("registration/register_coarsely.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: coarse registration"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        " --scale {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
+
+
+rule register_finely:
+    """Refine the hypotheses, judge them, and register or refuse (R8, R9, R12)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/{variant}/crop.ply",
+        crop_json="results/objects/{object}/registration/{variant}/crop.json",
+        cameras="results/objects/{object}/undistorted.json",
+        scale="results/objects/{object}/registration/{variant}/scale.json",
+        coarse="results/objects/{object}/registration/{variant}/coarse.json",
+        alignment="results/objects/{object}/alignment.json",
+        workspace=in_scene("undistorted"),
+        depth=in_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
+        depth_json=in_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
+    output:
+        fine="results/objects/{object}/registration/{variant}/fine.json",
+        picture=report(
+            "results/objects/{object}/registration/{variant}/fine.png",
+            category="Objects",
+            subcategory="{object}",
+            caption="../report/fine.rst",
+        ),
+    log:
+        "results/logs/register_finely/{object}-{variant}.log",
+    benchmark:
+        "results/benchmarks/register_finely/{object}-{variant}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        options=variant_options("fine"),
+        seed=config["seed"],
+        script=script("registration/register_finely.py"),
+        code=code("registration/register_finely.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: fine registration"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
+        " --scale {input.scale} --coarse {input.coarse} --alignment {input.alignment} --workspace {input.workspace} --depth {input.depth} --fine {output.fine} --picture {output.picture}"
+        " --seed {params.seed} {params.options} &> {log}"
+
+
+rule write_frame_ledger:
+    """Every transform between the object's frames, in one file."""
+    input:
+        cloud="results/objects/{object}/object.json",
+        fine="results/objects/{object}/registration/full/fine.json",
+        georeference=in_scene("georeference.json"),
+    output:
+        "results/objects/{object}/frames.json",
+    log:
+        "results/logs/write_frame_ledger/{object}.log",
+    benchmark:
+        "results/benchmarks/write_frame_ledger/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 500 * attempt,
+        runtime=lambda wildcards, attempt: 10 * attempt,
+    params:
+        script=script("registration/write_frame_ledger.py"),
+        code=code("registration/write_frame_ledger.py"),
+    message:
+        "{wildcards.object}: frame ledger"
+    shell:
+        "exec python {params.script} --object-report {input.cloud} --fine {input.fine} --georeference {input.georeference}"
+        " --frames {output} &> {log}"

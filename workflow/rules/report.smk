@@ -1,0 +1,152 @@
+# Figures, tables, and the report page.
+#
+# INPUTS    everything before
+# OUTPUTS   results/scenes/{scene}/scene.png, results/objects/{object}/figures/
+#           results/summary/*.tsv, summary.txt, report.html
+TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects"]
+
+
+rule draw_scene:
+    """The scene from above and from the side, with its cameras and objects."""
+    input:
+        cloud="results/scenes/{scene}/dense.ply",
+        model="results/scenes/{scene}/georeferenced",
+        crops=of_objects("registration/full/crop.ply"),
+    output:
+        report(
+            "results/scenes/{scene}/scene.png",
+            category="Scenes",
+            caption="../report/scene.rst",
+        ),
+    log:
+        "results/logs/draw_scene/{scene}.log",
+    benchmark:
+        "results/benchmarks/draw_scene/{scene}.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        objects=objects_in,
+        script=script("report/draw_scene.py"),
+        code=code("report/draw_scene.py"),
+    message:
+        "Scene {wildcards.scene}: figure"
+    shell:
+        "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} --georeferenced {input.model}"
+        " --crops {input.crops} --objects {params.objects} --figure {output} &> {log}"
+
+
+rule draw_object:
+    """The object before and after, and every step between (the paper's Figures 2, 3 and 5)."""
+    input:
+        scene=in_scene("dense.ply"),
+        fused_scene="results/objects/{object}/fused_scene.ply",
+        crop="results/objects/{object}/registration/full/crop.ply",
+        crop_json="results/objects/{object}/registration/full/crop.json",
+        cloud="results/objects/{object}/object.ply",
+        fine="results/objects/{object}/registration/full/fine.json",
+        metrics="results/objects/{object}/metrics.json",
+        cameras="results/objects/{object}/undistorted",
+        masks="results/objects/{object}/masks",
+        stage1="results/objects/{object}/stage1",
+        stage2="results/objects/{object}/stage2",
+        stage3="results/objects/{object}/stage3",
+        stage4="results/objects/{object}/stage4",
+    output:
+        report(
+            directory("results/objects/{object}/figures"),
+            patterns=["{name}.png"],
+            category="Objects",
+            subcategory="{object}",
+            caption="../report/figures.rst",
+        ),
+    log:
+        "results/logs/draw_object/{object}.log",
+    benchmark:
+        "results/benchmarks/draw_object/{object}.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        script=script("report/draw_object.py"),
+        code=code("report/draw_object.py"),
+    message:
+        "{wildcards.object}: figures"
+    shell:
+        "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
+        " --crop {input.crop} --crop-report {input.crop_json} --object-cloud {input.cloud} --fine {input.fine}"
+        " --metrics {input.metrics} --cameras {input.cameras} --masks {input.masks} --stage1 {input.stage1}"
+        " --stage2 {input.stage2} --stage3 {input.stage3} --stage4 {input.stage4} --figures {output} &> {log}"
+
+
+rule write_summary:
+    """Tables, and a text that reads well over ssh."""
+    input:
+        results_of,
+    output:
+        tables=report(
+            expand("results/summary/{table}.tsv", table=TABLES),
+            category="Tables",
+            caption="../report/table.rst",
+        ),
+        text="results/summary/summary.txt",
+    log:
+        "results/logs/write_summary/all.log",
+    benchmark:
+        "results/benchmarks/write_summary/all.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        command=summary_command("results/logs/write_summary/all.log"),
+        code=code("report/write_summary.py"),
+    message:
+        "Summary: tables"
+    shell:
+        "exec {params.command}"
+
+
+rule write_report:
+    """One page with all pictures and tables, readable offline."""
+    input:
+        summary="results/summary/summary.txt",
+        scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
+        figures=expand("results/objects/{object}/figures", object=OBJECTS),
+    output:
+        "results/summary/report.html",
+    log:
+        "results/logs/write_report/all.log",
+    benchmark:
+        "results/benchmarks/write_report/all.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=1000,
+        runtime=10,
+    params:
+        scenes=expand("results/scenes/{scene}", scene=SCENES),
+        objects=expand("results/objects/{object}", object=OBJECTS),
+        script=script("report/write_report.py"),
+        code=code("report/write_report.py"),
+    message:
+        "Summary: report page"
+    shell:
+        "exec python {params.script} --summary results/summary --scenes {params.scenes} --objects {params.objects}"
+        " --title scenefuse --report {output} &> {log}"
+
+
+onerror:
+    shell(
+        "mkdir -p results/logs/summary; "
+        + summary_command("results/logs/write_summary/onerror.log")
+        + " || true"
+    )
+    print(
+        "Some jobs failed; results/summary/summary.txt names them.", file=sys.stderr
+    )

@@ -1,0 +1,330 @@
+# Structure from motion: from photos to cameras, the same steps for a scene and for an object.
+#
+# INPUTS    config/scenes.tsv, config/objects.tsv: photos; config: scene, object, seed
+# OUTPUTS   results/scenes/{scene}/photos.json                              the photos, checked, with GPS
+#           results/objects/{object}/frames/, photos.json                   the photos, checked and at most a given width
+#           .../features.db, database.db, matches.json                      COLMAP databases
+#           .../sparse/, sparse.json                                        cameras and sparse points
+#           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
+#           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
+
+
+rule list_photos:
+    """List the flight's photos, and stop at one that cannot be read."""
+    input:
+        scene_photos,
+    output:
+        "results/scenes/{scene}/photos.json",
+    log:
+        "results/logs/list_photos/{scene}.log",
+    benchmark:
+        "results/benchmarks/list_photos/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 1000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        folder=scene_folder,
+        script=script("sfm/list_photos.py"),
+        code=code("sfm/list_photos.py"),
+    message:
+        "Scene {wildcards.scene}: checking the photos"
+    shell:
+        "exec python {params.script} --folder {params.folder} --photos {output} &> {log}"
+
+
+rule extract_frames:
+    """Frames from a folder of photos or a video."""
+    input:
+        object_photos,
+    output:
+        frames=directory("results/objects/{object}/frames"),
+        photos="results/objects/{object}/photos.json",
+    log:
+        "results/logs/extract_frames/{object}.log",
+    benchmark:
+        "results/benchmarks/extract_frames/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        source=object_source,
+        options=flags(config["object"]["frames"]),
+        script=script("sfm/extract_frames.py"),
+        code=code("sfm/extract_frames.py"),
+    message:
+        "{wildcards.object}: frames"
+    shell:
+        "exec python {params.script} --source {params.source} --frames {output.frames} --photos {output.photos} {params.options} &> {log}"
+
+
+rule extract_scene_features:
+    """SIFT features and GPS priors (paper 3.1)."""
+    input:
+        scene_photos,
+        photos="results/scenes/{scene}/photos.json",
+    output:
+        "results/scenes/{scene}/features.db",
+    log:
+        "results/logs/extract_scene_features/{scene}.log",
+    benchmark:
+        "results/benchmarks/extract_scene_features/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
+    params:
+        folder=scene_folder,
+        options=flags(config["scene"]["features"]),
+        script=script("sfm/extract_features.py"),
+        code=code("sfm/extract_features.py"),
+    message:
+        "Scene {wildcards.scene}: features"
+    shell:
+        "exec python {params.script} --folder {params.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
+
+
+rule extract_object_features:
+    """SIFT features."""
+    input:
+        frames="results/objects/{object}/frames",
+        photos="results/objects/{object}/photos.json",
+    output:
+        "results/objects/{object}/features.db",
+    log:
+        "results/logs/extract_object_features/{object}.log",
+    benchmark:
+        "results/benchmarks/extract_object_features/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        options=flags(config["object"]["features"]),
+        script=script("sfm/extract_features.py"),
+        code=code("sfm/extract_features.py"),
+    message:
+        "{wildcards.object}: features"
+    shell:
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --features {output} {params.options} &> {log}"
+
+
+rule match_scene_features:
+    """Match pairs of photos that GPS says are near each other (paper 3.1)."""
+    input:
+        photos="results/scenes/{scene}/photos.json",
+        features="results/scenes/{scene}/features.db",
+    output:
+        database="results/scenes/{scene}/database.db",
+        report="results/scenes/{scene}/matches.json",
+    log:
+        "results/logs/match_scene_features/{scene}.log",
+    benchmark:
+        "results/benchmarks/match_scene_features/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        runtime=lambda wildcards, attempt: 240 * attempt,
+    params:
+        options=flags(config["scene"]["matches"]),
+        seed=config["seed"],
+        script=script("sfm/match_features.py"),
+        code=code("sfm/match_features.py"),
+    message:
+        "Scene {wildcards.scene}: matching"
+    shell:
+        "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
+        " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule match_object_features:
+    """Match pairs of frames."""
+    input:
+        photos="results/objects/{object}/photos.json",
+        features="results/objects/{object}/features.db",
+    output:
+        database="results/objects/{object}/database.db",
+        report="results/objects/{object}/matches.json",
+    log:
+        "results/logs/match_object_features/{object}.log",
+    benchmark:
+        "results/benchmarks/match_object_features/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
+    params:
+        options=flags(config["object"]["matches"]),
+        seed=config["seed"],
+        script=script("sfm/match_features.py"),
+        code=code("sfm/match_features.py"),
+    message:
+        "{wildcards.object}: matching"
+    shell:
+        "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
+        " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule map_scene_photos:
+    """Incremental mapping and bundle adjustment (paper 3.1)."""
+    input:
+        scene_photos,
+        photos="results/scenes/{scene}/photos.json",
+        database="results/scenes/{scene}/database.db",
+    output:
+        model=directory("results/scenes/{scene}/sparse"),
+        report="results/scenes/{scene}/sparse.json",
+    log:
+        "results/logs/map_scene_photos/{scene}.log",
+    benchmark:
+        "results/benchmarks/map_scene_photos/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 8000 * attempt,
+        runtime=lambda wildcards, attempt: 480 * attempt,
+    params:
+        folder=scene_folder,
+        options=flags(config["scene"]["sparse"]),
+        seed=config["seed"],
+        script=script("sfm/map_photos.py"),
+        code=code("sfm/map_photos.py"),
+    message:
+        "Scene {wildcards.scene}: cameras and sparse points"
+    shell:
+        "exec python {params.script} --folder {params.folder} --photos {input.photos} --database {input.database}"
+        " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule map_object_photos:
+    """Cameras and sparse points by incremental mapping."""
+    input:
+        frames="results/objects/{object}/frames",
+        photos="results/objects/{object}/photos.json",
+        database="results/objects/{object}/database.db",
+    output:
+        model=directory("results/objects/{object}/sparse"),
+        report="results/objects/{object}/sparse.json",
+    log:
+        "results/logs/map_object_photos/{object}.log",
+    benchmark:
+        "results/benchmarks/map_object_photos/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
+    params:
+        options=flags(config["object"]["sparse"]),
+        seed=config["seed"],
+        script=script("sfm/map_photos.py"),
+        code=code("sfm/map_photos.py"),
+    message:
+        "{wildcards.object}: cameras and sparse points"
+    shell:
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --database {input.database}"
+        " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule georegister:
+    """Turn and scale the model into metres, east, north and up, by the photos' GPS."""
+    input:
+        photos="results/scenes/{scene}/photos.json",
+        model="results/scenes/{scene}/sparse",
+        report="results/scenes/{scene}/sparse.json",
+    output:
+        model=directory("results/scenes/{scene}/georeferenced"),
+        report="results/scenes/{scene}/georeference.json",
+    log:
+        "results/logs/georegister/{scene}.log",
+    benchmark:
+        "results/benchmarks/georegister/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["scene"]["georegister"]),
+        seed=config["seed"],
+        script=script("sfm/georegister.py"),
+        code=code("sfm/georegister.py"),
+    message:
+        "Scene {wildcards.scene}: georeferencing"
+    shell:
+        "exec python {params.script} --sparse {input.model} --photos {input.photos} --georeferenced {output.model}"
+        " --report {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule undistort_scene_photos:
+    """Undistort the photos into a COLMAP workspace."""
+    input:
+        scene_photos,
+        model="results/scenes/{scene}/georeferenced",
+        report="results/scenes/{scene}/georeference.json",
+    output:
+        workspace=directory("results/scenes/{scene}/undistorted"),
+        report="results/scenes/{scene}/undistorted.json",
+    log:
+        "results/logs/undistort_scene_photos/{scene}.log",
+    benchmark:
+        "results/benchmarks/undistort_scene_photos/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: 8
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        folder=scene_folder,
+        options=flags(config["scene"]["undistort"]),
+        script=script("sfm/undistort_photos.py"),
+        code=code("sfm/undistort_photos.py"),
+    message:
+        "Scene {wildcards.scene}: undistorting"
+    shell:
+        "exec python {params.script} --folder {params.folder} --sparse {input.model} --dense {output.workspace}"
+        " --report {output.report} {params.options} &> {log}"
+
+
+rule undistort_object_photos:
+    """Undistort the frames, and find which way is up."""
+    input:
+        frames="results/objects/{object}/frames",
+        photos="results/objects/{object}/photos.json",
+        model="results/objects/{object}/sparse",
+        report="results/objects/{object}/sparse.json",
+    output:
+        cameras=directory("results/objects/{object}/undistorted"),
+        report="results/objects/{object}/undistorted.json",
+    log:
+        "results/logs/undistort_object_photos/{object}.log",
+    benchmark:
+        "results/benchmarks/undistort_object_photos/{object}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 2000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        options=flags(config["object"]["cameras"]),
+        script=script("sfm/undistort_object.py"),
+        code=code("sfm/undistort_object.py"),
+    message:
+        "{wildcards.object}: undistorting"
+    shell:
+        "exec python {params.script} --folder {input.frames} --photos {input.photos} --sparse {input.model}"
+        " --cameras {output.cameras} --report {output.report} {params.options} &> {log}"
