@@ -5,6 +5,7 @@ Nothing here imports more than the standard library, so that a stage that is tol
 
 import contextlib
 import ctypes
+import dataclasses
 import hashlib
 import json
 import os
@@ -18,6 +19,30 @@ from typing import Any
 
 class StageError(Exception):
     """Something a person has to mend. The message says what is wrong, where, and what to do."""
+
+
+def setting(
+    default: Any,
+    *,
+    unit: str = "",
+    least: float | None = None,
+    above: float | None = None,
+    most: float | None = None,
+    below: float | None = None,
+) -> Any:
+    """A field of a settings dataclass that a settings file may set; a field without it is a constant of the algorithm.
+
+    The docstring below the field describes it. Schema and tables are generated from both (`scenefuse.config`).
+
+    Args:
+        default: its value where nobody sets it.
+        unit: of the value, "" for a pure number or a word.
+        least, above: lower bound, included or not.
+        most, below: upper bound, included or not.
+    """
+    bounds = {"minimum": least, "exclusiveMinimum": above, "maximum": most, "exclusiveMaximum": below}
+    about = {"unit": unit, "bounds": {key: bound for key, bound in bounds.items() if bound is not None}}
+    return dataclasses.field(default=default, metadata={"setting": about})
 
 
 def run(function: Callable[..., Any]) -> None:

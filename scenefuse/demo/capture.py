@@ -14,32 +14,32 @@ from PIL import Image
 from scenefuse.demo import textures
 from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
-from scenefuse.stage import StageError, atomic_directory, quantity, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
 
 
 @dataclass(frozen=True)
 class FlightSettings:
     """The mapping flight."""
 
-    columns: int
+    columns: int = setting(7, least=0)
     """Strips of the grid of photos that look down, west to east."""
-    rows: int
+    rows: int = setting(7, least=0)
     """Photos in a strip, south to north."""
-    obliques: int
+    obliques: int = setting(11, least=0)
     """Photos that look obliquely, from the south and from the east."""
-    altitude: float
+    altitude: float = setting(40, unit="m", least=0)
     """Height above the ground, metres."""
-    width_px: int
+    width_px: int = setting(800, unit="px", least=0)
     """Columns of a photo."""
-    height_px: int
+    height_px: int = setting(600, unit="px", least=0)
     """Rows of a photo."""
-    focal_px: float
+    focal_px: float = setting(700, unit="px", least=0)
     """Focal length in pixels."""
-    supersampling: int
+    supersampling: int = setting(2, least=0)
     """Samples along each side of a pixel."""
-    gps_noise_horizontal: float
+    gps_noise_horizontal: float = setting(0.5, unit="m", least=0)
     """Standard deviation of the EXIF position, east and north, metres."""
-    gps_noise_vertical: float
+    gps_noise_vertical: float = setting(1.0, unit="m", least=0)
     """Standard deviation of the EXIF height, metres."""
 
 
@@ -47,19 +47,19 @@ class FlightSettings:
 class OrbitSettings:
     """The photos around one object."""
 
-    views: int
+    views: int = setting(40, least=0)
     """Number of photos, shared out among the rings."""
-    elevations_deg: tuple[float, ...]
+    elevations_deg: tuple[float, ...] = setting((5, 34), unit="degree")
     """One ring of photos for each: how high the camera stands above the object's middle, degrees."""
-    fill: float
+    fill: float = setting(0.65, least=0)
     """Share of the photo's height that the object fills, 0..1."""
-    width_px: int
+    width_px: int = setting(640, unit="px", least=0)
     """Columns of a photo."""
-    height_px: int
+    height_px: int = setting(480, unit="px", least=0)
     """Rows of a photo."""
-    focal_px: float
+    focal_px: float = setting(560, unit="px", least=0)
     """Focal length in pixels."""
-    supersampling: int
+    supersampling: int = setting(2, least=0)
     """Samples along each side of a pixel."""
 
 

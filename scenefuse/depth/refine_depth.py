@@ -30,7 +30,7 @@ from scenefuse.depth.train_depth import (
 from scenefuse.depth.training import Recipe, Supervision, key_of, predict, train_networks
 from scenefuse.io.maps import read_depth
 from scenefuse.mvs.views import Views, load_views
-from scenefuse.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, write_json
 
 FLOOR = 0.3
 
@@ -39,19 +39,19 @@ FLOOR = 0.3
 class FeedbackSettings:
     """How stage 3 refines; sizes, sources and photometric weights are those of stage 1."""
 
-    epochs: int
+    epochs: int = setting(5, least=0)
     """Epochs of refinement."""
-    passes_per_epoch: int
+    passes_per_epoch: int = setting(1, least=0)
     """How often an epoch shows every photo."""
-    batch_frames: int
+    batch_frames: int = setting(24, least=0)
     """Photos per step."""
-    learning_rate: float
+    learning_rate: float = setting(0.001, least=0)
     """Maximum learning rate of Adam."""
-    warmup_epochs: int
+    warmup_epochs: int = setting(1, least=0)
     """Epochs of linear warm-up before the cosine."""
-    target_weight: float
+    target_weight: float = setting(1.0, least=0)
     """Weight of the relative depth error against the fused depth."""
-    rendered_confidence: float
+    rendered_confidence: float = setting(0.5, least=0)
     """Rendered depths below this confidence (0..1) are not used."""
 
 

@@ -18,7 +18,7 @@ from scenefuse.depth.self_supervision import sample
 from scenefuse.depth.training import Recipe, Supervision, key_of, predict, small_photos, train_networks
 from scenefuse.io.maps import write_depth
 from scenefuse.mvs.views import Views, load_views
-from scenefuse.stage import atomic_directory, quantity, threads, write_json
+from scenefuse.stage import atomic_directory, quantity, setting, threads, write_json
 from scenefuse.transforms import rotation_angle_deg
 
 Content = dict[str, Any]
@@ -28,31 +28,31 @@ Content = dict[str, Any]
 class DepthSettings:
     """How stage 1 trains; every value comes from the config."""
 
-    width_px: int
+    width_px: int = setting(320, unit="px", least=0)
     """Width at which photos are read and depth maps are written, pixels."""
-    crop_px: int
+    crop_px: int = setting(144, unit="px", least=0)
     """Photos are cut to the object, to about this many pixels squared, for the networks."""
-    sources: int
+    sources: int = setting(6, least=0)
     """Other photos each photo is compared with."""
-    sweep_planes: int
+    sweep_planes: int = setting(48, least=0)
     """Depth hypotheses of the plane sweep that feeds the network; 0 leaves it out."""
-    epochs: int
+    epochs: int = setting(15, least=0)
     """Epochs of training."""
-    passes_per_epoch: int
+    passes_per_epoch: int = setting(1, least=0)
     """How often an epoch shows every photo."""
-    batch_frames: int
+    batch_frames: int = setting(24, least=0)
     """Photos per step."""
-    learning_rate: float
+    learning_rate: float = setting(0.001, least=0)
     """Maximum learning rate of Adam."""
-    warmup_epochs: int
+    warmup_epochs: int = setting(2, least=0)
     """Epochs of linear warm-up before the cosine."""
-    ssim_weight: float
+    ssim_weight: float = setting(0.85, least=0)
     """Share of SSIM in the photometric error; the rest is the absolute difference."""
-    smoothness_weight: float
+    smoothness_weight: float = setting(0.001, least=0)
     """Weight of the edge-aware smoothness of disparity."""
-    anchor_weight: float
+    anchor_weight: float = setting(1.0, least=0)
     """Weight of the relative depth error at SfM points."""
-    consistency_tolerance: float
+    consistency_tolerance: float = setting(0.01, unit="of the diagonal", least=0)
     """Disagreement between views that costs 40 % of a vote, as a share of the object's diagonal."""
 
 

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
 from scenefuse.io.units import length_unit
-from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
 
 FROM_SCENE, FROM_OBJECT = 0, 1
@@ -21,18 +21,18 @@ FROM_SCENE, FROM_OBJECT = 0, 1
 class FusionSettings:
     """Settings of the fusion. Spacing is the median distance between neighbours in the scene crop."""
 
-    fill_spacings: float
+    fill_spacings: float = setting(1.5, least=0)
     """Object points farther than this many spacings from every scene point are new."""
-    fill_residuals: float
+    fill_residuals: float = setting(1.5, least=0)
     """The same distance is at least this many times the median distance between the clouds where both exist, so
     that noise does not add a second layer."""
-    density: float
+    density: float = setting(1, least=0)
     """Spacing of the added points over the scene's; 0 keeps every object point."""
-    feather_spacings: float
+    feather_spacings: float = setting(4, least=0)
     """Width of the seam in spacings: colours, and in `replace` positions too, blend over it."""
-    match_colors: bool
+    match_colors: bool = setting(True)
     """Whether the object's colours get a gain and bias per channel from the overlap."""
-    min_confidence: float
+    min_confidence: float = setting(0, least=0)
     """Object points with a lower confidence are not used."""
 
 

@@ -37,30 +37,39 @@ def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
     return None
 
 
-def shipped_with(mine: Path | None) -> dict[str, Any]:
-    """The settings of config/config.yaml with those of another file laid over them, all checked.
+def with_defaults(content: Mapping[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with the defaults of their JSON schema for every key that they leave out, at every depth."""
+    return {
+        key: with_defaults(content.get(key) or {}, part) if "properties" in part else content.get(key, part["default"])
+        for key, part in schema["properties"].items()
+    }
+
+
+def read_settings(mine: Path | None) -> dict[str, Any]:
+    """The shipped settings with those of a file laid over them, all checked.
 
     Raises:
         StageError: the file is missing, is no YAML, or holds a key or value that the schema does not allow.
     """
-    settings = yaml.safe_load((ROOT / "config/config.yaml").read_text())
-    if mine is not None:
-        try:
-            own = yaml.safe_load(mine.read_text()) or {}
-        except OSError:
-            raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
-            raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
-        if not isinstance(own, dict):
-            raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
-        settings = merge(settings, own)
-    wrong = problem(settings, yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text()))
+    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    if mine is None:
+        return with_defaults({}, schema)
+    try:
+        own = yaml.safe_load(mine.read_text()) or {}
+    except OSError:
+        raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
+    if not isinstance(own, dict):
+        raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
+    wrong = problem(own, schema)
     if wrong:
         raise StageError(f"{mine}, {wrong}")
-    return settings
+    return with_defaults(own, schema)
 
 
 def build(settings: type[T], values: Mapping[str, Any]) -> T:
-    """A settings dataclass from the keys of its name in a section of the settings; lists become tuples."""
-    names = [field.name for field in dataclasses.fields(settings)]  # type: ignore[arg-type]
-    return settings(**{name: tuple(v) if isinstance(v := values[name], list) else v for name in names})
+    """A settings dataclass from the keys of its name in a section of the settings, the rest as shipped; lists become
+    tuples."""
+    names = {field.name for field in dataclasses.fields(settings)}  # type: ignore[arg-type]
+    return settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in names})

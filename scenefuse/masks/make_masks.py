@@ -25,6 +25,7 @@ from scenefuse.stage import (
     manifest,
     quantity,
     read_json,
+    setting,
     threads,
     value,
     write_json,
@@ -37,29 +38,29 @@ Array = NDArray[np.float64]
 class MaskSettings:
     """How masks are made."""
 
-    box_margin: float
+    box_margin: float = setting(0.15, unit="of the diagonal", least=0)
     """Growth of the prompts' box on each side, as a share of its diagonal."""
-    ground_margin: float
+    ground_margin: float = setting(0.02, unit="of the diagonal", least=0)
     """A sparse point is on the object only when it is this much above the ground, as a share of the box's diagonal."""
-    grabcut_width_px: int
+    grabcut_width_px: int = setting(320, unit="px", least=0)
     """The first cut runs on photos at most this wide."""
-    grabcut_iterations: int
+    grabcut_iterations: int = setting(4, least=0)
     """Rounds of learning colours and cutting in the first cut."""
-    hull_voxels: int
+    hull_voxels: int = setting(96, least=0)
     """Voxels of the visual hull along the longest side of the box."""
-    hull_tolerance: float
+    hull_tolerance: float = setting(0.1, least=0)
     """Share of the photos that may contradict a voxel of the hull."""
-    band_px: float
+    band_px: float = setting(5, unit="px", least=0)
     """Half width of the band along the hull's outline where a photo's own evidence decides, at a photo width of 640."""
-    min_agreement: float
+    min_agreement: float = setting(0.6, least=0)
     """Smallest IoU of a mask with the hull's outline; below it the photo is dropped."""
-    min_photos: int
+    min_photos: int = setting(5, least=0)
     """Fewest good masks to go on with."""
-    max_click_residual_px: float
+    max_click_residual_px: float = setting(4, unit="px", least=0)
     """Largest reprojection error of a clicked prompt."""
-    sam2_encoder_sha256: str
+    sam2_encoder_sha256: str = setting("54e9ee80bd43e36da6c7cd33031a525bb1d70577eadb31190a28999250b13dfe")
     """SHA-256 of the SAM 2 encoder's weights."""
-    sam2_decoder_sha256: str
+    sam2_decoder_sha256: str = setting("4a4c8a8a53d9722834b66d8ced88770e2cc783e367965ba62a13be3ab5f1ba89")
     """SHA-256 of the SAM 2 decoder's weights."""
 
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.metrics.completion import CompletionSettings, completion_metrics, plane_normals
-from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Sim3
 
 
@@ -17,23 +17,23 @@ from scenefuse.transforms import Sim3
 class MetricSettings:
     """Settings of all metrics. Shares are of the full variant's crop diagonal, the same for every variant."""
 
-    tau_fraction: float
+    tau_fraction: float = setting(0.016, least=0)
     """Distance within which points correspond."""
-    normal_neighbours: int
+    normal_neighbours: int = setting(16, least=0)
     """Neighbours that a normal is fitted to."""
-    variation_spacings: float
+    variation_spacings: float = setting(8, least=0)
     """Radius of the surface variation, in spacings of the scene crop."""
-    density_neighbours: int
+    density_neighbours: int = setting(16, least=0)
     """Neighbours k of the local density."""
-    primitive_fraction: float
+    primitive_fraction: float = setting(0.005, least=0)
     """Distance to a primitive within which a point lies on it."""
-    primitive_support: float
+    primitive_support: float = setting(0.01, least=0)
     """Smallest share of the new points that makes a primitive."""
-    primitive_most: int
+    primitive_most: int = setting(20, least=0)
     """Most primitives taken."""
-    primitive_angle_deg: float
+    primitive_angle_deg: float = setting(25, unit="degree", least=0)
     """Largest angle in degrees between a point's normal and the primitive's."""
-    sample: int
+    sample: int = setting(4000, least=0)
     """Points that a completion metric looks at, chosen by the seed."""
 
 

@@ -22,7 +22,17 @@ from scenefuse.io.maps import read_depth, write_depth, write_normals
 from scenefuse.io.units import length_unit
 from scenefuse.mvs.plane_sweep import DepthSettings, Photo, estimate_depth
 from scenefuse.sfm.features import cancellable
-from scenefuse.stage import StageError, atomic_directory, manifest, quantity, read_json, threads, value, write_json
+from scenefuse.stage import (
+    StageError,
+    atomic_directory,
+    manifest,
+    quantity,
+    read_json,
+    setting,
+    threads,
+    value,
+    write_json,
+)
 
 FEW_FUSED = 0.01
 
@@ -31,19 +41,19 @@ FEW_FUSED = 0.01
 class FusionSettings:
     """How depth maps become one cloud."""
 
-    min_photos: int
+    min_photos: int = setting(3, least=0)
     """Photos that must agree on a point."""
-    max_reprojection_px: float
+    max_reprojection_px: float = setting(2, unit="px", least=0)
     """Largest distance between a pixel and the point of another photo projected into it."""
-    max_depth_error: float
+    max_depth_error: float = setting(0.01, least=0)
     """Largest relative difference of two photos' depths of a point."""
-    max_normal_error_deg: float
+    max_normal_error_deg: float = setting(90, unit="degree", least=0)
     """Largest angle between two photos' normals of a point."""
-    max_traversal_depth: int
+    max_traversal_depth: int = setting(100, least=0)
     """Largest number of steps from photo to photo in one point's search for agreement."""
-    outlier_neighbours: int
+    outlier_neighbours: int = setting(8, least=0)
     """Neighbours whose mean distance tells a lonely point."""
-    outlier_ratio: float
+    outlier_ratio: float = setting(4, least=0)
     """A point is dropped when that distance is more than so many times the cloud's median; 0 keeps all."""
 
 

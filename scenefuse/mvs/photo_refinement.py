@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from scenefuse.mvs.plane_sweep import DepthSettings, Photo, refine_depth
 from scenefuse.mvs.views import Views
+from scenefuse.stage import setting
 
 SOURCES, BEST_SOURCES, BEST_ANGLE_DEG = 8, 3, 15.0
 
@@ -26,11 +27,11 @@ class RefinedDepths:
 class RefinementSettings:
     """How depths are moved to where photos match."""
 
-    match_reach_px: float
+    match_reach_px: float = setting(8, unit="px", least=0)
     """how far a depth may move, in the other photos, to where they match best; 0 leaves depths as they are"""
-    match_window_px: int
+    match_window_px: int = setting(5, unit="px", least=3)
     """side of the matching window, odd"""
-    match_min_score: float
+    match_min_score: float = setting(0.6, least=-1, most=1)
     """least mean correlation of the best matches; below it photos deny a depth where there is texture"""
 
 

@@ -19,6 +19,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from scenefuse.mvs.matching_kernel import keep_best
+from scenefuse.stage import setting
 
 # Less than this is no better match: smooth surfaces match nearly everywhere.
 MIN_GAIN = 0.02
@@ -30,25 +31,25 @@ TEXTURE = 3 / 255
 class DepthSettings:
     """How depth maps are made."""
 
-    max_image_size_px: int
+    max_image_size_px: int = setting(800, unit="px", least=0)
     """Longer side of the photo that stereo works on; the depth map has this size."""
-    sources: int
+    sources: int = setting(8, least=0)
     """Source photos per reference photo."""
-    best_sources: int
+    best_sources: int = setting(3, least=0)
     """The best so many sources of a hypothesis count; the others are taken as occluded (torch only)."""
-    planes: int
+    planes: int = setting(96, least=0)
     """At most so many inverse-depth hypotheses in the sweep (torch only)."""
-    sweep_reduction: int
+    sweep_reduction: int = setting(2, least=0)
     """The sweep runs on photos this much smaller; the refinement doubles the size step by step (torch only)."""
-    window_px: int
+    window_px: int = setting(7, unit="px", least=0)
     """Side of the matching window, odd."""
-    smoothness: float
+    smoothness: float = setting(0.1, least=0)
     """Semi-global cost of a step to the next plane, in units of 1 - NCC; a larger jump costs four times that."""
-    min_score: float
+    min_score: float = setting(0.5, least=0)
     """Smallest mean NCC of the best sources that a pixel needs to keep its depth."""
-    min_angle_deg: float
+    min_angle_deg: float = setting(2, unit="degree", least=0)
     """Smallest median angle between the rays of a reference and a source photo."""
-    geometric: bool
+    geometric: bool = setting(True)
     """Second, geometrically consistent pass of COLMAP's patch-match (colmap only)."""
 
 

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
+from scenefuse.stage import setting
 
 GEOMETRY_FEATURES = 15
 
@@ -14,15 +15,15 @@ GEOMETRY_FEATURES = 15
 class FieldSettings:
     """Size of the radiance field."""
 
-    levels: int
+    levels: int = setting(12, least=0)
     """levels of the hash grid"""
-    log2_table: int
+    log2_table: int = setting(16, least=0)
     """2-logarithm of the rows a hashed level has"""
-    coarsest: int
+    coarsest: int = setting(16, least=0)
     """cells per side at the coarsest level"""
-    finest: int
+    finest: int = setting(512, least=0)
     """cells per side at the finest level"""
-    width: int
+    width: int = setting(32, least=0)
     """width of the hidden layers"""
 
 

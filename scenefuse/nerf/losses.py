@@ -9,22 +9,24 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from scenefuse.stage import setting
+
 
 @dataclass(frozen=True)
 class LossWeights:
     """Weight of each loss; 0 switches one off."""
 
-    color_weight: float
+    color_weight: float = setting(1, least=0)
     """photometric loss inside the mask"""
-    depth_weight: float
+    depth_weight: float = setting(2, least=0)
     """absolute depth against the prior (Huber)"""
-    rank_weight: float
+    rank_weight: float = setting(0.02, least=0)
     """relative depth ranking between pixel pairs of one photo"""
-    mask_weight: float
+    mask_weight: float = setting(0.1, least=0)
     """opacity against the mask (binary cross-entropy)"""
-    sparsity_weight: float
+    sparsity_weight: float = setting(0.05, least=0)
     """density on rays that miss the object"""
-    distortion_weight: float
+    distortion_weight: float = setting(0.01, least=0)
     """spread of the weights along a ray"""
 
 

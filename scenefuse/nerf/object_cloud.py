@@ -17,28 +17,28 @@ from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.views import Views, load_views
-from scenefuse.stage import StageError, quantity, read_json, threads, write_json
+from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
 
 
 @dataclass(frozen=True)
 class CloudSettings:
     """How rendered depth maps become one cloud."""
 
-    min_views: int
+    min_views: int = setting(2, least=0)
     """views that must agree on a point, its own included"""
-    agreement: float
+    agreement: float = setting(0.006, unit="of the diagonal", least=0)
     """largest difference of depth that agrees, share of the diagonal"""
-    min_confidence: float
+    min_confidence: float = setting(0.3, least=0)
     """rendered depths below this confidence (0..1) are not used"""
-    through_share: float
+    through_share: float = setting(0.3, least=0)
     """share of the views that may see past a point"""
-    mask_share: float
+    mask_share: float = setting(0.1, least=0)
     """share of the views in whose mask a point need not lie"""
-    spacing: float
+    spacing: float = setting(0.004, unit="of the diagonal", least=0)
     """distance between points, share of the diagonal"""
-    outlier_deviations: float
+    outlier_deviations: float = setting(3, least=0)
     """points whose neighbours are farther than the mean by so many standard deviations are dropped"""
-    min_component: float
+    min_component: float = setting(0.01, least=0)
     """connected groups with a smaller share of the points are dropped"""
 
 

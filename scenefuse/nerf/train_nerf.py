@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.maps import read_depth, read_normals
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -49,7 +49,7 @@ def train_nerf(
         seed: of all random choices; the config's if not given.
     """
     start = time.perf_counter()
-    settings = shipped_with(config)
+    settings = read_settings(config)
     seed = settings["seed"] if seed is None else seed
     if out.exists() and not out.is_dir():
         raise StageError(f"--out {out} is a file; give a folder")
@@ -64,7 +64,7 @@ def train_nerf(
         cameras=cameras,
         mattes=mattes,
         report=steps / "photos.json",
-        settings=build(UndistortSettings, wanted["cameras"]),
+        settings=build(UndistortSettings, wanted["undistort"]),
     )
     photos = read_json(steps / "photos.json")
     exact = {"mask_band_px": 0} if value(photos, "masks_exact") else {}

@@ -25,7 +25,7 @@ from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import Photos, cube_from_cameras, dilate
 from scenefuse.nerf.render import Rendered, render_view
 from scenefuse.nerf.training import Model, Schedule, keep_memory, new_model, refined, train
-from scenefuse.stage import StageError, atomic_directory, quantity, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
 from scenefuse.transforms import Sim3, fit_sim3
 
 # A rendered depth is confident from here on; what later stages and the export call confident.
@@ -36,17 +36,17 @@ CONFIDENT = 0.5
 class NerfSettings:
     """What a NeRF stage needs besides field, schedule and losses."""
 
-    width_px: int
+    width_px: int = setting(480, unit="px", least=0)
     """photos are scaled down to this width, for training and for the rendered maps"""
-    occupancy_cells: int
+    occupancy_cells: int = setting(128, least=0)
     """cells per side of the occupancy grid, a multiple of 4 times a power of 2"""
-    mask_band_px: int
+    mask_band_px: int = setting(2, unit="px", least=0)
     """half-width of the band around a mask's edge that no loss touches; 0: masks are exact, grey values included"""
-    hull_tolerance: float
+    hull_tolerance: float = setting(0.04, least=0)
     """share of the photos that may deny a cell of the visual hull"""
-    render_samples: int
+    render_samples: int = setting(32, least=0)
     """samples per ray when views are rendered"""
-    agreement: float
+    agreement: float = setting(0.005, unit="of the diagonal", least=0)
     """two rendered depths agree within this share of the object's diagonal"""
 
 

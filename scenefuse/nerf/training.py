@@ -24,6 +24,7 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.rays import Batch, Photos, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import Prior, composite, march
+from scenefuse.stage import setting
 
 DEPTH_DELTA = 0.01
 OCCUPANCY_EVERY = 16
@@ -33,29 +34,29 @@ OCCUPANCY_EVERY = 16
 class Schedule:
     """How long and how fast a NeRF stage trains."""
 
-    epochs: int
+    epochs: int = setting(20, least=0)
     """epochs of this stage"""
-    rays_per_epoch: int
+    rays_per_epoch: int = setting(60000, least=0)
     """rays drawn per epoch"""
-    images_per_batch: int
+    images_per_batch: int = setting(24, least=0)
     """photos per batch"""
-    rays_per_image: int
+    rays_per_image: int = setting(96, least=0)
     """rays per photo of a batch"""
-    warmup_epochs: float
+    warmup_epochs: float = setting(1, least=0)
     """epochs of linear warm-up, before the cosine"""
-    learning_rate: float
+    learning_rate: float = setting(0.005, least=0)
     """highest learning rate of the networks"""
-    grid_learning_rate: float
+    grid_learning_rate: float = setting(0.01, least=0)
     """highest learning rate of the hash grid"""
-    samples_first: int
+    samples_first: int = setting(32, least=0)
     """samples per ray at the start"""
-    samples_last: int
+    samples_last: int = setting(16, least=0)
     """samples per ray at the end"""
-    coarse_until: float
+    coarse_until: float = setting(0.3, least=0)
     """share of the steps after which all levels are open"""
-    edge_boost: float
+    edge_boost: float = setting(1, least=0)
     """adaptive grid: gradients of fine levels are multiplied by 1 + this at edges"""
-    pose_learning_rate: float
+    pose_learning_rate: float = setting(0, least=0)
     """learning rate of the camera poses, 0 keeps them"""
 
     @property

@@ -17,7 +17,7 @@ from scenefuse.poses.bundle_adjustment import Refined, link, refine
 from scenefuse.poses.correspondences import Features, find_features, find_pairs
 from scenefuse.poses.pose_graph import chain, close, largest_group
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, write_json
 from scenefuse.transforms import Sim3, fit_sim3, rotation_angle_deg, rotation_between
 
 Array = NDArray[np.float64]
@@ -28,27 +28,27 @@ Content = dict[str, Any]
 class PoseSettings:
     """How poses are found without SfM."""
 
-    feature_width_px: int
+    feature_width_px: int = setting(960, unit="px", least=64)
     """Width at which features are found in the photos, pixels."""
-    features: int
+    features: int = setting(2000, least=50)
     """Most features of a photo."""
-    max_ratio: float
+    max_ratio: float = setting(0.8, above=0, most=1)
     """A match's distance over that of the next best feature."""
-    max_epipolar_px: float
+    max_epipolar_px: float = setting(1, unit="px", above=0)
     """Largest distance of a match from its epipolar line, pixels."""
-    min_matches: int
+    min_matches: int = setting(30, least=8)
     """Fewest matches that make a pair of photos."""
-    min_angle_deg: float
+    min_angle_deg: float = setting(1.5, unit="degrees", above=0, most=30)
     """Two rays that meet under a smaller angle have no depth, degrees."""
-    network_width_px: int
+    network_width_px: int = setting(64, unit="px", least=32)
     """Width at which the depth network sees the photos, pixels."""
-    steps: int
+    steps: int = setting(150, least=0)
     """Training steps of the depth network, each over all photos."""
-    learning_rate: float
+    learning_rate: float = setting(0.005, above=0)
     """Maximum learning rate of Adam."""
-    smoothness_weight: float
+    smoothness_weight: float = setting(0.001, least=0)
     """Weight of the edge-aware smoothness of disparity."""
-    refine_focal: bool
+    refine_focal: bool = setting(True)
     """Whether the focal length is refined together with the poses."""
 
 

@@ -15,7 +15,7 @@ from scenefuse.registration.refine import ScaleRange, refine_points
 from scenefuse.registration.score import Score, score
 from scenefuse.registration.surface import Surface, prepare, probing, with_grid
 from scenefuse.registration.upright import upright_hypotheses
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg, rotation_between
 
 MOST_POINTS = 6000
@@ -26,27 +26,27 @@ SCORE_POINTS = 1200
 class CoarseSettings:
     """Settings of the coarse registration."""
 
-    voxel_fractions: tuple[float, ...]
+    voxel_fractions: tuple[float, ...] = setting((0.04, 0.03), unit="of the diagonal")
     """Voxels of the feature pyramid, as shares of the scene crop's diagonal."""
-    ransac_samples: int
+    ransac_samples: int = setting(30000, least=0)
     """Random triples of matches drawn at each level of the pyramid."""
-    feature_scale_steps: int
+    feature_scale_steps: int = setting(3, least=0)
     """Logarithmic scale steps at which the object's features are computed."""
-    scale_steps: int
+    scale_steps: int = setting(13, least=0)
     """Logarithmic scale steps of the upright sweep."""
-    yaw_steps: int
+    yaw_steps: int = setting(24, least=0)
     """Steps of a full turn of the upright sweep."""
-    sweep_voxel_fraction: float
+    sweep_voxel_fraction: float = setting(0.045, unit="of the diagonal", least=0)
     """Voxel of the upright sweep, as a share of the scene crop's diagonal."""
-    max_tilt_deg: float
+    max_tilt_deg: float = setting(10, unit="degree", least=0)
     """Largest angle in degrees between the two up directions, where both are known."""
-    recall_weight: float
+    recall_weight: float = setting(2, least=0)
     """Beta of the F-beta score: how much more the scene's explained share weighs than the object's."""
-    score_fraction: float
+    score_fraction: float = setting(0.02, unit="of the diagonal", least=0)
     """Distance within which points agree in the score, as a share of the scene crop's diagonal."""
-    candidates: int
+    candidates: int = setting(24, least=0)
     """Hypotheses that are briefly refined."""
-    keep: int
+    keep: int = setting(6, least=0)
     """Distinct hypotheses handed to the fine registration."""
 
 

@@ -17,7 +17,7 @@ from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes
 from scenefuse.registration.score import Score, score
 from scenefuse.registration.surface import Surface, probing, with_grid
 from scenefuse.registration.verify import Decision, Gate, decide, tilt_deg, turned_copies
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3
 
 MOST_POINTS = 12000
@@ -34,45 +34,45 @@ ASTRAY = 0.9
 class FineSettings:
     """Settings of the fine registration and its gate."""
 
-    fine_voxel_fraction: float
+    fine_voxel_fraction: float = setting(0.0075, unit="of the diagonal", least=0)
     """Spacing of both clouds, as a share of the scene crop's diagonal."""
-    start_fraction: float
+    start_fraction: float = setting(0.05, unit="of the diagonal", least=0)
     """First pairing distance of the refinement, as a share of the diagonal."""
-    end_fraction: float
+    end_fraction: float = setting(0.02, unit="of the diagonal", least=0)
     """Last pairing distance of the refinement, and that of the polish, as a share of the diagonal."""
-    color_weight: float
+    color_weight: float = setting(0.3, least=0)
     """Weight of colours against geometry in the polish; 0 ignores colours there."""
-    turn_steps: int
+    turn_steps: int = setting(24, least=0)
     """Turned copies of the leading poses tried about an axis."""
-    recall_weight: float
+    recall_weight: float = setting(2, least=0)
     """Beta of the F-beta score: how much more the scene's explained share weighs than the object's."""
-    score_fraction: float
+    score_fraction: float = setting(0.02, unit="of the diagonal", least=0)
     """Distance within which points agree in the score, as a share of the diagonal."""
-    min_f_score: float
+    min_f_score: float = setting(0.35, least=0)
     """Gate: smallest two-way F-score."""
-    min_recall: float
+    min_recall: float = setting(0.4, least=0)
     """Gate: smallest share of the scene crop that the object explains."""
-    min_color: float
+    min_color: float = setting(0.5, least=0)
     """Gate: smallest agreement of the colours, where both clouds have colours that vary."""
-    min_margin: float
+    min_margin: float = setting(0.04, least=0)
     """Gate: smallest relative lead over the best pose that differs."""
-    max_final_tilt_deg: float
+    max_final_tilt_deg: float = setting(8, unit="degree", least=0)
     """Gate: largest angle in degrees between the up directions."""
-    use_alignment: bool
+    use_alignment: bool = setting(True)
     """Whether the photos' similarity (the alignment) is compared with the clouds' and overrules it."""
-    free_space_photos: int
+    free_space_photos: int = setting(12, least=0)
     """Photos of the scene whose depth maps are asked what they saw through; 0 leaves the test out."""
-    free_space_fraction: float
+    free_space_fraction: float = setting(0.03, unit="of the diagonal", least=0)
     """A measurement this far beyond a point of the object, as a share of the diagonal, proves it is not there."""
-    max_blocked: float
+    max_blocked: float = setting(0.25, least=0)
     """Gate: largest share of the object that stands where the scene's photos saw through."""
-    resamplings: int
+    resamplings: int = setting(8, least=2)
     """Halves of the surface that are registered again for the spread of the pose."""
-    max_translation_sd_fraction: float
+    max_translation_sd_fraction: float = setting(0.005, unit="of the diagonal", least=0)
     """Gate: largest standard deviation of the object's centre, as a share of the diagonal."""
-    max_scale_sd_log: float
+    max_scale_sd_log: float = setting(0.01, least=0)
     """Gate: largest standard deviation of the scale, natural logarithm."""
-    max_rotation_sd_deg: float
+    max_rotation_sd_deg: float = setting(1, unit="degree", least=0)
     """Gate: largest standard deviation of the rotation, degrees, but about a free axis."""
 
 

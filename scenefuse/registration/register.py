@@ -10,7 +10,7 @@ import numpy as np
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_scene import CropSettings, crop_marked
@@ -66,7 +66,7 @@ def register_clouds(
     Args:
         obj: the object, any frame and unit.
         scene: the scene's points around it (see `cut_scene`), any frame and unit; far origins lose no precision.
-        settings: all settings, as `scenefuse.io.settings.shipped_with` returns them.
+        settings: all settings, as `scenefuse.io.settings.read_settings` returns them.
         seed: of all random choices.
         ups: up directions in the object's and in the scene's frame; None where one of them is not known.
         scales: scene units per object unit; None to estimate them from both extents.
@@ -177,7 +177,7 @@ def register(
         seed: of all random choices; the config's if not given.
     """
     start = time.perf_counter()
-    settings = shipped_with(config)
+    settings = read_settings(config)
     seed = settings["seed"] if seed is None else seed
     scales = _scales(scale, scale_range)
     if fiducials is not None and crop_box is not None:

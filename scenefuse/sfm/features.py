@@ -22,6 +22,7 @@ from scenefuse.stage import (
     atomic_file,
     quantity,
     read_json,
+    setting,
     threads,
     value,
     write_json,
@@ -32,15 +33,15 @@ from scenefuse.stage import (
 class FeatureSettings:
     """SIFT and the camera model."""
 
-    max_image_size_px: int
+    max_image_size_px: int = setting(2000, unit="px", least=0)
     """Longest side at which features are looked for; larger photos are scaled down for this stage only."""
-    max_features: int
+    max_features: int = setting(1500, least=0)
     """Most features kept per photo, the largest first."""
-    first_octave: int
+    first_octave: int = setting(-1, least=-1)
     """-1 looks for features in photos enlarged twice as well: more small features, four times the work; 0 does not."""
-    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"]
+    camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = setting("SIMPLE_RADIAL")
     """COLMAP's camera model; focal length and distortion are refined."""
-    camera_mode: Literal["auto", "single", "per_folder", "per_photo"]
+    camera_mode: Literal["auto", "single", "per_folder", "per_photo"] = setting("single")
     """Which photos share one camera; auto: those with one size, EXIF camera and focal length."""
 
 
@@ -48,15 +49,15 @@ class FeatureSettings:
 class MatchSettings:
     """How descriptors are matched and pairs verified."""
 
-    max_ratio: float
+    max_ratio: float = setting(0.7, least=0)
     """Lowe's ratio test: best over second-best descriptor distance."""
-    max_distance: float
+    max_distance: float = setting(0.7, least=0)
     """Largest descriptor distance of a match."""
-    cross_check: bool
+    cross_check: bool = setting(True)
     """Keep only matches that are mutually the best."""
-    guided_matching: bool
+    guided_matching: bool = setting(True)
     """Match again along the epipolar lines once a pair is verified."""
-    min_inliers: int
+    min_inliers: int = setting(15, least=0)
     """Fewest verified matches for a pair of photos to count."""
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 
 from scenefuse.sfm.photos import Photo, inspect_photo, photo_names, photo_notes, write_photos
-from scenefuse.stage import StageError, atomic_directory, quantity, threads
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 
@@ -22,13 +22,13 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".web
 class FrameSettings:
     """Which frames are taken, and at what size."""
 
-    frame_step: int
+    frame_step: int = setting(1, least=0)
     """Take every n-th photo, or one frame out of each n of a video."""
-    max_frames: int
+    max_frames: int = setting(200, least=0)
     """Most frames; more are thinned out evenly. 0 sets no limit."""
-    max_width_px: int
+    max_width_px: int = setting(1600, unit="px", least=0)
     """Widest frame; wider ones are scaled down."""
-    jpeg_quality: int
+    jpeg_quality: int = setting(97, least=0)
     """Quality of frames that have to be encoded, 1 to 100."""
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scenefuse.sfm.geodesy import local_frame
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import gps_positions, read_photos
-from scenefuse.stage import atomic_directory, quantity, write_json
+from scenefuse.stage import atomic_directory, quantity, setting, write_json
 from scenefuse.transforms import Sim3, fit_sim3_robust, rotation_between
 
 Array = NDArray[np.float64]
@@ -21,11 +21,11 @@ Array = NDArray[np.float64]
 class GeoreferenceSettings:
     """When GPS is used, and how strictly."""
 
-    use_gps: bool
+    use_gps: bool = setting(True, unit="m")
     """Whether GPS positions in EXIF bring the model into metres."""
-    gps_accuracy_m: float
+    gps_accuracy_m: float = setting(3, unit="m", least=0)
     """Standard error of a GPS position in metres; positions farther than four times this are outliers."""
-    min_gps_photos: int
+    min_gps_photos: int = setting(5, least=0)
     """Fewest registered photos with GPS for the model to count as metric."""
 
 

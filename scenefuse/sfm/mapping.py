@@ -12,24 +12,24 @@ import pycolmap
 
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import read_photos
-from scenefuse.stage import StageError, atomic_directory, quantity, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
 
 
 @dataclass(frozen=True)
 class MapSettings:
     """Incremental mapping and bundle adjustment."""
 
-    ba_iterations: int
+    ba_iterations: int = setting(100, least=0)
     """Most iterations of a global bundle adjustment."""
-    ba_linear_solver_iterations: int
+    ba_linear_solver_iterations: int = setting(200, least=0)
     """Most iterations of the linear solver within one of them."""
-    ba_tolerance: float
+    ba_tolerance: float = setting(0, least=0)
     """Function, gradient and parameter tolerance of the last bundle adjustment; 0 runs all iterations."""
-    max_reprojection_error_px: float
+    max_reprojection_error_px: float = setting(4, unit="px", least=0)
     """Observations with a larger error are dropped."""
-    init_min_inliers: int
+    init_min_inliers: int = setting(100, least=0)
     """Fewest matches of the first pair of photos."""
-    min_registered_share: float
+    min_registered_share: float = setting(0.7, least=0)
     """Smallest share of the photos that have to be registered, 0 to 1; fewer is an error."""
 
 

@@ -11,6 +11,7 @@ from scipy.spatial.distance import cdist
 
 from scenefuse.sfm.geodesy import local_frame
 from scenefuse.sfm.photos import Photo, gps_positions
+from scenefuse.stage import setting
 
 Pair = tuple[str, str]
 
@@ -19,19 +20,19 @@ Pair = tuple[str, str]
 class PairSettings:
     """The choice of pairs."""
 
-    pairs: Literal["auto", "exhaustive", "spatial", "sequential"]
+    pairs: Literal["auto", "exhaustive", "spatial", "sequential"] = setting("auto")
     """auto: by GPS where most photos have it, in sequence for a video, all pairs of a small set, else in sequence."""
-    spatial_from: int
+    spatial_from: int = setting(40, least=0)
     """auto compares GPS neighbours only from this many photos on."""
-    exhaustive_up_to: int
+    exhaustive_up_to: int = setting(200, least=0)
     """auto compares all pairs up to this many photos."""
-    neighbours: int
+    neighbours: int = setting(20, least=0)
     """spatial: nearest photos (horizontal distance) that each photo is compared with."""
-    overlap: int
+    overlap: int = setting(10, least=0)
     """sequential: following photos that each photo is compared with."""
-    loop_every: int
+    loop_every: int = setting(5, least=0)
     """sequential: every n-th photo is compared with every other n-th photo, which closes loops."""
-    gps_accuracy_m: float
+    gps_accuracy_m: float = setting(3, unit="m", least=0)
     """Standard error of a GPS position; positions that spread less than five times this are not used."""
 
 

@@ -6,16 +6,16 @@ from pathlib import Path
 import pycolmap
 
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, manifest, quantity, setting, threads, write_json
 
 
 @dataclass(frozen=True)
 class UndistortSettings:
     """Size and quality of undistorted photos."""
 
-    max_size_px: int
+    max_size_px: int = setting(2000, unit="px", least=0)
     """Longest side of an undistorted photo; larger ones are scaled down (method M4)."""
-    jpeg_quality: int
+    jpeg_quality: int = setting(97, least=0)
     """Quality of undistorted JPEG files, 1 to 100."""
 
 

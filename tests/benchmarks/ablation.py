@@ -12,7 +12,7 @@ import pandas as pd
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.settings import build, merge, shipped_with
+from scenefuse.io.settings import build, merge, read_settings
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
@@ -81,7 +81,7 @@ def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
         results: folder of a finished demo.
         seeds: 0 to this.
     """
-    settings, rows = shipped_with(None), []
+    settings, rows = read_settings(None), []
     truth = results / "demo/demo/truth"
     scene_cameras = read_cameras(truth / "scene/cameras.json")
     scene = fit_cameras(read_posed(results / "scenes/demo/georeferenced", scene_cameras), scene_cameras)

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import ROOT, build, shipped_with
+from scenefuse.io.settings import ROOT, build, read_settings
 from scenefuse.masks.make_masks import MaskSettings, make_masks, read_frames
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.metrics.truth import mask_iou
@@ -34,7 +34,7 @@ def alexander(*, results: Path, given: Path) -> None:
         results: the results folder of the workflow.
         given: folder of supplied masks.
     """
-    folder, shipped = results / "objects/alexander", shipped_with(EXAMPLE / "config.yaml")
+    folder, shipped = results / "objects/alexander", read_settings(EXAMPLE / "config.yaml")
     frames, _ = read_frames(folder / "undistorted")
     supplied = supplied_masks(given, folder / "sparse", frames)
     with tempfile.TemporaryDirectory() as temporary:

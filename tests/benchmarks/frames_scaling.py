@@ -22,7 +22,7 @@ from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
 from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
 from scenefuse.depth.train_depth import DepthSettings, train_depth
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
@@ -169,7 +169,7 @@ def frames_scaling(
         frames: numbers of photos, each taken evenly from the largest capture.
         settings: laid over the shipped ones, or none.
     """
-    shipped = shipped_with(settings)
+    shipped = read_settings(settings)
     own, seed, most = shipped["object"], shipped["seed"], max(frames)
     photos, truth = work / f"photos_{name}_{most}", work / f"truth_{name}_{most}"
     if not truth.is_dir():

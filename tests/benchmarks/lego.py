@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from scenefuse.cores import use_threads
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.views import load_views
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -55,13 +55,13 @@ def lego(
     """
     use_threads(threads)
     torch.backends.cuda.matmul.fp32_precision = "tf32"
-    settings = shipped_with(config)["object"]
+    settings = read_settings(config)["object"]
     chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         places = {"cameras": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
-            data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["cameras"])
+            data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )
         views = load_views(places["cameras"], places["mattes"], chosen["width_px"], 0)
     start = time.perf_counter()

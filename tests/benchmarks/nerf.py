@@ -16,7 +16,7 @@ import torch
 from painted_sphere import photos_of, sphere_views, sphere_volume
 
 from scenefuse.cores import use_threads
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.plane_sweep import DepthSettings, Photo, _Matcher
 from scenefuse.nerf import encoding, kernels
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
@@ -88,7 +88,7 @@ def matching() -> dict[str, Callable[[], None]]:
     poses = [np.column_stack([np.eye(3), [x, 0, 0]]) for x in (0, -4, -3, -2, -1, 1, 2, 3, 4)]
     intrinsics = np.array([[350, 0, 200], [0, 350, 150], [0, 0, 1.0]])
     photos = [Photo(gray, intrinsics, pose) for gray, pose in zip(grays, poses)]
-    settings = build(DepthSettings, shipped_with(None)["scene"]["depth_maps"])
+    settings = build(DepthSettings, read_settings(None)["scene"]["depth_maps"])
     matcher = _Matcher(photos[0], photos[1:], settings, "cpu")
     inverse = torch.linspace(1 / 60, 1 / 20, 16)[:, None, None].expand(-1, 300, 400).contiguous()
 
@@ -157,7 +157,7 @@ def time_of(step: Callable[[], None]) -> float:
 
 def training_seconds(steps: int, threads: int, device: str) -> float:
     """Seconds of one training step of the default field on photos of a painted sphere, compilation left out."""
-    config = shipped_with(None)["object"]
+    config = read_settings(None)["object"]
     settings = config["nerf"]
     views = sphere_views(24, 160)
     cube, hull = sphere_volume(views, settings["occupancy_cells"])

@@ -18,7 +18,7 @@ import pycolmap
 from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
 from scenefuse.depth.train_depth import DepthSettings, train_depth
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.evaluation import cloud_results, read_object_truth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
@@ -100,7 +100,7 @@ def no_sfm(
         objects: of the demo.
         settings: laid over the shipped ones, or none.
     """
-    chosen = shipped_with(settings)
+    chosen = read_settings(settings)
     own, seed, samples = chosen["object"], chosen["seed"], chosen["evaluation"]["object"]["samples"]
     truth = results / "demo/demo/truth"
     for name in objects:

@@ -16,7 +16,7 @@ import torch
 
 from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
 from scenefuse.mvs.photo_refinement import RefinementSettings
@@ -76,7 +76,8 @@ def one(
             own = settings["nerf"] | settings["matching"] | variant.nerf | {"epochs": epochs}
             train_object_nerf(
                 **inputs, **common, prior=prior if variant.prior else None, previous=previous,
-                stage=work / f"stage{stage}", report=work / f"stage{stage}.json", device=own["device"], field=build(FieldSettings, own),
+                stage=work / f"stage{stage}", report=work / f"stage{stage}.json",
+                device=own["device"], field=build(FieldSettings, own),
                 schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
                 refinement=build(RefinementSettings, own),
             )  # fmt: skip
@@ -183,7 +184,7 @@ def object_ablation(
         only: these variants; none for all.
         settings: laid over the shipped ones, or none.
     """
-    shipped = shipped_with(settings)
+    shipped = read_settings(settings)
     own, judge = shipped["object"], shipped["evaluation"]["object"]
     out = results / "bench/object_ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)

@@ -15,7 +15,7 @@ import pandas as pd
 
 from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals, write_depth
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.mvs.consistency import compare
 from scenefuse.mvs.depth_maps import FusionSettings, estimate_depth_maps, fuse_depth_maps
@@ -186,7 +186,7 @@ def object_mvs(
         objects: of the demo.
         settings: laid over the shipped ones, or none.
     """
-    chosen, rows = shipped_with(settings), []
+    chosen, rows = read_settings(settings), []
     out = results / "bench/object_mvs.tsv"
     (out.parent / "object_mvs").mkdir(parents=True, exist_ok=True)
     judge, known = chosen["evaluation"]["object"], results / "demo/demo/truth"

@@ -16,7 +16,7 @@ import pandas as pd
 from planted import SHAPES, Trial, errors, plant
 
 from scenefuse.io.clouds import Cloud
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud
 from scenefuse.registration.evidence import Evidence
@@ -27,7 +27,7 @@ from scenefuse.registration.scale import estimates, prior_centre
 from scenefuse.stage import run
 from scenefuse.transforms import Sim3
 
-CONFIG = shipped_with(None)["registration"]
+CONFIG = read_settings(None)["registration"]
 UP = np.array([0.0, 0.0, 1.0])
 COVERAGES = (0.3, 0.5, 0.7, 0.9)
 SCALE_PCT, ROTATION_DEG, SHIFT = 2.0, 2.0, 0.01

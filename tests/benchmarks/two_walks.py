@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.register import register_clouds
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
@@ -29,7 +29,7 @@ def two_walks(*, results: Path, pictures: Path) -> None:
         results: the results folder of the workflow.
         pictures: folder for the clouds on each other, by clouds and by photos.
     """
-    settings = shipped_with(None)
+    settings = read_settings(None)
     alignment_settings = build(AlignmentSettings, settings["registration"]["alignment"])
     pictures.mkdir(parents=True, exist_ok=True)
     for name, pair in PAIRS.items():

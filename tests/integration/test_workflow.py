@@ -50,11 +50,11 @@ def test_the_house_is_registered_where_it_is(finished):
 
 
 def test_masks_find_the_house_in_the_scene_without_clicks(finished):
-    full, no_clicks = (
-        np.array(decision(finished, variant)["scene_from_object"]["value"]) for variant in ("full", "no_clicks")
+    full, by_masks = (
+        np.array(decision(finished, variant)["scene_from_object"]["value"]) for variant in ("full", "by_masks")
     )
-    assert decision(finished, "no_clicks")["status"]["value"] == "registered"
-    assert np.linalg.norm(full[:3, 3] - no_clicks[:3, 3]) < 0.1  # metres
+    assert decision(finished, "by_masks")["status"]["value"] == "registered"
+    assert np.linalg.norm(full[:3, 3] - by_masks[:3, 3]) < 0.1  # metres
 
 
 def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(finished):

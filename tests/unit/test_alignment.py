@@ -1,4 +1,4 @@
-"""The alignment from shared features finds a planted similarity, says how sure it is, and says no where nothing is shared."""
+"""The alignment from shared features finds a planted similarity, and refuses where nothing is shared."""
 
 import os
 from dataclasses import dataclass, replace

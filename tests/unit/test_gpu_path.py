@@ -7,7 +7,7 @@ from painted_sphere import photos_of, sphere_views, sphere_volume
 from pretend_gpu import OnGpu, PretendGpu, to_pretended
 from test_depth import plane_views
 
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
 from scenefuse.nerf.field import FieldSettings
@@ -40,7 +40,7 @@ def test_the_pretended_gpu_notices_what_was_left_behind(gpu):
 
 
 def test_training_and_rendering_on_a_gpu(gpu, tmp_path):
-    settings = shipped_with(None)["object"]["nerf"]
+    settings = read_settings(None)["object"]["nerf"]
     views = sphere_views(6, 40)
     cube, hull = sphere_volume(views, 32)
     photos = photos_of(views, cube, prior=1.0)

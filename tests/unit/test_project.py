@@ -1,5 +1,6 @@
 """The repository's own promises: one set of versions, settings that are documented, docs that are not stale."""
 
+import os
 import re
 import subprocess
 import sys
@@ -7,6 +8,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+
+from scenefuse.io.settings import problem, with_defaults
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -31,13 +34,31 @@ def test_every_setting_is_described():
     assert [name for name, part in leaves(schema) if not part.get("description")] == []
 
 
-def test_the_page_of_settings_is_not_stale():
-    page = [sys.executable, "workflow/config_docs.py", "--check"]
-    assert subprocess.run(page, cwd=ROOT).returncode == 0, "run `make docs`"
+def test_schema_and_page_of_settings_are_not_stale():
+    check = [sys.executable, "workflow/generate.py", "--check"]
+    assert subprocess.run(check, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0, (
+        "run `make docs`"
+    )
 
 
-@pytest.mark.parametrize("script", sorted((ROOT / "scripts").glob("*.py")), ids=lambda path: path.stem)
-def test_a_script_is_the_command_line_of_one_function(script):
+def test_the_shown_settings_are_the_shipped_ones():
+    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    shown = yaml.safe_load((ROOT / "config/config.yaml").read_text())
+    assert problem(shown, schema) is None
+    assert with_defaults(shown, schema) == with_defaults({}, schema)
+
+
+SCRIPTS = sorted((ROOT / "scripts").rglob("*.py"))
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+def test_a_script_is_the_command_line_of_the_function_of_its_name(script):
     source = script.read_text()
     assert len(source.splitlines()) <= 8
-    assert re.search(r'if __name__ == "__main__":\n    run\(\w+\)\n$', source)
+    assert source.endswith(f'if __name__ == "__main__":\n    run({script.stem})\n')
+
+
+def test_rules_and_scripts_share_their_names():
+    rules = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
+    used = set(re.findall(r'script\("(\S+?)"\)', rules))
+    assert used == {str(p.relative_to(ROOT / "scripts")) for p in SCRIPTS if p.parent.name != "scripts"}

@@ -12,7 +12,7 @@ from test_formats import UTM, write_e57
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
-from scenefuse.io.settings import shipped_with
+from scenefuse.io.settings import read_settings
 from scenefuse.registration.register import register, register_clouds
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
@@ -110,7 +110,7 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
 
 
 def test_origins_far_away_change_nothing(house):
-    settings = shipped_with(None)
+    settings = read_settings(None)
     little = {"ransac_samples": 5000, "feature_scale_steps": 1, "candidates": 4, "keep": 2}
     settings["registration"]["coarse"] |= QUICK["coarse"] | little
     settings["registration"]["fine"] |= QUICK["fine"] | {"turn_steps": 4}

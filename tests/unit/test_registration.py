@@ -8,7 +8,7 @@ from planted import errors, plant
 from scipy.spatial.transform import Rotation
 
 from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.io.settings import build, shipped_with
+from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
 from scenefuse.registration.evidence import Alignment, Evidence
 from scenefuse.registration.features import match, ransac_similarities
@@ -24,7 +24,7 @@ from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
-SHIPPED = shipped_with(None)["registration"]
+SHIPPED = read_settings(None)["registration"]
 COARSE, FINE = build(CoarseSettings, SHIPPED["coarse"]), build(FineSettings, SHIPPED["fine"])
 
 

@@ -10,7 +10,7 @@ from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import fingerprint
 from scenefuse.masks.algebra import mask_folders
-from scenefuse.io.settings import merge, problem
+from scenefuse.io.settings import merge, problem, with_defaults
 from scenefuse.stage import StageError
 
 ROOT = Path(workflow.basedir)
@@ -58,13 +58,29 @@ def table(path, schema):
 
 
 check(config, "config.schema.yaml", "config")
+config.update(
+    with_defaults(
+        config,
+        yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text()),
+    )
+)
 SCENES = table(config["scenes"], "scenes.schema.yaml")
 OBJECTS = table(config["objects"], "objects.schema.yaml")
 if not SCENES:
     raise WorkflowError(f"{config['scenes']} has no rows; add one for each scene")
+DEFINED = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
+for name in config["registration"]["variants"]:
+    if name not in DEFINED:
+        raise WorkflowError(
+            f"config, registration.variants: unknown variant '{name}'; workflow/variants.yaml defines: {', '.join(DEFINED)}"
+        )
+if "full" not in config["registration"]["variants"]:
+    raise WorkflowError(
+        "config, registration.variants: 'full' is missing; it is the one that is fused"
+    )
 VARIANTS = {
-    name: merge(config["registration"], over)
-    for name, over in config["variants"].items()
+    name: merge(config["registration"], DEFINED[name])
+    for name in config["registration"]["variants"]
 }
 for name, row in OBJECTS.items():
     if row["scene"] not in SCENES:

@@ -320,7 +320,7 @@ rule undistort_object_photos:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        options=flags(config["object"]["cameras"]),
+        options=flags(config["object"]["undistort"]),
         script=script("sfm/undistort_object.py"),
         code=code("sfm/undistort_object.py"),
     message:

@@ -16,7 +16,7 @@ from scenefuse.registration.crop.ground import Ground, fit_ground
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
 from scenefuse.registration.crop.vote import Votes, vote
 from scenefuse.sfm.fiducials import locate
-from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
+from scenefuse.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_between
 
 
@@ -24,29 +24,29 @@ from scenefuse.transforms import Array, Sim3, rotation_between
 class CropSettings:
     """Settings of the crop. Shares are of the diagonal of the fiducials' box."""
 
-    shape: Literal["box", "oriented", "hull"]
+    shape: Literal["box", "oriented", "hull"] = setting("box")
     """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
-    margin: float
+    margin: float = setting(0.05, least=0)
     """Widening of the box on every side, as a share of its own extent."""
-    margin_fraction: float
+    margin_fraction: float = setting(0.04, unit="of the diagonal", least=0)
     """Further widening on every side, as a share of the diagonal (two voxels of the registration)."""
-    remove_ground: bool
+    remove_ground: bool = setting(True)
     """Whether the ground is fitted around the box and removed inside."""
-    ring_fraction: float
+    ring_fraction: float = setting(0.5, unit="of the diagonal", least=0)
     """Width of the ring around the box in which the ground is looked for, as a share of the diagonal."""
-    ground_fraction: float
+    ground_fraction: float = setting(0.015, unit="of the diagonal", least=0)
     """Points lower than this above the ground are ground, as a share of the diagonal."""
-    link_fraction: float
+    link_fraction: float = setting(0.03, unit="of the diagonal", least=0)
     """Points closer than this belong to one part, as a share of the diagonal."""
-    reach_fraction: float
+    reach_fraction: float = setting(0.05, unit="of the diagonal", least=0)
     """A part this near to a fiducial belongs to the object, as a share of the diagonal."""
-    min_part: float
+    min_part: float = setting(0.01, least=0)
     """Parts with a smaller share of the points are left out."""
-    min_points: int
+    min_points: int = setting(200, least=0)
     """Fewest points a crop may have."""
-    max_residual_px: float
+    max_residual_px: float = setting(5, unit="px", least=0)
     """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
-    min_votes: float
+    min_votes: float = setting(0.8, above=0, most=1)
     """Share of the object's photos showing a scene point that must have it inside their mask; mode masks only."""
 
 

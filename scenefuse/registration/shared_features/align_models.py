@@ -22,7 +22,7 @@ from scenefuse.registration.shared_features.reprojection import (
     observations,
     refine,
 )
-from scenefuse.stage import quantity, write_json
+from scenefuse.stage import quantity, setting, write_json
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 
 PROPOSALS = 2000
@@ -35,30 +35,30 @@ SAME_SCALE = 0.8
 class AlignmentSettings:
     """Settings of the alignment from shared features, and its gate."""
 
-    most_points: int
+    most_points: int = setting(100000, least=100)
     """Most points of either model that are matched, those with the longest tracks; bounds time and memory."""
-    descriptors_per_point: int
+    descriptors_per_point: int = setting(3, least=1)
     """Views of a point whose descriptors are compared."""
-    max_ratio: float
+    max_ratio: float = setting(0.85, above=0, most=1)
     """Lowe's ratio test: descriptor distance to the best over that to the second-best point."""
-    ransac_samples: int
+    ransac_samples: int = setting(100000, least=100)
     """Random triples of matches drawn."""
-    max_error_px: float
+    max_error_px: float = setting(6, unit="px", above=0)
     """Largest reprojection error of an inlier, RMS, in pixels of the coarser photos."""
-    min_points: int
+    min_points: int = setting(15, least=4)
     """Gate: fewest points shared by both models."""
-    min_photos: int
+    min_photos: int = setting(3, least=2)
     """Gate: fewest photos on either side that see shared points."""
-    nearest_points: int
+    nearest_points: int = setting(200, least=10)
     """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
     bent against each other."""
-    max_rival_share: float
+    max_rival_share: float = setting(0.5, least=0, most=1)
     """Gate: inliers of the best pose among the other matches, over inliers."""
-    max_scale_sd_log: float
+    max_scale_sd_log: float = setting(0.05, above=0)
     """Gate: largest standard deviation of the scale, natural logarithm."""
-    max_rotation_sd_deg: float
+    max_rotation_sd_deg: float = setting(3, unit="degree", above=0)
     """Gate: largest standard deviation of the rotation, degrees."""
-    bootstrap_draws: int
+    bootstrap_draws: int = setting(200, least=10)
     """Draws of photos and points for the standard deviations."""
 
 
