@@ -60,5 +60,5 @@ def test_a_script_is_the_command_line_of_the_function_of_its_name(script):
 
 def test_rules_and_scripts_share_their_names():
     rules = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
-    used = set(re.findall(r'script\("(\S+?)"\)', rules))
+    used = set(re.findall(r"script\([\"'](\S+?)[\"']\)", rules))
     assert used == {str(p.relative_to(ROOT / "scripts")) for p in SCRIPTS if p.parent.name != "scripts"}
