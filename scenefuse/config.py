@@ -51,8 +51,9 @@ class RunSettings:
     """Table of objects."""
     seed: int = setting(0, least=0)
     """Seed of everything random."""
-    gpu: int = setting(0, least=0)
-    """GPUs that a stereo or training job asks the scheduler for; 0 on a machine without one."""
+    gpu: int | Literal["auto"] = setting("auto", least=0)
+    """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
+    NVIDIA card, else 0. On a cluster, say it."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +278,9 @@ def _json_type(kind: Any) -> dict[str, Any]:
     if origin is tuple:
         return {"type": "array", "minItems": 1, "items": _json_type(parts[0])}
     if origin in (typing.Union, types.UnionType):
-        return {"type": [names[part] for part in parts]}
+        words = [word for part in parts for word in typing.get_args(part)]  # of a Literal
+        pattern = {"pattern": f"^({'|'.join(words)})$"} if words else {}
+        return {"type": [names.get(part, "string") for part in parts]} | pattern
     raise TypeError(f"a setting of type {kind} has no JSON schema")
 
 

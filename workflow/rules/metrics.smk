@@ -5,6 +5,16 @@
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
 
 
+def scene_truth(name):
+    """The truth of the scene that an object with known truth lies in."""
+    truth = scene_row(name).get("truth")
+    if not truth:
+        raise WorkflowError(
+            f"{config['scenes']}: scene '{name}' has no truth, but an object in it has; fill both or neither"
+        )
+    return truth
+
+
 rule compute_metrics:
     """Registration and completion metrics, each with its null value (paper 3.3.1 and 3.3.2; G1 to G5)."""
     input:
@@ -90,6 +100,7 @@ rule evaluate_scene:
         options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
         script=script("metrics/evaluate_scene.py"),
+        files=state_of_files,
         code=code("metrics/evaluate_scene.py"),
     message:
         "Scene {wildcards.scene}: comparing with the truth"
@@ -135,6 +146,7 @@ rule evaluate_object:
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
+        files=state_of_files,
         code=code("metrics/evaluate_object.py"),
     message:
         "{wildcards.object}: comparing with the truth"

@@ -9,6 +9,32 @@
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
 
+def scene_photos(wildcards):
+    """The photos of a scene."""
+    return photos_in(
+        scene_row(wildcards.scene)["photos"],
+        f"{config['scenes']}, scene '{wildcards.scene}'",
+    )
+
+
+def scene_folder(wildcards):
+    """Their folder, for a command line."""
+    return shlex.quote(scene_row(wildcards.scene)["photos"])
+
+
+def object_photos(wildcards):
+    """The photos, or the video, of an object."""
+    return photos_in(
+        object_row(wildcards.object)["photos"],
+        f"{config['objects']}, object '{wildcards.object}'",
+    )
+
+
+def object_source(wildcards):
+    """Their folder, or the video, for a command line."""
+    return shlex.quote(object_row(wildcards.object)["photos"])
+
+
 rule list_photos:
     """List the flight's photos, and stop at one that cannot be read."""
     input:
@@ -27,6 +53,7 @@ rule list_photos:
     params:
         folder=scene_folder,
         script=script("sfm/list_photos.py"),
+        files=state_of_files,
         code=code("sfm/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
@@ -54,6 +81,7 @@ rule extract_frames:
         source=object_source,
         options=flags(config["object"]["frames"]),
         script=script("sfm/extract_frames.py"),
+        files=state_of_files,
         code=code("sfm/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
@@ -82,6 +110,7 @@ rule extract_scene_features:
         folder=scene_folder,
         options=flags(config["scene"]["features"]),
         script=script("sfm/extract_features.py"),
+        files=state_of_files,
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
@@ -200,6 +229,7 @@ rule map_scene_photos:
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
+        files=state_of_files,
         code=code("sfm/map_photos.py"),
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
@@ -292,6 +322,7 @@ rule undistort_scene_photos:
         folder=scene_folder,
         options=flags(config["scene"]["undistort"]),
         script=script("sfm/undistort_photos.py"),
+        files=state_of_files,
         code=code("sfm/undistort_photos.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
