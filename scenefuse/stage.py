@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import shlex
 import shutil
 import signal
 import sys
@@ -49,10 +50,13 @@ def run(function: Callable[..., Any]) -> None:
     """Run a stage function as a command line built from its signature and docstring.
 
     A StageError ends in one sentence on stderr and exit status 1; a number that the function returns is the exit
-    status. SIGTERM and SIGINT unwind the stack, so that
-    temporary outputs are removed; the process also gets SIGTERM when its parent dies.
+    status. SIGTERM and SIGINT unwind the stack, so that temporary outputs are removed; the process also gets SIGTERM
+    when its parent dies. A log of the workflow, which sets SCENEFUSE, begins with the command, to be pasted.
     """
     import tyro
+
+    if "SCENEFUSE" in os.environ:
+        print(shlex.join(["python", *sys.argv]), flush=True)
 
     _die_with_parent()
     for number in (signal.SIGTERM, signal.SIGINT):

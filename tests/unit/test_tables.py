@@ -72,9 +72,9 @@ def project(tmp_path, monkeypatch):
     """Read a project whose tables hold these rows."""
     monkeypatch.chdir(tmp_path)
 
-    def read(scene="yard\tflight", thing="shed\tyard\tclose", **settings):
-        (tmp_path / "scenes.tsv").write_text(f"scene\tphotos\n{scene}\n")
-        (tmp_path / "objects.tsv").write_text(f"object\tscene\tphotos\n{thing}\n")
+    def read(scene_row="yard\tflight", object_row="shed\tyard\tclose", **settings):
+        (tmp_path / "scenes.tsv").write_text(f"scene\tphotos\n{scene_row}\n")
+        (tmp_path / "objects.tsv").write_text(f"object\tscene\tphotos\n{object_row}\n")
         return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"} | settings)
 
     return read
@@ -106,11 +106,11 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
 @pytest.mark.parametrize(
     "rows, sentence",
     [
-        ({"thing": "shed\tgarden\tclose"}, "object 'shed' lies in scene 'garden', which scenes.tsv does not list"),
-        ({"thing": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
-        ({"scene": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
-        ({"thing": "shed\tyard\t"}, "objects.tsv, row 1, photos: '' "),
-        ({"scene": ""}, "scenes.tsv has no rows; add one for each scene"),
+        ({"object_row": "shed\tgarden\tclose"}, "object 'shed' lies in scene 'garden', which scenes.tsv does not list"),
+        ({"object_row": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
+        ({"scene_row": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
+        ({"object_row": "shed\tyard\t"}, "objects.tsv, row 1, photos: '' "),
+        ({"scene_row": ""}, "scenes.tsv has no rows; add one for each scene"),
     ],
     ids=["unknown scene", "object with a dash", "scene with a dash", "no photos", "no scene"],
 )

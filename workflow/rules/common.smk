@@ -2,7 +2,6 @@
 import glob
 import os
 import shlex
-import shutil
 import sys
 from functools import cache
 from pathlib import Path
@@ -11,6 +10,7 @@ from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
+from scenefuse.machine import has_gpu, memory_mb
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
 
@@ -29,9 +29,13 @@ except StageError as error:
 config.update(PROJECT.settings)
 SCENES, OBJECTS, VARIANTS = PROJECT.scenes, PROJECT.objects, PROJECT.variants
 if config["gpu"] == "auto":
-    config["gpu"] = int(
-        bool(glob.glob("/dev/nvidia[0-9]*") or shutil.which("nvidia-smi"))
-    )
+    config["gpu"] = int(has_gpu())
+# Jobs on one machine share its memory and take turns on its card, unless `--resources` says otherwise; on a cluster, where
+# `jobs` is given instead of `cores`, the scheduler sees to that.
+if workflow.is_main_process and workflow.global_resources["_nodes"].value is None:
+    for name, limit in {"mem_mb": memory_mb(), "gpu": 1}.items():
+        if name not in workflow.global_resources:
+            workflow.register_resource(name, limit)
 
 
 wildcard_constraints:
