@@ -106,9 +106,12 @@ def photos_in(path, where):
         ) from None
 
 
-def state_of_files(wildcards, input):
-    """Params function: what the user's own files among the inputs hold. Snakemake takes one with an older date for the one it knew."""
-    return files_fingerprint(tuple(path for path in input if not made_here(path)))
+def state_of(files):
+    """Params function: what an input function's own files of the user hold; Snakemake takes one with an older date for the one it
+    knew. (A params function that asks for `input` would not be recorded.)"""
+    return lambda wildcards: files_fingerprint(
+        tuple(path for path in files(wildcards) if not made_here(path))
+    )
 
 
 def script(name):

@@ -110,7 +110,7 @@ rule make_masks:
         options=mask_options,
         seed=config["seed"],
         script=script("masks/make_masks.py"),
-        files=state_of_files,
+        files=state_of(mask_inputs),
         code=code("masks/make_masks.py"),
     message:
         "{wildcards.object}: masks"

@@ -5,14 +5,24 @@
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
 
 
-def scene_truth(name):
-    """The truth of the scene that an object with known truth lies in."""
-    truth = scene_row(name).get("truth")
+def truth_of(scene):
+    """The truth of a scene that an object with known truth lies in."""
+    truth = scene_row(scene).get("truth")
     if not truth:
         raise WorkflowError(
-            f"{config['scenes']}: scene '{name}' has no truth, but an object in it has; fill both or neither"
+            f"{config['scenes']}: scene '{scene}' has no truth, but an object in it has; fill both or neither"
         )
     return truth
+
+
+def scene_truth(wildcards):
+    return [truth_of(wildcards.scene)]
+
+
+def object_truth(wildcards):
+    """The truth of the object's scene, and its own."""
+    row = object_row(wildcards.object)
+    return [truth_of(row["scene"]), row["truth"]]
 
 
 rule compute_metrics:
@@ -84,7 +94,7 @@ rule evaluate_scene:
         model="results/scenes/{scene}/georeferenced",
         georeference="results/scenes/{scene}/georeference.json",
         cloud="results/scenes/{scene}/dense.ply",
-        truth=lambda wildcards: scene_truth(wildcards.scene),
+        truth=scene_truth,
     output:
         "results/scenes/{scene}/truth.json",
     log:
@@ -100,7 +110,7 @@ rule evaluate_scene:
         options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
         script=script("metrics/evaluate_scene.py"),
-        files=state_of_files,
+        files=state_of(scene_truth),
         code=code("metrics/evaluate_scene.py"),
     message:
         "Scene {wildcards.scene}: comparing with the truth"
@@ -129,8 +139,7 @@ rule evaluate_object:
         before=in_scene("dense.ply"),
         after="results/objects/{object}/fused_scene.ply",
         scene=in_scene("truth.json"),
-        truth_scene=lambda wildcards: scene_truth(object_row(wildcards.object)["scene"]),
-        truth_object=lambda wildcards: object_row(wildcards.object)["truth"],
+        truth=object_truth,
     output:
         "results/objects/{object}/truth.json",
     log:
@@ -146,12 +155,12 @@ rule evaluate_object:
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
-        files=state_of_files,
+        files=state_of(object_truth),
         code=code("metrics/evaluate_object.py"),
     message:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
         " --cloud {input.cloud} --variants {input.variants} --alignment {input.alignment} --before {input.before} --after {input.after}"
-        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
+        " --scene-evaluation {input.scene} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --evaluation {output} --seed {params.seed} {params.options} &> {log}"

@@ -104,7 +104,7 @@ rule crop_scene:
     params:
         options=crop_options,
         script=script("registration/crop_scene.py"),
-        files=state_of_files,
+        files=state_of(crop_inputs),
         code=code("registration/crop_scene.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: crop"

@@ -177,7 +177,7 @@ rule write_report:
 
 onerror:
     shell(
-        "mkdir -p results/logs/summary; "
+        "mkdir -p results/logs/write_summary; "
         + summary_command("results/logs/write_summary/onerror.log")
         + " || true"
     )

@@ -53,7 +53,7 @@ rule list_photos:
     params:
         folder=scene_folder,
         script=script("sfm/list_photos.py"),
-        files=state_of_files,
+        files=state_of(scene_photos),
         code=code("sfm/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
@@ -81,7 +81,7 @@ rule extract_frames:
         source=object_source,
         options=flags(config["object"]["frames"]),
         script=script("sfm/extract_frames.py"),
-        files=state_of_files,
+        files=state_of(object_photos),
         code=code("sfm/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
@@ -110,7 +110,7 @@ rule extract_scene_features:
         folder=scene_folder,
         options=flags(config["scene"]["features"]),
         script=script("sfm/extract_features.py"),
-        files=state_of_files,
+        files=state_of(scene_photos),
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
@@ -229,7 +229,7 @@ rule map_scene_photos:
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
-        files=state_of_files,
+        files=state_of(scene_photos),
         code=code("sfm/map_photos.py"),
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
@@ -322,7 +322,7 @@ rule undistort_scene_photos:
         folder=scene_folder,
         options=flags(config["scene"]["undistort"]),
         script=script("sfm/undistort_photos.py"),
-        files=state_of_files,
+        files=state_of(scene_photos),
         code=code("sfm/undistort_photos.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
