@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
+from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthSettings
 from scenefuse.fusion.fuse_object import FusionSettings
@@ -54,18 +55,6 @@ class RunSettings:
     gpu: int | Literal["auto"] = setting("auto", least=0)
     """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
     NVIDIA card, else 0. On a cluster, say it."""
-
-
-@dataclass(frozen=True)
-class ClickSettings:
-    """Clicks of the demo."""
-
-    photos: int = setting(6, least=0)
-    """Photos used at most."""
-    separation_deg: float = setting(12, unit="degree", least=0)
-    """Smallest angle at the object between the views of two photos used."""
-    noise_px: float = setting(1, unit="px", least=0)
-    """Standard deviation of a click."""
 
 
 @dataclass(frozen=True)
