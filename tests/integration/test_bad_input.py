@@ -47,6 +47,13 @@ def test_unreadable_photo(project, refused):
     assert not (project.path / "results/scenes/yard/photos.json").exists()
 
 
+def test_jobs_on_one_machine_share_its_memory_and_its_card(project, refused):
+    project.photos("flight")
+    (project.path / "flight/1.jpg").write_bytes(b"")
+    bounds = next(x for x in refused("results/scenes/yard/photos.json").splitlines() if "Provided resources" in x)
+    assert "mem_mb" in bounds and "gpu" in bounds
+
+
 def test_too_few_registered_photos(project, refused):
     project.photos("flight", 4)
     output = refused("results/scenes/yard/sparse.json")

@@ -65,14 +65,14 @@ def test_a_script_is_the_command_line_of_the_function_of_its_name(script):
 
 
 def test_rules_and_scripts_share_their_names():
-    rules = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
+    rules = "".join(path.read_text() for path in (ROOT / "workflow").rglob("*.smk"))
     used = set(re.findall(r"script\([\"'](\S+?)[\"']\)", rules))
     assert used == {str(p.relative_to(ROOT / "scripts")) for p in SCRIPTS if p.parent.name != "scripts"}
 
 
 def test_reading_the_rules_imports_nothing_heavy():
     # Every job on a cluster reads them again. Snakemake itself imports NumPy and pandas.
-    rules = [*(ROOT / "workflow/rules").glob("*.smk"), ROOT / "Snakefile"]
+    rules = [*(ROOT / "workflow").rglob("*.smk"), ROOT / "Snakefile"]
     lines = [line for path in rules for line in path.read_text().splitlines() if re.match(r"(from|import) ", line)]
     heavy = "{'torch', 'open3d', 'pycolmap', 'cv2', 'numba', 'scipy', 'PIL', 'matplotlib'}"
     source = "\n".join([*lines, "import sys", f"print(sorted({heavy} & set(sys.modules)))"])
