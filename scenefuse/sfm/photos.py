@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
+from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError, quantity, read_json, sha256, threads, write_json
-
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 
 
 @dataclass(frozen=True)
@@ -71,16 +70,8 @@ def list_photos(*, folder: Path, photos: Path) -> None:
 
 
 def photo_names(folder: Path) -> list[str]:
-    """Relative names of all photos below a folder, sorted; StageError when there are none."""
-    if not folder.is_dir():
-        raise StageError(f"the photo folder {folder} does not exist; check its path in the configuration")
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
-    names = sorted(p.relative_to(folder).as_posix() for p in files if p.suffix.lower() in SUFFIXES)
-    if not names:
-        raise StageError(
-            f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there "
-            f"({len(files)} other files were found)"
-        )
+    """Relative names of all photos below a folder, sorted; see `photo_files`."""
+    names = [file.relative_to(folder).as_posix() for file in photo_files(folder)]
     spaced = next((name for name in names if any(c.isspace() for c in name)), None)
     if spaced is not None:
         raise StageError(f"'{spaced}' in {folder} has a space in its name, which COLMAP's lists cannot hold; rename it")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scenefuse.sfm.photo_files import photo_files
 from scenefuse.sfm.photos import gps_positions, list_photos, read_photos
 from scenefuse.stage import StageError, read_json, value
 
@@ -90,3 +91,30 @@ def test_missing_and_empty_folders(tmp_path):
     (tmp_path / "empty" / "readme.txt").write_text("x")
     with pytest.raises(StageError, match=r"holds no photos.*1 other files"):
         list_photos(folder=tmp_path / "empty", photos=tmp_path / "photos.json")
+
+
+def test_only_what_is_a_photo_is_listed(tmp_path):
+    folder = tmp_path / "p"
+    save(folder / "b.JPG")
+    save(folder / "sub" / "a.tif")
+    save(folder / ".trash" / "old.jpg")
+    for name in (".DS_Store", "Thumbs.db", "._b.JPG", "b.xmp", "b.DNG", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    assert photo_files(folder) == [folder / "b.JPG", folder / "sub" / "a.tif"]
+
+
+def test_photos_in_symlinked_folders_are_found_once(tmp_path):
+    save(tmp_path / "disk" / "card" / "a.jpg")
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "flight").symlink_to(tmp_path / "disk" / "card")
+    (tmp_path / "disk" / "card" / "back").symlink_to(tmp_path / "p")
+    assert photo_files(tmp_path / "p") == [tmp_path / "p" / "flight" / "a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["IMG_1.HEIC", "DJI_0001.DNG", "sub/shot.NEF"])
+def test_photos_that_cannot_be_read_are_named(tmp_path, name):
+    save(tmp_path / "p" / "a.jpg")
+    save(tmp_path / "p" / "sub" / "b.jpg")
+    (tmp_path / "p" / name).write_bytes(b"x")
+    with pytest.raises(StageError, match=f"{name} cannot be read.*convert to JPEG"):
+        photo_files(tmp_path / "p")
