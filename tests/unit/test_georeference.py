@@ -16,7 +16,7 @@ from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.stage import read_json, value
 from scenefuse.transforms import Sim3, rotation_angle_deg
 
-SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0, min_gps_photos=5)
+SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0)
 FRAME = LocalFrame(47.37, 8.55, 430.0)
 PLANTED = Sim3(7.5, Rotation.from_euler("xyz", [150, 20, -80], degrees=True).as_matrix(), np.array([30.0, -12.0, 55.0]))
 
