@@ -1,5 +1,6 @@
 """A sparse model brought into metres by GPS, or at least turned upright."""
 
+import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -126,33 +127,44 @@ def place_by_gps(centres: Array, target: Array, up: Array, settings: Georeferenc
     the tilt: then the cameras' up direction (3,) closes it. Positions within five times the GPS accuracy of each other
     say nothing about scale: then the model is only turned upright.
     """
-    limit = OUTLIER * settings.gps_accuracy_m
-    has_height = np.isfinite(target[:, 2])
-    extent = _extent(target)
-    if extent[0] < SPREAD * settings.gps_accuracy_m:
-        reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {settings.gps_accuracy_m:g} m"
+    accuracy_m, extent = settings.gps_accuracy_m, _extent(target)
+    if extent[0] < SPREAD * accuracy_m:
+        reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
-    narrow = extent[1] < WIDTH * settings.gps_accuracy_m
-    enough = has_height.sum() >= MIN_GPS_PHOTOS and _extent(target[has_height])[1] >= WIDTH * settings.gps_accuracy_m
-    levelled = bool(narrow or not enough)
-    try:
-        if levelled:
-            fitted, inliers = fit_level(centres, target, up, limit, seed)
-            how = f"{'along one line' if narrow else 'by GPS'}, levelled by the cameras"
-        else:
-            fitted, inliers = fit_measured(centres, target, limit, seed)
-            how = "by GPS"
-    except ValueError as error:
-        return upright(up, f"GPS positions do not fit the cameras ({error})")
+    fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, seed)
     if inliers.sum() < max(MIN_GPS_PHOTOS, 0.5 * len(target)):
-        reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
+        reason = (
+            f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within"
+            f" {OUTLIER * accuracy_m:g} m"
+        )
         return upright(up, reason)
-    reason = f"{inliers.sum()} of {len(target)} photos {how}"
-    if not has_height.any():
+    reason = f"{inliers.sum()} of {len(target)} photos by GPS"
+    if levelled:
+        line = "along one line, " if _extent(target[inliers])[1] < WIDTH * accuracy_m else ""
+        reason += f", {line}levelled by the cameras"
+    unknown = np.isnan(target[:, 2])
+    if unknown.all():
         reason += "; no photo has a GPS height, so heights are relative to the middle camera"
-    elif not has_height.all():
-        reason += f"; {np.sum(~has_height)} of them have no GPS height and do not constrain heights"
-    return Placement("georeferenced", reason, fitted, inliers, "measured" if has_height.any() else "relative", levelled)
+    elif unknown.any():
+        reason += f"; {unknown.sum()} of them have no GPS height and do not constrain heights"
+    return Placement("georeferenced", reason, fitted, inliers, "relative" if unknown.all() else "measured", levelled)
+
+
+def _fit(
+    centres: Array, target: Array, up: Array, accuracy_m: float, seed: int
+) -> tuple[Sim3, NDArray[np.bool_], bool]:
+    """Similarity, inliers, and whether the cameras had to level it, because the positions that agree do not."""
+    limit, has_height = OUTLIER * accuracy_m, np.isfinite(target[:, 2])
+
+    def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= WIDTH * accuracy_m)
+
+    if fixes_tilt(has_height):
+        with contextlib.suppress(ValueError):  # no three positions agree
+            fitted, inliers = fit_measured(centres, target, limit, seed)
+            if inliers.sum() >= 0.5 * len(target) and fixes_tilt(inliers & has_height):
+                return fitted, inliers, False
+    return *fit_level(centres, target, up, limit, seed), True
 
 
 def upright(up: Array, reason: str) -> Placement:
