@@ -175,7 +175,8 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
         camera.rescale(width, height)
         target = camera if _straight(camera) else pycolmap.undistort_camera(options, camera)
         cam_from_object = np.linalg.inv(photo.object_from_cam)
-        view = View(photo.name, target.calibration_matrix(), cam_from_object, target.width, target.height)
+        intrinsics = np.asarray(target.calibration_matrix(), dtype=np.float64)
+        view = View(photo.name, intrinsics, cam_from_object, target.width, target.height)
         pairs.append((camera, view))
     smallest: dict[tuple[int, int], tuple[int, int]] = {}
     for camera, view in pairs:

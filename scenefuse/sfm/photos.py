@@ -124,7 +124,9 @@ def save_upright(source: Path, target: Path, max_width_px: int | None = None) ->
         if max_width_px is not None and upright.width > max_width_px:
             height = round(upright.height * max_width_px / upright.width)
             upright = upright.resize((max_width_px, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
-        coded = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        coded: dict[str, Any] = (
+            {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        )
         upright.save(target, exif=exif.tobytes(), **coded)
     return size
 
