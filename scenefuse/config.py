@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
+from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthSettings
 from scenefuse.fusion.fuse_object import FusionSettings
@@ -51,20 +52,9 @@ class RunSettings:
     """Table of objects."""
     seed: int = setting(0, least=0)
     """Seed of everything random."""
-    gpu: int = setting(0, least=0)
-    """GPUs that a stereo or training job asks the scheduler for; 0 on a machine without one."""
-
-
-@dataclass(frozen=True)
-class ClickSettings:
-    """Clicks of the demo."""
-
-    photos: int = setting(6, least=0)
-    """Photos used at most."""
-    separation_deg: float = setting(12, unit="degree", least=0)
-    """Smallest angle at the object between the views of two photos used."""
-    noise_px: float = setting(1, unit="px", least=0)
-    """Standard deviation of a click."""
+    gpu: int | Literal["auto"] = setting("auto", least=0)
+    """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
+    NVIDIA card, else 0. On a cluster, say it."""
 
 
 @dataclass(frozen=True)
@@ -277,7 +267,9 @@ def _json_type(kind: Any) -> dict[str, Any]:
     if origin is tuple:
         return {"type": "array", "minItems": 1, "items": _json_type(parts[0])}
     if origin in (typing.Union, types.UnionType):
-        return {"type": [names[part] for part in parts]}
+        words = [word for part in parts for word in typing.get_args(part)]  # of a Literal
+        pattern = {"pattern": f"^({'|'.join(words)})$"} if words else {}
+        return {"type": [names.get(part, "string") for part in parts]} | pattern
     raise TypeError(f"a setting of type {kind} has no JSON schema")
 
 

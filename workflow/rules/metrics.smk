@@ -5,6 +5,9 @@
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
 
 
+include: "../functions/metrics.smk"
+
+
 rule compute_metrics:
     """Registration and completion metrics, each with its null value (paper 3.3.1 and 3.3.2; G1 to G5)."""
     input:
@@ -74,7 +77,7 @@ rule evaluate_scene:
         model="results/scenes/{scene}/georeferenced",
         georeference="results/scenes/{scene}/georeference.json",
         cloud="results/scenes/{scene}/dense.ply",
-        truth=lambda wildcards: scene_truth(wildcards.scene),
+        truth=scene_truth,
     output:
         "results/scenes/{scene}/truth.json",
     log:
@@ -90,6 +93,7 @@ rule evaluate_scene:
         options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
         script=script("metrics/evaluate_scene.py"),
+        files=state_of(scene_truth),
         code=code("metrics/evaluate_scene.py"),
     message:
         "Scene {wildcards.scene}: comparing with the truth"
@@ -118,8 +122,7 @@ rule evaluate_object:
         before=in_scene("dense.ply"),
         after="results/objects/{object}/fused_scene.ply",
         scene=in_scene("truth.json"),
-        truth_scene=lambda wildcards: scene_truth(object_row(wildcards.object)["scene"]),
-        truth_object=lambda wildcards: object_row(wildcards.object)["truth"],
+        truth=object_truth,
     output:
         "results/objects/{object}/truth.json",
     log:
@@ -135,11 +138,12 @@ rule evaluate_object:
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
+        files=state_of(object_truth),
         code=code("metrics/evaluate_object.py"),
     message:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
         " --cloud {input.cloud} --variants {input.variants} --alignment {input.alignment} --before {input.before} --after {input.after}"
-        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
+        " --scene-evaluation {input.scene} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --evaluation {output} --seed {params.seed} {params.options} &> {log}"

@@ -9,6 +9,9 @@
 # measured at the same thresholds.
 
 
+include: "../functions/registration.smk"
+
+
 rule align_models:
     """Find the object in the scene by features that their photos share (R14)."""
     input:
@@ -65,6 +68,7 @@ rule crop_scene:
     params:
         options=crop_options,
         script=script("registration/crop_scene.py"),
+        files=state_of(crop_inputs),
         code=code("registration/crop_scene.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: crop"

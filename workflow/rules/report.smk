@@ -3,6 +3,11 @@
 # INPUTS    everything before
 # OUTPUTS   results/scenes/{scene}/scene.png, results/objects/{object}/figures/
 #           results/summary/*.tsv, summary.txt, report.html
+
+
+include: "../functions/report.smk"
+
+
 TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects"]
 
 
@@ -143,7 +148,7 @@ rule write_report:
 
 onerror:
     shell(
-        "mkdir -p results/logs/summary; "
+        "mkdir -p results/logs/write_summary; "
         + summary_command("results/logs/write_summary/onerror.log")
         + " || true"
     )

@@ -11,6 +11,9 @@
 # Folders of photos are ancient(): whether a photo has changed, the hashes in photos.json say.
 
 
+include: "../functions/sfm.smk"
+
+
 rule list_photos:
     """List the flight's photos, turn rotated ones upright, and stop at one that cannot be read."""
     input:
@@ -30,6 +33,7 @@ rule list_photos:
     params:
         folder=scene_folder,
         script=script("sfm/list_photos.py"),
+        files=state_of(scene_photos),
         code=code("sfm/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
@@ -57,6 +61,7 @@ rule extract_frames:
         source=object_source,
         options=flags(config["object"]["frames"]),
         script=script("sfm/extract_frames.py"),
+        files=state_of(object_photos),
         code=code("sfm/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
@@ -84,6 +89,7 @@ rule extract_scene_features:
     params:
         options=flags(config["scene"]["features"]),
         script=script("sfm/extract_features.py"),
+        files=state_of(scene_photos),
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
@@ -188,6 +194,7 @@ rule map_scene_photos:
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
+        files=state_of(scene_photos),
         code=code("sfm/map_photos.py"),
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
@@ -274,6 +281,7 @@ rule undistort_scene_photos:
         upright=lambda wildcards, input: f"--georeference {input.report}",
         options=flags(config["scene"]["undistort"]),
         script=script("sfm/undistort_photos.py"),
+        files=state_of(scene_photos),
         code=code("sfm/undistort_photos.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
