@@ -19,9 +19,8 @@ from scenefuse.depth.train_depth import DepthSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.registration import MetricSettings
-from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.mvs.plane_sweep import DepthSettings as DepthMapSettings
+from scenefuse.mvs.dense_cloud import DenseCloudSettings
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudSettings
@@ -73,14 +72,6 @@ class ChunkSettings:
 
     chunks: int = setting(4, least=1)
     """Jobs that the depth maps of a scene are split into; on a cluster they run side by side."""
-
-
-@dataclass(frozen=True)
-class BackendSettings:
-    """Who makes depth maps."""
-
-    backend: Literal["auto", "colmap", "torch"] = setting("auto")
-    """`colmap` needs CUDA; `torch` is our plane sweep; `auto` takes the first that can run."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +171,7 @@ SECTIONS: dict[str, list[Any]] = {
     "scene.sparse": [MapSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
-    "scene.depth_maps": [BackendSettings(), DepthMapSettings()],
+    "scene.depth_maps": [DepthMapSettings()],
     "scene.dense_cloud": [DenseCloudSettings()],
     "object": [HoldOutSettings()],
     "object.frames": [FrameSettings()],
@@ -194,7 +185,6 @@ SECTIONS: dict[str, list[Any]] = {
     "object.stage2": [EpochSettings()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [EpochSettings()],
-    "object.matching": [RefinementSettings()],
     "object.nerf": [DeviceSettings(), NerfSettings(), FieldSettings(), Schedule(), LossWeights()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
