@@ -31,11 +31,11 @@ from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.crop.crop_scene import CropSettings
 from scenefuse.registration.fine import FineSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
-from scenefuse.sfm.features import FeatureSettings, MatchSettings
+from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
 from scenefuse.sfm.mapping import MapSettings
-from scenefuse.sfm.pairs import PairSettings
+from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 
@@ -167,7 +167,7 @@ SECTIONS: dict[str, list[Any]] = {
     "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings(max_features=3000, first_octave=0, camera_mode="auto")],
-    "scene.matches": [PairSettings(), MatchSettings()],
+    "scene.matches": [MatchSettings()],
     "scene.sparse": [MapSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
@@ -176,7 +176,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object": [HoldOutSettings()],
     "object.frames": [FrameSettings()],
     "object.features": [FeatureSettings()],
-    "object.matches": [PairSettings(), MatchSettings()],
+    "object.matches": [MatchSettings()],
     "object.sparse": [MapSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],

@@ -37,7 +37,7 @@ def complete_scene(
         objects: their clouds (PLY), each in its own frame, in the order of `names`.
         crops: the scene's points on each (PLY).
         fines: JSON of the fine registration of each.
-        georeference: JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing.
+        georeference: JSON of the scene, with its origin for the LAZ file, or nothing.
         completed: output PLY, the scene's frame.
         completed_laz: output LAZ of the same, in the CRS where the scene is georeferenced.
         report: output JSON: what each `source` is, the points that each object added, the unregistered with the reason.

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
 from scenefuse.io.units import length_unit
+from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -81,7 +82,7 @@ def fuse_object(
         crop: the scene's points on the object (PLY).
         crop_report: JSON of the crop stage, for the box.
         fine: JSON of the fine registration.
-        georeference: JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing.
+        georeference: JSON of the scene, with its origin for the LAZ file, or nothing.
         fused: output PLY, the object's surroundings: the scene in the crop's box and what was added.
         fused_scene: output PLY, the whole scene with what was added.
         fused_laz: output LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one.
@@ -209,10 +210,13 @@ def with_provenance(cloud: Cloud, source: int) -> Cloud:
 def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
     """Write a cloud in the scene's frame as PLY, and as LAZ in the scene's CRS; returns that CRS, None without one."""
     write_cloud(ply, cloud)
-    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
-    about_origin = replace(crs_from_scene, translation=np.zeros(3))
-    write_laz(laz, cloud.transformed(about_origin), crs_from_scene.translation, crs)
-    return crs
+    frame = None if georeference is None else scene_frame(read_json(georeference))
+    if frame is None:
+        write_laz(laz, cloud, np.zeros(3), None)
+        return None
+    origin = frame.in_crs(np.zeros((1, 3)))[0]
+    write_laz(laz, replace(cloud, points=frame.in_crs(cloud.points) - origin), origin, frame.crs)
+    return frame.crs
 
 
 def _thin(cloud: Cloud, wanted: float) -> Cloud:
@@ -250,15 +254,6 @@ def _feather(added: Cloud, kept: Cloud, width: float, move: bool, fill: float) -
         height = np.clip((offset * normal).sum(1, keepdims=True), -fill, fill)
         added = replace(added, points=added.points + share * height * normal)
     return added
-
-
-def _crs_from_scene(georeference: Path | None) -> tuple[Sim3, str] | None:
-    """The transform into a georeferenced scene's CRS and the CRS, or None."""
-    content = {} if georeference is None else read_json(georeference)
-    crs, transform = content.get("crs"), content.get("crs_from_scene")
-    if not crs or not transform or not crs["value"] or transform["value"] is None:
-        return None
-    return Sim3.from_matrix(np.array(transform["value"])), str(crs["value"])
 
 
 def _bytes(colors: Array) -> NDArray[np.uint8]:

@@ -61,7 +61,7 @@ def train_nerf(
         data=data,
         images=images,
         masks=masks,
-        cameras=cameras,
+        workspace=cameras,
         mattes=mattes,
         report=steps / "photos.json",
         settings=build(UndistortSettings, wanted["undistort"]),

@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError
+from scenefuse.workspace import read_model
 
 Array = NDArray[np.float64]
 CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
@@ -167,7 +168,7 @@ def locate(
     marked = read_points(path)
     if isinstance(marked, ScenePoints):
         return marked.points, marked.positions, np.zeros(len(marked.points))
-    return triangulate(marked, pycolmap.Reconstruction(model), max_residual_px, sizes)
+    return triangulate(marked, read_model(model), max_residual_px, sizes)
 
 
 def _model_pixel(

@@ -59,11 +59,11 @@ def lego(
     chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        places = {"cameras": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        places = {"workspace": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
             data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )
-        views = load_views(places["cameras"], places["mattes"], chosen["width_px"], 0)
+        views = load_views(places["workspace"], places["mattes"], chosen["width_px"], 0)
     start = time.perf_counter()
     training, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
     cube, hull = _volume(views, training, build(NerfSettings, chosen), None)

@@ -7,6 +7,7 @@ import pytest
 
 from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds, fuse_object, match_colors
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -104,13 +105,13 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
             "scene_from_object": quantity(pose.matrix, ""),
         },
     )
-    crs_from_scene = Sim3(1.0, np.eye(3), np.array([4e5, 5e6, 100.0]))
     write_json(
         tmp_path / "georeference.json",
         {
             "length_unit": quantity("m", ""),
-            "crs": quantity("EPSG:32632", ""),
-            "crs_from_scene": quantity(crs_from_scene.matrix, "m"),
+            "origin_latitude_deg": quantity(47.4, "deg"),
+            "origin_longitude_deg": quantity(8.55, "deg"),
+            "origin_altitude_m": quantity(430.0, "m"),
         },
     )
     fuse_object(
@@ -142,4 +143,5 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     import laspy
 
     las = laspy.read(tmp_path / "fused_scene.laz")
-    assert len(las.points) == len(whole) and np.asarray(las.x).min() == pytest.approx(4e5, abs=0.01)
+    in_crs = LocalFrame(47.4, 8.55, 430.0).in_crs(whole.points)
+    np.testing.assert_allclose(np.stack([las.x, las.y, las.z], axis=1), in_crs, atol=1e-3)

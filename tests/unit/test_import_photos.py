@@ -19,7 +19,8 @@ from scenefuse.mvs.views import load_views
 from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.rays import cube_from_cameras
 from scenefuse.nerf.render import Rendered
-from scenefuse.nerf.train_object_nerf import _held_out_quality, train_nerf
+from scenefuse.nerf.train_nerf import train_nerf
+from scenefuse.nerf.train_object_nerf import _held_out_quality
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import StageError, read_json, value
@@ -140,10 +141,10 @@ def imported(data, out, images=None, masks=None):
         data=data,
         images=images,
         masks=masks,
-        cameras=out / "cameras",
+        workspace=out / "cameras",
         mattes=out / "masks",
         report=out / "photos.json",
-        settings=UndistortSettings(1600, 97),
+        settings=UndistortSettings(max_size_px=1600),
     )
     return load_views(out / "cameras", out / "masks", WIDTH, 0), read_json(out / "photos.json")
 

@@ -1,24 +1,26 @@
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from scenefuse.sfm.features import FeatureSettings, MatchSettings, camera_groups, extract_features, match_features
+from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MapSettings, map_photos
-from scenefuse.sfm.pairs import PairSettings, choose_pairs, sequential_pairs, spatial_pairs
+from scenefuse.sfm.matches import match_features
+from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
 from scenefuse.sfm.photos import Photo, list_photos, write_photos
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import fit_sim3
 
-PAIRS = PairSettings("auto", 10, 20, 3, 2, 4, 2.0)
-FEATURES = FeatureSettings(1000, 800, 0, "SIMPLE_RADIAL", "auto")
-MATCHES = MatchSettings(0.7, 0.7, True, True, 15)
-MAPPING = MapSettings(50, 200, 0.0, 4.0, 50, 0.8)
+PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
+FEATURES = FeatureSettings(max_image_size_px=1000, max_features=800, first_octave=0, camera_mode="auto")
+MAPPING = MapSettings(min_registered_share=0.8)
 FRAME = LocalFrame(47.0, 8.0, 400.0)
 
 
@@ -39,7 +41,7 @@ def test_pairs_are_chosen_by_what_is_known():
     assert choose_pairs(without[:20], False, PAIRS)[0] == "exhaustive"
     assert choose_pairs(without[:20], True, PAIRS)[0] == "sequential"
     assert choose_pairs(without, False, PAIRS)[0] == "sequential"
-    kind, reason, pairs = choose_pairs(without[:5], False, PairSettings("spatial", 10, 20, 3, 2, 4, 2.0))
+    kind, reason, pairs = choose_pairs(without[:5], False, replace(PAIRS, pairs="spatial"))
     assert (kind, len(pairs)) == ("exhaustive", 10) and "too few photos" in reason
 
 
@@ -108,7 +110,7 @@ def capture(tmp_path_factory):
         u, v = (hit[..., 0] * 75 + 256) % 512, (hit[..., 1] * 75 + 128) % 256
         Image.fromarray(texture[v.astype(int), u.astype(int)]).save(folder / "photos" / f"{index}.png")
         centres.append(centre)
-    list_photos(folder=folder / "photos", photos=folder / "photos.json")
+    list_photos(folder=folder / "photos", upright=folder / "upright", photos=folder / "photos.json")
     return folder, np.array(centres)
 
 
@@ -117,7 +119,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     folder, truth = capture
     extract_features(
-        folder=folder / "photos",
+        folder=folder / "upright",
         photos=folder / "photos.json",
         features=tmp_path / "features.db",
         settings=FEATURES,
@@ -128,12 +130,11 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
             features=tmp_path / "features.db",
             database=tmp_path / f"{name}.db",
             matches=tmp_path / "matches.json",
-            pair_settings=PAIRS,
-            settings=MATCHES,
+            settings=PAIRS,
             seed=0,
         )
         map_photos(
-            folder=folder / "photos",
+            folder=folder / "upright",
             photos=folder / "photos.json",
             database=tmp_path / f"{name}.db",
             sparse=tmp_path / name,
@@ -155,22 +156,24 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
 
     undistort_photos(
-        folder=folder / "photos",
+        folder=folder / "upright",
+        photos=folder / "photos.json",
         sparse=tmp_path / "first",
-        dense=tmp_path / "dense",
+        workspace=tmp_path / "dense",
         report=tmp_path / "dense.json",
-        settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+        settings=UndistortSettings(max_size_px=120),
     )
     dense = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
     assert {c.model_name for c in dense.cameras.values()} == {"PINHOLE"}
     assert max(value(read_json(tmp_path / "dense.json"), "sizes_px")[0]) <= 120
-    with pytest.raises(StageError, match=r"6 photos of the model .* are missing"):
+    with pytest.raises(StageError, match="6 photos are missing in"):
         undistort_photos(
             folder=tmp_path,
+            photos=folder / "photos.json",
             sparse=tmp_path / "first",
-            dense=tmp_path / "none",
+            workspace=tmp_path / "none",
             report=tmp_path / "none.json",
-            settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+            settings=UndistortSettings(max_size_px=120),
         )
     assert not (tmp_path / "none").exists()
 
@@ -182,9 +185,9 @@ def test_photos_that_show_different_things(tmp_path):
         noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
         noise = (noise - noise.min()) / np.ptp(noise) * 255
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
-    list_photos(folder=tmp_path / "photos", photos=tmp_path / "photos.json")
+    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
     extract_features(
-        folder=tmp_path / "photos",
+        folder=tmp_path / "upright",
         photos=tmp_path / "photos.json",
         features=tmp_path / "features.db",
         settings=FEATURES,
@@ -195,8 +198,7 @@ def test_photos_that_show_different_things(tmp_path):
             features=tmp_path / "features.db",
             database=tmp_path / "database.db",
             matches=tmp_path / "matches.json",
-            pair_settings=PAIRS,
-            settings=MATCHES,
+            settings=PAIRS,
             seed=0,
         )
     assert not (tmp_path / "database.db").exists() and not (tmp_path / "matches.json").exists()
