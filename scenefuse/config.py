@@ -23,7 +23,6 @@ from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.plane_sweep import DepthSettings as DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
@@ -121,22 +120,6 @@ class PoseSource:
 
 
 @dataclass(frozen=True)
-class EpochSettings:
-    """Length of a stage."""
-
-    epochs: int = setting(20, least=0)
-    """Epochs of this stage."""
-
-
-@dataclass(frozen=True)
-class DeviceSettings:
-    """Where the NeRF trains."""
-
-    device: Literal["auto", "cpu", "cuda"] = setting("auto")
-    """`auto` takes CUDA where it is."""
-
-
-@dataclass(frozen=True)
 class VariantSettings:
     """Which registrations run."""
 
@@ -212,11 +195,11 @@ SECTIONS: dict[str, list[Any]] = {
     "object.masks": [MaskSources(), MaskSettings()],
     "object.poses": [PoseSettings()],
     "object.stage1": [PoseSource(), DepthSettings()],
-    "object.stage2": [EpochSettings()],
+    "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
-    "object.stage4": [EpochSettings()],
+    "object.stage4": [Schedule()],
     "object.matching": [RefinementSettings()],
-    "object.nerf": [DeviceSettings(), NerfSettings(), FieldSettings(), Schedule(), LossWeights()],
+    "object.nerf": [NerfSettings(), FieldSettings(), Schedule()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
@@ -230,7 +213,7 @@ SECTIONS: dict[str, list[Any]] = {
     "evaluation.object": [ObjectEvaluation()],
 }
 # Set by another section, or by the workflow.
-ELSEWHERE = {("object.nerf", "epochs")}
+ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
 
 
 def schema() -> dict[str, Any]:
