@@ -1,6 +1,9 @@
 """The NeRF stage on a tiny workspace: what it writes, and the sentences for bad input."""
 
-from dataclasses import replace
+import ast
+import re
+from dataclasses import fields, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +22,7 @@ from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_obj
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
+ROOT = Path(__file__).resolve().parents[2]
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
 WEIGHTS = LossWeights(depth_weight=1.0)
 UNREFINED = RefinementSettings(match_reach_px=0.0)
@@ -157,3 +161,14 @@ def test_empty_masks_are_named(workspace, tmp_path):
 def test_missing_cuda_is_named(workspace):
     with pytest.raises(StageError, match="no CUDA device; set it to auto or cpu"):
         _run(workspace, "other", settings=replace(SETTINGS, device="cuda"))
+
+
+def test_the_lego_example_and_its_benchmark_train_alike():
+    example = (ROOT / "config/examples/lego.yaml").read_text()
+    words = re.sub(r"[#\\\n]+", " ", example.split("--out lego")[1].split("object:")[0]).split()
+    said = {words[i].removeprefix("--").replace("-", "_"): float(words[i + 1]) for i in range(0, len(words), 2)}
+    benchmark = (ROOT / "tests/benchmarks/lego.py").read_text()
+    flags = ast.literal_eval(re.search(r"^FLAGS = (\{.*?^\})", benchmark, re.M | re.S).group(1))
+    assert said | {"mask_band_px": 0} == flags
+    known = {field.name for part in (NerfRecipe, LossWeights, MapSettings, Schedule) for field in fields(part)}
+    assert set(flags) <= known
