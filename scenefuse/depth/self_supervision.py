@@ -17,6 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+# alpha of equation (2), as in Monodepth2.
+SSIM_WEIGHT = 0.85
+
 
 def points_in_cam(depth: Tensor, intrinsics: Tensor) -> Tensor:
     """(B, 1, H, W) depth and (B, 3, 3) intrinsics -> (B, 3, H*W) points in the camera's frame."""
@@ -80,11 +83,11 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (spread + c2))
 
 
-def photometric_error(a: Tensor, b: Tensor, ssim_weight: float) -> Tensor:
+def photometric_error(a: Tensor, b: Tensor) -> Tensor:
     """Equation (2), averaged over colours: (B, 1, H, W)."""
     absolute = (a - b).abs()
     structure = (1.0 - ssim(a, b)).div(2.0).clamp(0.0, 1.0)
-    return (ssim_weight * structure + (1.0 - ssim_weight) * absolute).mean(1, keepdim=True)
+    return (SSIM_WEIGHT * structure + (1.0 - SSIM_WEIGHT) * absolute).mean(1, keepdim=True)
 
 
 def minimum_reprojection(errors: Tensor, valid: Tensor, unmoved: Tensor | None) -> tuple[Tensor, Tensor]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_depth import plane_views
+from support.textured_plane import plane_views
 from test_photo_refinement import _speckled, _wrong
 
 from scenefuse.depth.prior import read_prior
