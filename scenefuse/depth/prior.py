@@ -57,7 +57,7 @@ def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreeme
     depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
     matched = refine_by_photos(seen, seen.object_from_cam, depths, settings)
     refined = float(matched.moved.sum() / max(int((depths > 0).sum()), 1))
-    depths = np.where(matched.denied, 0, matched.depths)
+    depths = np.where(matched.inconsistent, 0, matched.depths)
     confidence = np.where(matched.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
     depths = np.where(confidence > 0, depths, 0)
     shape = views.masks.shape

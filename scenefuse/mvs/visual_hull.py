@@ -3,16 +3,23 @@
 Source: Laurentini 1994 (visual hull), with voting instead of a strict intersection.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-Array = NDArray[np.float64]
+from scenefuse.transforms import Array
+from scenefuse.workspace import View
+
 Mask = NDArray[np.bool_]
+Counts = NDArray[np.int32]
+
+BATCH = 4
+"""Photos after which `carve` leaves out the voxels that are decided: most are, early."""
 
 
 @dataclass(frozen=True)
@@ -48,34 +55,6 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One undistorted photo of the object and its camera.
-
-    Attributes:
-        name: file name.
-        image: (H, W, 3) uint8 BGR.
-        intrinsics: (3, 3), pixel centres at +0.5.
-        cam_from_object: (3, 4).
-        observed: (K, 2) pixel positions of the SfM points that it sees.
-        point_rows: (K,) their rows in the array of all SfM points.
-    """
-
-    name: str
-    image: NDArray[np.uint8]
-    intrinsics: Array
-    cam_from_object: Array
-    observed: Array
-    point_rows: NDArray[np.int64]
-
-    def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixel positions (N, 2) and depths (N,) of (N, 3) points."""
-        x = points @ self.cam_from_object[:, :3].T + self.cam_from_object[:, 3]
-        depth = x[:, 2]
-        pixels = (x @ self.intrinsics.T)[:, :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[:, None]
-        return pixels, depth
-
-
-@dataclass(frozen=True)
 class Hull:
     """The occupied voxels of a box.
 
@@ -90,17 +69,37 @@ class Hull:
     volume: float
 
 
+def count_silhouettes(points: NDArray[Any], views: Iterable[View]) -> tuple[Counts, Counts]:
+    """In how many photos each point lies in the frame, (N,), and in how many of these it lies off the mask, (N,).
+
+    Source: Laurentini 1994. With the two counts a caller decides how many photos may err.
+
+    Args:
+        points: (N, 3) in the views' world, float32 or float64; projections are computed in their precision.
+        views: photos with `pixels` (H, W) bool, True on the object.
+    """
+    shown, missed = (np.zeros(len(points), dtype=np.int32) for _ in range(2))
+    for view in views:
+        projection = view.projection.astype(points.dtype)
+        x, y, depth = (points @ projection[:, :3].T + projection[:, 3]).T
+        safe = np.maximum(depth, 1e-6)
+        u, v = (np.clip(c / safe, -1, 1e6).astype(np.int32) for c in (x, y))
+        rows = np.flatnonzero((depth > 0) & (x >= 0) & (u < view.width) & (y >= 0) & (v < view.height))
+        shown[rows] += 1
+        missed[rows] += ~view.pixels[v[rows], u[rows]]
+    return shown, missed
+
+
 def carve(
-    box: Box, height_of: Callable[[Array], Array], frames: list[Frame], masks: list[Mask], voxels: int, tolerance: float
+    box: Box, height_of: Callable[[Array], Array], silhouettes: list[View], voxels: int, tolerance: float
 ) -> Hull:
     """The voxels of a box, above the ground, that all masks but a share of `tolerance` contain.
 
     Args:
-        box: the space to look at.
+        box: the space to carve from.
         height_of: heights (N,) over the ground of (N, 3) points along the box's axes; nothing below 0
             belongs to the object.
-        frames: photos; a photo has no say on a voxel it does not show.
-        masks: (H, W) per photo.
+        silhouettes: cameras with masks as `pixels`; a photo counts for the voxels in its frame.
         voxels: number along the longest side.
         tolerance: share of the photos that show a voxel which may have it outside their mask.
     """
@@ -110,49 +109,39 @@ def carve(
     x_in_box = box.low + (index + 0.5) * size
     centres = box.to_object(x_in_box).astype(np.float32)
     alive = np.flatnonzero(height_of(x_in_box) > 0)
-    misses = np.zeros(len(centres), dtype=np.int16)
-    shown = np.zeros(len(centres), dtype=np.int16)
-    for k, (frame, mask) in enumerate(zip(frames, masks)):
-        rotation, shift = frame.cam_from_object[:, :3], frame.cam_from_object[:, 3]
-        projection = (frame.intrinsics @ np.column_stack([rotation, shift])).astype(np.float32)
-        p = centres[alive] @ projection[:, :3].T + projection[:, 3]
-        height, width = mask.shape
-        depth = np.maximum(p[:, 2], 1e-6)
-        u, v = np.clip(p[:, :2].T / depth, -1, 1e6).astype(np.int32)
-        inside = (p[:, 2] > 0) & (p[:, 0] >= 0) & (u < width) & (p[:, 1] >= 0) & (v < height)
-        hit = np.zeros(len(alive), dtype=bool)
-        hit[inside] = mask[v[inside], u[inside]]
-        shown[alive] += inside
-        misses[alive] += inside & ~hit
-        # Whatever already has more misses than all photos together could excuse needs no further look.
-        if k % 4 == 3:
-            alive = alive[misses[alive] <= tolerance * len(frames)]
+    shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
+    for start in range(0, len(silhouettes), BATCH):
+        counts = count_silhouettes(centres[alive], silhouettes[start : start + BATCH])
+        shown[alive] += counts[0]
+        missed[alive] += counts[1]
+        # A voxel outside more masks than all photos together could excuse is decided.
+        alive = alive[missed[alive] <= tolerance * len(silhouettes)]
     occupied = np.zeros(len(centres), dtype=bool)
-    occupied[alive] = (shown[alive] >= max(2, len(frames) // 4)) & (misses[alive] <= tolerance * shown[alive])
+    enough = shown[alive] >= max(2, len(silhouettes) // 4)
+    occupied[alive] = enough & (missed[alive] <= tolerance * shown[alive])
     grid = occupied.reshape(shape)
     shell = grid & ~ndimage.binary_erosion(grid)
     return Hull(centres[shell.ravel()].astype(np.float64), float(size), float(grid.mean()))
 
 
-def silhouette(hull: Hull, frame: Frame) -> Mask:
+def silhouette(hull: Hull, view: View) -> Mask:
     """The hull as the photo sees it, (H, W)."""
-    height, width = frame.image.shape[:2]
-    drawn = np.zeros((height, width), dtype=np.uint8)
+    drawn = np.zeros((view.height, view.width), dtype=np.uint8)
     if len(hull.shell) == 0:
         return drawn.astype(bool)
-    pixels, depth = frame.project(hull.shell)
+    pixels, depth = view.project(hull.shell)
     front = depth > 1e-6
     u, v = np.floor(pixels[front]).astype(int).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     drawn[v[inside], u[inside]] = 255
-    side = hull.voxel * frame.intrinsics[0, 0] / float(np.median(depth[front]))
+    side = hull.voxel * view.intrinsics[0, 0] / float(np.median(depth[front]))
     # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
     reach = 2 * int(np.ceil(0.75 * side)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel, borderValue=0) > 0
 
 
-def agreement(a: Mask, b: Mask) -> float:
+def mask_iou(a: Mask, b: Mask) -> float:
     """Intersection over union of two masks; 0 when both are empty."""
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0

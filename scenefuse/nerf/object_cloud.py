@@ -89,7 +89,7 @@ def make_object_cloud(
     depths, confidence, normals = _maps(stage, views, settings.min_confidence)
     rendered = max(int((depths > 0).sum()), 1)
     refined = refine_by_photos(views, poses, depths, refinement)
-    depths = np.where(refined.denied, 0, refined.depths)
+    depths = np.where(refined.inconsistent, 0, refined.depths)
     raw, diagonal = fuse_depths(views, poses, depths, confidence, normals, settings)
     if len(raw) < 100:
         raise StageError(
@@ -103,7 +103,7 @@ def make_object_cloud(
     content = {
         "points": quantity(len(cleaned), "1"),
         "refined_share": quantity(float(refined.moved.sum() / rendered), "1"),
-        "inconsistent_share": quantity(float(refined.denied.sum() / rendered), "1"),
+        "inconsistent_share": quantity(float(refined.inconsistent.sum() / rendered), "1"),
         "points_before_thinning": quantity(len(raw), "1"),
         "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
         "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),

@@ -69,7 +69,7 @@ def train_nerf(
     photos = read_json(steps / "photos.json")
     exact = {"mask_band_px": 0} if value(photos, "masks_exact") else {}
     chosen = wanted["nerf"] | wanted["nerf_alone"] | exact
-    refinement = build(RefinementSettings, wanted["matching"])
+    refinement = RefinementSettings()
     train_object_nerf(
         cameras=cameras,
         masks=mattes,
@@ -115,7 +115,7 @@ def train_nerf(
             "nerf": nerf,
             "cloud": cloud,
             "no_cloud_because": quantity(refused, ""),
-            "settings": quantity(chosen | {"matching": wanted["matching"], "cloud": wanted["cloud"]}, ""),
+            "settings": quantity(chosen | {"cloud": wanted["cloud"]}, ""),
             "seed": quantity(seed, ""),
             "seconds": quantity(round(time.perf_counter() - start, 1), "s"),
         },

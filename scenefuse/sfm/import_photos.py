@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.masks.supplied import mask_files, matte_of
+from scenefuse.io.mask_files import mask_files, matte_of
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.sfm.undistort import UndistortSettings

@@ -100,7 +100,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
 
     def nerf(number: int, prior: int, previous: Path | None) -> None:
-        settings = own["nerf"] | own["matching"] | own[f"stage{number}"]
+        settings = own["nerf"] | own[f"stage{number}"]
         train_object_nerf(
             **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
             report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
@@ -127,7 +127,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
         make_object_cloud(
             **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
             cameras_report=folder / "undistorted.json", cloud=folder / "object.ply", report=folder / "object.json",
-            refinement=build(RefinementSettings, own["cloud"] | own["matching"]),
+            refinement=build(RefinementSettings, own["cloud"]),
             settings=build(CloudSettings, own["cloud"]),
         )  # fmt: skip
     now = os.times()

@@ -63,7 +63,7 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         return {"stage": folder / name, "report": folder / f"{name}.json"}
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
-        own = settings["nerf"] | settings["matching"] | settings[name]
+        own = settings["nerf"] | settings[name]
         train_object_nerf(
             **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
             field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
@@ -77,7 +77,7 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         settings=build(FeedbackSettings, settings["stage3"]),
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
-    own = settings["cloud"] | settings["matching"]
+    own = settings["cloud"]
     make_object_cloud(
         **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
         cloud=folder / "object.ply", report=folder / "object.json",

@@ -73,7 +73,7 @@ def one(
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
-            own = settings["nerf"] | settings["matching"] | variant.nerf | {"epochs": epochs}
+            own = settings["nerf"] | variant.nerf | {"epochs": epochs}
             train_object_nerf(
                 **inputs, **common, prior=prior if variant.prior else None, previous=previous,
                 stage=work / f"stage{stage}", report=work / f"stage{stage}.json",
@@ -94,7 +94,7 @@ def one(
         if not variant.long:
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if variant.long else "stage4")
-        seconds, fusing = time.monotonic() - start, settings["cloud"] | settings["matching"]
+        seconds, fusing = time.monotonic() - start, settings["cloud"]
         depth = depth_results([work / "stage2", last], truth, photos)
         return {
             "depth_2_pct": 100 * value(depth, "stage2_depth_error"),

@@ -237,11 +237,7 @@ def mask_options(wildcards):
         "supplied": row.get("masks") or None,
         "prompts": None if row.get("masks") else row.get("prompts") or None,
     }
-    return flags(
-        {k: v for k, v in settings.items() if k != "sam2_package"}
-        | own
-        | ({"method": "supplied"} if row.get("masks") else {})
-    )
+    return flags(settings | own | ({"method": "supplied"} if row.get("masks") else {}))
 
 
 def variant_options(part):

@@ -5,7 +5,7 @@
 #           results/objects/{object}/object.ply, object.json                the cloud
 
 
-NERF = config["object"]["nerf"] | config["object"]["matching"]
+NERF = config["object"]["nerf"]
 
 
 rule train_object_nerf:
@@ -107,7 +107,7 @@ rule make_object_cloud:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["object"]["cloud"] | config["object"]["matching"]),
+        options=flags(config["object"]["cloud"]),
         seed=config["seed"],
         script=script("nerf/make_object_cloud.py"),
         code=code("nerf/make_object_cloud.py"),
