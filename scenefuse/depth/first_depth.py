@@ -11,14 +11,23 @@ from torch.nn import functional
 
 from scenefuse.depth.inputs import PhotoTensors
 from scenefuse.depth.networks import depth_from_disparity, disparity_from_depth
-from scenefuse.depth.self_supervision import plane_sweep, points_in_cam
+from scenefuse.depth.self_supervision import points_in_cam, warp
+from scenefuse.mvs.matcher import Matcher
+from scenefuse.workspace import View
 
 # Side of the matching windows at full and at half size: small, because the cut photos are small.
 WINDOW_PX = 5
 COARSE_WINDOW_PX = 3
 # Single pixels that matched elsewhere are left out by a median.
 MEDIAN_PX = 5
-SWEEP_SOURCES = 4
+# Photos that a photo is matched with, and of these the ones that count: others may not see the place.
+SWEEP_SOURCES, BEST_SOURCES = 4, 2
+# Windows this small hold little contrast: with more of it, what the matcher allows for flat windows does not outweigh
+# theirs. For the same reason the slow changes of brightness are kept.
+CONTRAST = np.float32(4.0)
+# Masks are widened by this window's radius before a depth may be outside them.
+HULL_PX = 5
+WHOLE = (slice(None), slice(None))
 # Finer hypotheses tried at full size on each side of the one found at half size.
 FINE_STEPS = 3
 # Matching score at which sweep and SfM points count the same.
@@ -116,26 +125,15 @@ def _best_hypothesis(
 ) -> tuple[Tensor, Tensor]:
     """Disparity with the best score among (D, h, w) equidistant hypotheses, to a fraction of a step, and its score."""
     chosen = photos.sources[index][:SWEEP_SOURCES]
-    image, sources, silhouettes = (
-        photos.images[index : index + 1].mean(1, keepdim=True),
-        photos.images[chosen].mean(1, keepdim=True),
-        functional.max_pool2d(photos.masks[chosen], 5, 1, 2),
-    )
-    of_cut, of_sources = photos.intrinsics[index : index + 1].clone(), photos.intrinsics[chosen].clone()
-    of_cut[:, 0, 2] -= cut[1].start
-    of_cut[:, 1, 2] -= cut[0].start
-    image = image[:, :, cut[0], cut[1]]
-    if shrink > 1:
-        image, sources, silhouettes = (
-            functional.avg_pool2d(x, shrink, ceil_mode=True, count_include_pad=False)
-            for x in (image, sources, silhouettes)
-        )
-        of_cut[:, :2] /= shrink
-        of_sources[:, :2] /= shrink
+    reference = _gray(photos, index, cut, shrink)
+    sources = [_gray(photos, int(source), WHOLE, shrink) for source in chosen]
     depths = depth_from_disparity(hypotheses.clamp(0.0, 1.0), photos.near, photos.far)
-    moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
     window = WINDOW_PX if shrink == 1 else COARSE_WINDOW_PX
-    scores = plane_sweep(image, sources, depths, moves, of_cut, of_sources, silhouettes, window)
+    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, high_pass_px=0)
+    scores = matcher.score((1.0 / depths).contiguous())
+    moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
+    outside = _outside_silhouettes(photos.masks[chosen], depths, moves, reference, sources)
+    scores = torch.where(outside, torch.full_like(scores, -1.0), scores)
     best = scores.argmax(0)[None]
     last = len(hypotheses) - 1
     before, here, after = (scores.gather(0, (best + step).clamp(0, last))[0] for step in (-1, 0, 1))
@@ -143,3 +141,39 @@ def _best_hypothesis(
     found = hypotheses.gather(0, best)[0] + shift * (hypotheses[1] - hypotheses[0])
     smooth = cv2.medianBlur(found.cpu().numpy().astype(np.float32), MEDIAN_PX)
     return torch.from_numpy(smooth).to(found.device), here.clamp(0.0, 1.0)
+
+
+def _gray(photos: PhotoTensors, index: int, cut: tuple[slice, slice], shrink: int) -> View:
+    """A cut of a photo in grey, smaller by a whole number, in more contrast (CONTRAST)."""
+    pixels = _smaller(photos.images[index].mean(0)[cut][None, None], shrink)[0, 0]
+    intrinsics = photos.intrinsics[index].double().cpu().numpy().copy()
+    intrinsics[:2, 2] -= [cut[1].start or 0, cut[0].start or 0]
+    intrinsics[:2] /= shrink
+    pose = np.linalg.inv(photos.object_from_cam[index].double().cpu().numpy())
+    height, width = pixels.shape
+    return View(str(index), intrinsics, pose, width, height, CONTRAST * pixels.cpu().numpy())
+
+
+def _outside_silhouettes(masks: Tensor, depths: Tensor, moves: Tensor, reference: View, sources: list[View]) -> Tensor:
+    """(D, h, w), True for the (D, h, w) depths of the reference that lie off the object in two of its sources.
+
+    Such a depth is outside the visual hull; a single mask may be wrong.
+    """
+    count, size = len(sources), (sources[0].height, sources[0].width)
+    shrink = round(masks.shape[2] / size[0])
+    silhouettes = _smaller(functional.max_pool2d(masks, HULL_PX, 1, HULL_PX // 2), shrink)
+    of_reference, *of_sources = (
+        torch.as_tensor(v.intrinsics, dtype=depths.dtype, device=depths.device) for v in (reference, *sources)
+    )
+    of_all, outside = torch.stack(of_sources), []
+    for depth in depths:
+        hull, seen = warp(
+            silhouettes, depth.expand(count, 1, *depth.shape), moves, of_reference.expand(count, 3, 3), of_all
+        )
+        outside.append(((hull < 0.5) & seen).sum((0, 1)) >= min(2, count))
+    return torch.stack(outside)
+
+
+def _smaller(maps: Tensor, shrink: int) -> Tensor:
+    """(B, C, H, W) maps averaged over squares; a rest at the border counts as one."""
+    return functional.avg_pool2d(maps, shrink, ceil_mode=True, count_include_pad=False) if shrink > 1 else maps

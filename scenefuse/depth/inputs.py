@@ -17,6 +17,8 @@ BEST_ANGLE_DEG = 15.0
 CHECK_EVERY = 10
 # A point belongs to the object when this share of the photos that observe it have it in their mask.
 SHARE_IN_MASKS = 0.7
+# Points nearer than this, in object units, are behind the camera or in it.
+MIN_DEPTH = 1e-6
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def photo_tensors(views: Views, sources: int, device: torch.device) -> PhotoTens
     if (~views.held_out).sum() < 3:
         raise StageError(
             f"only {(~views.held_out).sum()} photos with a mask can be trained on; depth needs at least 3: "
-            "take more photos around the object, or lower hold_out_every"
+            "take more photos around the object, or set object.hold_out_every to 0"
         )
     seen = _points_on_object(views)
     on_object = np.unique(np.concatenate([ids for ids, _ in seen]))
@@ -113,17 +115,14 @@ def _points_on_object(views: Views) -> list[tuple[NDArray[np.int64], NDArray[np.
 def _observed(views: Views, index: int) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
     """Indices of the SfM points that photo `index` observes on the object, and their column, row and depth."""
     ids = views.tracks[index]
-    pose = views.object_from_cam[index]
-    points = (views.sparse[ids] - pose[:3, 3]) @ pose[:3, :3]
-    in_front = points[:, 2] > 1e-6
-    ids, points = ids[in_front], points[in_front]
-    pixels = points @ views.intrinsics[index].T
-    pixels = pixels[:, :2] / pixels[:, 2:]
+    pixels, depths = views.view(index).project(views.sparse[ids])
+    in_front = depths > MIN_DEPTH
+    ids, pixels, depths = ids[in_front], pixels[in_front], depths[in_front]
     height, width = views.masks.shape[1:]
     column, row = np.floor(pixels).astype(int).T
     keep = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     keep[keep] = views.masks[index][row[keep], column[keep]]
-    return ids[keep], np.column_stack([pixels, points[:, 2]])[keep].astype(np.float32)
+    return ids[keep], np.column_stack([pixels, depths])[keep].astype(np.float32)
 
 
 def _choose_sources(views: Views, seen: list[NDArray[np.int64]], count: int) -> NDArray[np.int64]:

@@ -255,13 +255,13 @@ def _losses(
     unmoved = scale.unmoved[chosen][:, columns]
     photometric, counts = _reprojection(scale, chosen, sources, depth, moves, unmoved)
     small, one = small_photos(photos), sources[:, :1]
-    guess = networks.pose(small[chosen], small[one[:, 0]])[:, None]
-    error, seen = _reprojection(scale, chosen, one, depth.detach(), guess, None)
+    found = networks.pose(small[chosen], small[one[:, 0]])[:, None]
+    error, seen = _reprojection(scale, chosen, one, depth.detach(), found, None)
     return {
         "photometric": masked_mean(photometric, counts),
         "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
         "target": _against_target(depth, supervision, chosen, photos.near),
-        "pose": masked_mean(error, seen) + pose_error(guess[:, 0], moves[:, 0], networks.pose.unit),
+        "pose": masked_mean(error, seen) + pose_error(found[:, 0], moves[:, 0], networks.pose.unit),
         "depth": depth,
     }
 

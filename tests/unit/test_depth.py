@@ -176,6 +176,15 @@ def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
     assert np.median(error) < 0.005
 
 
+def test_the_plane_sweep_alone_is_near_the_truth():
+    views, truth = plane_views(width=128, height=96)
+    photos = photo_tensors(views, 4, torch.device("cpu"))
+    swept = (network_inputs(photos, 24).channels[:, -2:-1] + 1) / 2
+    depth = depth_from_disparity(swept, photos.near, photos.far).numpy()[:, 0]
+    error = np.abs(depth - truth)[views.masks] / photos.diagonal
+    assert np.median(error) < 0.003
+
+
 RECIPE = Recipe(epochs=4, warmup_epochs=1, batch_photos=4, coarse_share=0.3)
 
 
