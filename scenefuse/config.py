@@ -16,7 +16,7 @@ from typing import Any, Literal
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
-from scenefuse.depth.train_depth import DepthSettings
+from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.registration import MetricSettings
@@ -154,7 +154,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
-    "object.stage1": [PoseSource(), DepthSettings()],
+    "object.stage1": [PoseSource(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [Schedule()],

@@ -138,7 +138,7 @@ def _clear(out: Path) -> None:
 
 def _nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int, exact: bool) -> NerfSettings:
     """Settings and options together; where masks are exact, no band around their edges is left out."""
-    built = build(NerfSettings, wanted["nerf"] | wanted["matching"] | {"epochs": epochs})
+    built = build(NerfSettings, wanted["nerf"] | {"epochs": epochs})
     recipe = replace(options.recipe, mask_band_px=0) if exact else options.recipe
     return replace(built, recipe=recipe, losses=options.losses, maps=options.maps)
 

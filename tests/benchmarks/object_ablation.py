@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import torch
 
-from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
+from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
@@ -80,7 +80,8 @@ def one(
         if variant.feedback and variant.prior and not variant.long:
             prior = work / "stage3"
             refine_depth(
-                **inputs, **common, previous=folder / "stage1", rendered=work / "stage2", stage=prior,
+                workspace=folder / "undistorted", masks=masks, **common, stage=prior,
+                earlier=EarlierStages(previous=folder / "stage1", rendered=work / "stage2"),
                 report=work / "stage3.json", settings=build(FeedbackSettings, settings["stage3"]),
             )  # fmt: skip
         if not variant.long:
