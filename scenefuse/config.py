@@ -16,14 +16,13 @@ from typing import Any, Literal
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
-from scenefuse.depth.train_depth import DepthSettings
+from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
@@ -78,22 +77,6 @@ class PoseSource:
 
     pose_source: Literal["sfm", "network"] = setting("sfm")
     """Whose poses the training stages use; with `network` those that the photos and a depth network give."""
-
-
-@dataclass(frozen=True)
-class EpochSettings:
-    """Length of a stage."""
-
-    epochs: int = setting(20, least=0)
-    """Epochs of this stage."""
-
-
-@dataclass(frozen=True)
-class DeviceSettings:
-    """Where the NeRF trains."""
-
-    device: Literal["auto", "cpu", "cuda"] = setting("auto")
-    """`auto` takes CUDA where it is."""
 
 
 @dataclass(frozen=True)
@@ -171,11 +154,11 @@ SECTIONS: dict[str, list[Any]] = {
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
-    "object.stage1": [PoseSource(), DepthSettings()],
-    "object.stage2": [EpochSettings()],
+    "object.stage1": [PoseSource(), DepthTrainingSettings()],
+    "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
-    "object.stage4": [EpochSettings()],
-    "object.nerf": [DeviceSettings(), NerfSettings(), FieldSettings(), Schedule(), LossWeights()],
+    "object.stage4": [Schedule()],
+    "object.nerf": [NerfSettings(), FieldSettings(), Schedule()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
@@ -189,7 +172,7 @@ SECTIONS: dict[str, list[Any]] = {
     "evaluation.object": [ObjectEvaluation()],
 }
 # Set by another section, or by the workflow.
-ELSEWHERE = {("object.nerf", "epochs")}
+ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
 
 
 def schema() -> dict[str, Any]:
