@@ -4,7 +4,8 @@ Snakemake sees neither an edited library module nor an upgraded package, and it 
 one that it knew. A fingerprint of code changes when code that a stage can reach changes, and not when comments,
 docstrings, formatting or file dates do.
 
-What a module holds is remembered between runs by the SHA-256 of its source: a second to work out, nothing to look up.
+What a module holds is remembered between runs by the SHA-256 of its source, in ~/.cache/scenefuse: it takes a second to
+work out for all modules, and nothing to look up.
 """
 
 import ast
@@ -30,8 +31,9 @@ DISTRIBUTIONS = {
     "yaml": ("pyyaml",),
 }
 IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
-REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scenefuse/modules.json"
+REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
 MOST_REMEMBERED = 5000
+OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered
 # A file of a user up to this size is read whole; of a larger one only size and date are looked at.
 LARGEST_READ_BYTES = 200_000
 
@@ -83,7 +85,7 @@ def _state(path: Path) -> str:
 @functools.cache
 def _module(path: Path, root: Path) -> _Module:
     source = path.read_text(encoding="utf-8")
-    known, key = _remembered(), hashlib.sha256(source.encode()).hexdigest()
+    known, key = _remembered(), hashlib.sha256(OWN_SOURCE + source.encode()).hexdigest()
     if key not in known:
         known[key] = _digest(_normalised(source, path))
     names = set(_imports(source, path, root))
@@ -116,7 +118,7 @@ def _remembered() -> dict[str, str]:
 
 
 def _remember(known: dict[str, str], before: int) -> None:
-    if len(known) > before:
+    if len(known) > before and REMEMBERED.is_absolute():
         with contextlib.suppress(OSError), atomic_file(REMEMBERED) as temporary:
             temporary.write_text(json.dumps(dict(list(known.items())[-MOST_REMEMBERED:])))
 

@@ -63,8 +63,12 @@ def house() -> Model:
         box((-5.75, 0.5, -0.3), (-5.0, 3.1, 1.55), t.LOGS),
         tube((4.4, 3.95, -0.3), (4.4, 3.95, 1.15), 0.42, t.WOOD, 18),
     ]
-    z = ridge - rise * 4.15 + 0.2
-    landmarks = {
+    return Model(parts, (-21.0, 9.0, 21.0), _house_landmarks(ridge, ridge - rise * 4.15 + 0.2), 8.0)
+
+
+def _house_landmarks(ridge: float, z: float) -> dict[str, tuple[float, float, float]]:
+    """Corners that a person would click; the eaves' tops lie at height `z`."""
+    return {
         "eave_south_west": (-5.6, -4.15, z),
         "eave_south_east": (5.6, -4.15, z),
         "eave_north_east": (5.6, 4.15, z),
@@ -81,7 +85,6 @@ def house() -> Model:
         "porch_east": (4.3, -5.35, 0.02),
         "logs": (-5.75, 3.1, 0.02),
     }
-    return Model(parts, (-21.0, 9.0, 21.0), landmarks, 8.0)
 
 
 def balloon() -> Model:
