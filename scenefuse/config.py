@@ -30,8 +30,9 @@ from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.crop.crop_scene import CropSettings
-from scenefuse.registration.fine import FineSettings
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
+from scenefuse.registration.verify import FineSettings
 from scenefuse.sfm.features import FeatureSettings, MatchSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
@@ -145,25 +146,6 @@ class VariantSettings:
 
 
 @dataclass(frozen=True)
-class CropMode:
-    """How the crop finds the object."""
-
-    mode: Literal["fiducials", "masks", "none"] = setting("fiducials")
-    """Fiducials; masks, by whose votes the scene's points are picked (used for objects without fiducials in any case);
-    or none, which keeps the whole scene."""
-
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """How the scale is estimated."""
-
-    method: Literal["rms", "prior", "none"] = setting("prior")
-    """Rms, prior or none."""
-    width_log: float = setting(0.5, least=0)
-    """Half width of the prior, natural logarithm of the scale; used by `prior` only."""
-
-
-@dataclass(frozen=True)
 class FusionMode:
     """How the object is added."""
 
@@ -220,7 +202,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
-    "registration.crop": [CropMode(), CropSettings()],
+    "registration.crop": [CropSettings()],
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],

@@ -8,10 +8,10 @@ import numpy as np
 import pycolmap
 import pytest
 from planted import plant
+from scenefuse.registration.crop.ground import fit_ground
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud, crop_scene
-from scenefuse.registration.crop.ground import fit_ground
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
 from scenefuse.registration.crop.vote import count, read_silhouettes, vote
 from scenefuse.stage import StageError, quantity, read_json, value, write_json

@@ -5,20 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from planted import errors, plant
+from scenefuse.registration.evidence import Alignment, Evidence
+from scenefuse.registration.features import match, ransac_similarities
+from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
+from scenefuse.registration.upright import upright_hypotheses
 from scipy.spatial.transform import Rotation
 
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
-from scenefuse.registration.evidence import Alignment, Evidence
-from scenefuse.registration.features import match, ransac_similarities
 from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely, scale_ledger
 from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
-from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
 from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
-from scenefuse.registration.upright import upright_hypotheses
 from scenefuse.registration.verify import tilt_deg
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
