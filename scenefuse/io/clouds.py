@@ -138,7 +138,10 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
-    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are."""
+    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are.
+
+    PLY allows no spaces in a field's name: they become underscores.
+    """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
@@ -146,7 +149,8 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
         columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
     # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
     columns |= {
-        name: v.astype(np.float64) if v.dtype in (np.int64, np.uint64) else v for name, v in cloud.fields.items()
+        "_".join(name.split()): v.astype(np.float64) if v.dtype in (np.int64, np.uint64) else v
+        for name, v in cloud.fields.items()
     }
     vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
