@@ -29,7 +29,7 @@ from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.crop.crop_scene import CropSettings
+from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
 from scenefuse.registration.verify import FineSettings

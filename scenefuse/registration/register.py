@@ -12,7 +12,8 @@ from scenefuse.io.formats import las_crs
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop.crop_scene import MIN_POINTS, CropSettings, crop_marked
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.crop.crop_scene import MIN_POINTS, crop_marked
 from scenefuse.registration.fine import pose_quantities
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.picture import draw_alignment

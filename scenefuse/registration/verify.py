@@ -1,5 +1,6 @@
 """May a pose be used? Turned copies of it, the margin to the best rival, and the gate (method R12)."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -113,15 +114,8 @@ def decide(
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    problems = [_free_space_violation(best)]
-    if decided_by == "geometry":
-        problems += [
-            _poor_score(best, margin, settings),
-            _scale_at_edge(best, problem),
-            _uncertain(uncertainty, free_axis, problem.scene.diagonal, settings),
-        ]
-    problems.append(_tilted(best, problem))
-    reason = next((text for text in problems if text is not None), None)
+    of_clouds = _reasons_of_clouds(best, margin, free_axis, uncertainty, problem, settings)
+    reason = next(_reasons(best, of_clouds if decided_by == "geometry" else (), problem), None)
     words = {
         "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
         "both": f"shared photos and clouds agree, F-score {best.score.f_score:.2f}",
@@ -146,62 +140,55 @@ def _rivals(
     return rivals, free_axis
 
 
-def _free_space_violation(best: Hypothesis) -> str | None:
-    violation = best.score.free_space_violation
-    if violation is None or violation <= MAX_FREE_SPACE_VIOLATION:
-        return None
-    return (
-        f"{violation:.0%} of the object would lie in free space, where the scene's photos measured surfaces behind it;"
-        f" {MAX_FREE_SPACE_VIOLATION:.0%} are allowed"
-    )
+def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:
+    """Why a pose may not be used, the first of which is told; free space and gravity count whatever decided on it."""
+    violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.evidence.ups)
+    if violation is not None and violation > MAX_FREE_SPACE_VIOLATION:
+        yield (
+            f"{violation:.0%} of the object would lie in free space, where the scene's photos measured surfaces behind"
+            f" it; {MAX_FREE_SPACE_VIOLATION:.0%} are allowed"
+        )
+    yield from of_clouds
+    if tilt is not None and tilt > MAX_TILT_DEG:
+        yield f"the object would lean by {tilt:.1f} degrees, more than {MAX_TILT_DEG:.1f}"
 
 
-def _poor_score(best: Hypothesis, margin: float, settings: FineSettings) -> str | None:
-    score = best.score
-    if score.f_score < settings.min_f_score:
-        return f"the two-way F-score is {score.f_score:.2f}, below {settings.min_f_score:.2f}"
-    if score.recall < MIN_RECALL:
-        return f"the object explains only {score.recall:.2f} of the scene crop, below {MIN_RECALL:.2f}"
-    if score.color is not None and score.color < MIN_COLOR:
-        return f"the colours agree by {score.color:.2f} only, below {MIN_COLOR:.2f}"
+def _reasons_of_clouds(
+    best: Hypothesis,
+    margin: float,
+    free_axis: Array | None,
+    uncertainty: Uncertainty | None,
+    problem: Problem,
+    settings: FineSettings,
+) -> Iterator[str]:
+    """Why a pose that no photos support may not be used."""
+    found, scales = best.score, problem.scales
+    if found.f_score < settings.min_f_score:
+        yield f"the two-way F-score is {found.f_score:.2f}, below {settings.min_f_score:.2f}"
+    if found.recall < MIN_RECALL:
+        yield f"the object explains only {found.recall:.2f} of the scene crop, below {MIN_RECALL:.2f}"
+    if found.color is not None and found.color < MIN_COLOR:
+        yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
     if margin < settings.min_margin:
-        return f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"
-    return None
-
-
-def _scale_at_edge(best: Hypothesis, problem: Problem) -> str | None:
-    scales = problem.scales
-    if not scales.at_edge(best.pose.scale):
-        return None
-    return (
-        f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
-        f" {np.exp(scales.width):.2f}; widen the prior"
-    )
-
-
-def _uncertain(
-    uncertainty: Uncertainty | None, free_axis: Array | None, diagonal: float, settings: FineSettings
-) -> str | None:
+        yield f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"
+    if scales.at_edge(best.pose.scale):
+        yield (
+            f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
+            f" {np.exp(scales.width):.2f}; widen the prior"
+        )
     if uncertainty is None:
-        return "too little of the object meets the scene to tell how certain the pose is"
+        yield "too little of the object meets the scene to tell how certain the pose is"
+        return
     scale, most = uncertainty.scale_sd_log, settings.max_scale_sd_log
     if scale > most:
-        return f"the scale is uncertain by {scale:.1%}, more than {most:.1%}"
+        yield f"the scale is uncertain by {scale:.1%}, more than {most:.1%}"
     turns_freely = free_axis is not None and abs(free_axis @ uncertainty.rotation_axis) > 0.9
     angle, most = uncertainty.rotation_sd_deg, settings.max_rotation_sd_deg
     if angle > most and not turns_freely:
-        return f"the rotation is uncertain by {angle:.1f} degrees, more than {most:.1f}"
-    shift, most = uncertainty.translation_sd / diagonal, settings.max_translation_sd_fraction
+        yield f"the rotation is uncertain by {angle:.1f} degrees, more than {most:.1f}"
+    shift, most = uncertainty.translation_sd / problem.scene.diagonal, settings.max_translation_sd_fraction
     if shift > most:
-        return f"the position is uncertain by {shift:.1%} of the diagonal, more than {most:.1%}"
-    return None
-
-
-def _tilted(best: Hypothesis, problem: Problem) -> str | None:
-    tilt = tilt_deg(best.pose, problem.evidence.ups)
-    if tilt is None or tilt <= MAX_TILT_DEG:
-        return None
-    return f"the object would lean by {tilt:.1f} degrees, more than {MAX_TILT_DEG:.1f}"
+        yield f"the position is uncertain by {shift:.1%} of the diagonal, more than {most:.1%}"
 
 
 def rotation_axis(rotation: Array) -> Array:

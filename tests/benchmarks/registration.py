@@ -17,7 +17,7 @@ from support.planted import SHAPES, Trial, errors, plant
 
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud
+from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.paper import paper_coarse, paper_fine
 from scenefuse.registration.problem import Evidence, Problem

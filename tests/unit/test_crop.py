@@ -10,7 +10,8 @@ import pytest
 from support.planted import plant
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.registration.crop.crop_scene import CropInputs, CropSettings, crop_cloud, crop_scene
+from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
 from scenefuse.registration.crop.vote import count, read_masked_views, vote
 from scenefuse.sfm.ground import fit_ground
@@ -51,7 +52,7 @@ def test_parts_far_from_every_fiducial_are_kept_and_that_is_said(monkeypatch):
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     low, high = trial.scene.points.min(0), trial.scene.points.max(0)
     far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
-    monkeypatch.setattr("scenefuse.registration.crop.crop_scene.MIN_PART", 1.1)
+    monkeypatch.setattr("scenefuse.registration.crop.crop_cloud.MIN_PART", 1.1)
     cut = crop_cloud(trial.scene, far, Z, SETTINGS)
     assert cut.keep.all() and "no part in the box lies near a fiducial" in cut.notes[1]
 
