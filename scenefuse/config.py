@@ -28,9 +28,10 @@ from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.crop.crop_scene import CropSettings
-from scenefuse.registration.fine import FineSettings
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
+from scenefuse.registration.verify import FineSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
@@ -85,25 +86,6 @@ class VariantSettings:
 
     variants: tuple[str, ...] = setting(("full", "paper", "clouds_only", "no_scale", "no_crop"))
     """Registration variants that run, of those in workflow/variants.yaml; `full` is fused and has to be among them."""
-
-
-@dataclass(frozen=True)
-class CropMode:
-    """How the crop finds the object."""
-
-    mode: Literal["fiducials", "masks", "none"] = setting("fiducials")
-    """Fiducials; masks, by whose votes the scene's points are picked (used for objects without fiducials in any case);
-    or none, which keeps the whole scene."""
-
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """How the scale is estimated."""
-
-    method: Literal["rms", "prior", "none"] = setting("prior")
-    """Rms, prior or none."""
-    width_log: float = setting(0.5, least=0)
-    """Half width of the prior, natural logarithm of the scale; used by `prior` only."""
 
 
 @dataclass(frozen=True)
@@ -162,7 +144,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
-    "registration.crop": [CropMode(), CropSettings()],
+    "registration.crop": [CropSettings()],
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],

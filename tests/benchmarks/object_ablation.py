@@ -61,7 +61,6 @@ def one(
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         masks = folder / "masks" if variant.masks else white(folder / "masks", work / "masks")
-        inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": masks}
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
