@@ -18,6 +18,8 @@ from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.make_masks import MaskSettings
+from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
+from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
 from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
 from scenefuse.mvs.photo_refinement import RefinementSettings
@@ -163,32 +165,6 @@ class ScaleSettings:
     """Half width of the prior, natural logarithm of the scale; used by `prior` only."""
 
 
-@dataclass(frozen=True)
-class FusionMode:
-    """How the object is added."""
-
-    mode: Literal["fill", "append", "replace"] = setting("fill")
-    """Fill, append or replace."""
-
-
-@dataclass(frozen=True)
-class SceneEvaluation:
-    """Evaluation of a scene."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
-
-
-@dataclass(frozen=True)
-class ObjectEvaluation:
-    """Evaluation of an object."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
-    max_photos: int = setting(8, least=1)
-    """Photos whose depth maps are judged, spread evenly."""
-
-
 SECTIONS: dict[str, list[Any]] = {
     "": [RunSettings()],
     "demo.flight": [FlightSettings()],
@@ -224,10 +200,10 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
-    "fusion": [FusionMode(), FusionSettings()],
+    "fusion": [FusionSettings()],
     "metrics": [MetricSettings()],
-    "evaluation.scene": [SceneEvaluation()],
-    "evaluation.object": [ObjectEvaluation()],
+    "evaluation.scene": [SceneEvaluationSettings()],
+    "evaluation.object": [ObjectEvaluationSettings()],
 }
 # Set by another section, or by the workflow.
 ELSEWHERE = {("object.nerf", "epochs")}

@@ -12,6 +12,7 @@ from typing import Any
 
 import pandas as pd
 
+from scenefuse.logs import JobRecords, why_unfinished
 from scenefuse.report.values import Fields, find, load, number, unit_of
 
 # What each step leaves, in the order in which the steps run.
@@ -51,7 +52,8 @@ class Collected:
         variants: variant -> quantities of its registration, `fine.scale` for instance.
         fusion: quantities of the fusion.
         missing: the first file that should be there and is not, or "".
-        reason: the last error in its logs, when something is missing.
+        failed: why a job of it failed, when something is missing; "" when nothing failed.
+        failed_variants: variant -> why its own jobs failed.
     """
 
     name: str
@@ -59,7 +61,8 @@ class Collected:
     variants: dict[str, Fields]
     fusion: Fields
     missing: str
-    reason: str
+    failed: str
+    failed_variants: dict[str, str]
 
 
 def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
@@ -137,7 +140,7 @@ def runtime_table(benchmarks: Path) -> pd.DataFrame:
     return table
 
 
-def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
+def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, errors against truth."""
     rows = []
     for name, fields in scenes.items():
@@ -156,7 +159,7 @@ def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
             "completed_by": None if added is None else ", ".join(added) or "none",
         }
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
-        row["error"] = None if find(fields, "dense.points") is not None else last_error(logs, name)
+        row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(name, jobs))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -186,21 +189,9 @@ def objects_table(objects: list[Collected]) -> pd.DataFrame:
         for name in ("precision", "completeness", "f_score"):
             row[f"{name}_1pct"] = number_in(fields, f"truth.cloud_{name}_1pct")
         row["missing"] = item.missing or None
-        row["error"] = item.reason or None
+        row["error"] = why_missing(item.failed) if item.missing else None
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def last_error(logs: Path, name: str) -> str:
-    """The last error line in the newest log of a scene or object that holds one; '' when there is none."""
-    named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(name)}($|[^A-Za-z0-9_])")
-    found = [p for p in logs.rglob("*.log") if named.search(p.relative_to(logs).with_suffix("").as_posix())]
-    for path in sorted(found, key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True):
-        lines = path.read_text(errors="replace").splitlines()
-        errors = [line.strip() for line in lines if re.match(r"\s*(error:|Killed|[\w.]*(Error|Exception)\b)", line)]
-        if errors:
-            return f"{errors[-1].removeprefix('error: ')} [{path.relative_to(logs).as_posix()}]"
-    return ""
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -225,13 +216,13 @@ def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
     return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
 
 
-def collect(folder: Path, variants: list[str], logs: Path, scene: str = "", scene_gap: str = "") -> Collected:
+def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = "", scene_gap: str = "") -> Collected:
     """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
 
     Args:
         folder: the object's results.
         variants: registration variants, the one that is fused first.
-        logs: folder of the rules' logs.
+        jobs: where the rules' logs and benchmarks are.
         scene: name of the scene that the object lies in.
         scene_gap: the first file that this scene lacks, or "".
     """
@@ -245,27 +236,41 @@ def collect(folder: Path, variants: list[str], logs: Path, scene: str = "", scen
     if not gap:
         there, gap = unbroken(folder, ("alignment.json",))
         stages |= read_fields(folder, there)
-    per_variant: dict[str, Fields] = {variant: {} for variant in variants}
+    per_variant, gaps = ({variant: {} for variant in variants}, {}) if gap else _collect_variants(folder, variants)
     fusion: Fields = {}
-    for variant in [] if gap else variants:
-        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
-        per_variant[variant] = read_fields(folder / "registration" / variant, there)
-        gap = gap or (lacking and f"registration/{variant}/{lacking}")
     if "fine.status" in per_variant[variants[0]]:
-        there, lacking = unbroken(folder, ("fusion.json", "metrics.json"))
+        there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
         fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
         per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
-        gap = gap or lacking
-    judged = fusion and all("fine.status" in fields for fields in per_variant.values())
-    truth = read_fields(folder, ["truth.json"]) if judged else {}
-    for variant in variants:
-        prefix = f"truth.variants.{variant}."
-        per_variant[variant] |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
-    stages |= {key: item for key, item in truth.items() if not key.startswith("truth.variants.")}
+    failed_variants = {variant: why_unfinished(f"{folder.name}-{variant}", jobs) for variant in gaps}
+    gap = next(iter(gaps.values()), gap)
+    if fusion and all("fine.status" in per_variant[variant] for variant in variants):
+        truth = read_fields(folder, ["truth.json"])
+        stages |= {key: item for key, item in truth.items() if not key.startswith("truth.variants.")}
+        _add_truth(per_variant, truth)
     unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
     per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
-    reason = (last_error(logs, who) or "no error in its logs; it has not run yet") if gap else ""
-    return Collected(folder.name, stages, per_variant, fusion, gap, reason)
+    failed = why_unfinished(who, jobs) if gap else ""
+    return Collected(folder.name, stages, per_variant, fusion, gap, failed, failed_variants)
+
+
+def _collect_variants(folder: Path, variants: list[str]) -> tuple[dict[str, Fields], dict[str, str]]:
+    """The quantities of each variant's registration, and the first file that each incomplete one lacks."""
+    found: dict[str, Fields] = {}
+    gaps: dict[str, str] = {}
+    for variant in variants:
+        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
+        found[variant] = read_fields(folder / "registration" / variant, there)
+        if lacking:
+            gaps[variant] = f"registration/{variant}/{lacking}"
+    return found, gaps
+
+
+def _add_truth(per_variant: dict[str, Fields], truth: Fields) -> None:
+    """Add each variant's errors against truth to its quantities, as `truth.NAME`."""
+    for variant, fields in per_variant.items():
+        prefix = f"truth.variants.{variant}."
+        fields |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
 
 
 def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
@@ -289,15 +294,25 @@ def _in_unit(fields: Fields, unit: str) -> Fields:
 
 
 def status_of(item: Collected, variant: str) -> str:
-    """registered, unregistered, or missing."""
-    return str(find(item.variants.get(variant, {}), "fine.status") or "missing")
+    """registered, unregistered, ungated (a pose that nothing checked), failed (an error), or missing (did not run)."""
+    decided = find(item.variants.get(variant, {}), "fine.status")
+    return str(decided) if decided else "failed" if _failure(item, variant) else "missing"
 
 
 def reason_of(item: Collected, variant: str) -> str | None:
     """Why an object is not registered in a variant."""
-    if status_of(item, variant) == "missing":
-        return item.reason or None
-    return find(item.variants[variant], "fine.reason") or None
+    if find(item.variants.get(variant, {}), "fine.status"):
+        return find(item.variants[variant], "fine.reason") or None
+    return why_missing(_failure(item, variant))
+
+
+def why_missing(failed: str) -> str:
+    """Why something is missing, for the reader: the failure, or that nothing of it ran."""
+    return failed or "no error in its logs; it has not run yet"
+
+
+def _failure(item: Collected, variant: str) -> str:
+    return item.failed_variants.get(variant, item.failed)
 
 
 def _six(item: float | int | None) -> str | None:

@@ -115,6 +115,8 @@ def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
     parts = [f'<h2 id="{escape(folder.name)}">{escape(folder.name)}{badge}</h2>']
     if reason not in ("-", ""):
         parts.append(f"<p>{escape(reason)}</p>")
+    if status in ("failed", "missing"):
+        return "\n".join([*parts, "<p>No figures: the object's stages did not finish.</p>"])
     figure_folder = folder / "figures"
     before, after = figure_folder / "before.png", figure_folder / "after.png"
     if before.is_file() and after.is_file():
@@ -125,8 +127,6 @@ def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
         )
     figures = [(figure_folder / f"{name}.png", caption) for name, caption in _OBJECT_FIGURES.items()]
     parts += [_picture(path, caption) for path, caption in figures if path.is_file()]
-    if len(parts) < 3 and not any(path.is_file() for path, _ in figures):
-        parts.append("<p>No figures: the object's stages did not finish.</p>")
     return "\n".join(parts)
 
 

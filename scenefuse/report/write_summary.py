@@ -7,6 +7,7 @@ from typing import Any
 
 import pandas as pd
 
+from scenefuse.logs import JobRecords
 from scenefuse.report.tables import (
     REGISTRATION,
     Collected,
@@ -25,6 +26,7 @@ from scenefuse.report.tables import (
     scenes_table,
     status_of,
     truth_numbers,
+    why_missing,
 )
 from scenefuse.report.values import Fields, find, number, unit_of
 from scenefuse.stage import StageError, atomic_file
@@ -43,8 +45,7 @@ def write_summary(
     objects: list[Path],
     scene_of: list[str],
     variants: list[str],
-    benchmarks: Path,
-    logs: Path,
+    jobs: JobRecords,
     summary: Path,
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
@@ -59,8 +60,7 @@ def write_summary(
         objects: result folders of the objects (results/objects/{object}); they need not exist.
         scene_of: name of the scene that each object lies in.
         variants: registration variants, the one that is fused first.
-        benchmarks: folder of Snakemake's benchmark files, {rule}/{job}.tsv.
-        logs: folder of the rules' logs, {rule}/{job}.log.
+        jobs: folders of the rules' logs and benchmarks; see JobRecords.
         summary: output folder; other files in it are left alone.
 
     Raises:
@@ -72,20 +72,20 @@ def write_summary(
         raise StageError(f"{len(objects)} objects but {len(scene_of)} scenes are given; name the scene of each object")
     parts = {folder.name: collect_scene(folder, chunks) for folder in scenes}
     found = [
-        collect(folder, variants, logs, scene, parts[scene][1] if scene in parts else "")
+        collect(folder, variants, jobs, scene, parts[scene][1] if scene in parts else "")
         for folder, scene in zip(objects, scene_of)
     ]
     scene_fields = {name: fields for name, (fields, _) in parts.items()}
     for folder in scenes:
-        decisions = [status_of(item, variants[0]) for item, scene in zip(found, scene_of) if scene == folder.name]
-        if not parts[folder.name][1] and "missing" not in decisions:
-            scene_fields[folder.name] |= read_fields(folder, ["completed.json"])
+        of_scene = [item for item, scene in zip(found, scene_of) if scene == folder.name]
+        if not parts[folder.name][1]:
+            scene_fields[folder.name] |= _completed(folder, of_scene, variants[0])
     tables = {
         "registration": registration_table(found, variants),
         "completion": completion_table(found, variants[0]),
         "ablation": ablation_table(found, variants),
-        "runtime": runtime_table(benchmarks),
-        "scenes": scenes_table(scene_fields, logs),
+        "runtime": runtime_table(jobs.benchmarks),
+        "scenes": scenes_table(scene_fields, jobs),
         "objects": objects_table(found),
     }
     for name, table in tables.items():
@@ -97,6 +97,13 @@ def write_summary(
     print(text, flush=True)
 
 
+def _completed(folder: Path, objects: list[Collected], variant: str) -> Fields:
+    """What the completed scene holds; nothing when it is from before an object failed, or was mended."""
+    fields = read_fields(folder, ["completed.json"])
+    undecided = {item.name for item in objects if status_of(item, variant) in ("failed", "missing")}
+    return fields if set(find(fields, "completed.failed") or {}) == undecided else {}
+
+
 def _text(
     scenes: dict[str, Fields], objects: list[Collected], variants: list[str], tables: dict[str, pd.DataFrame]
 ) -> str:
@@ -104,10 +111,12 @@ def _text(
     lines: list[str] = []
     for name, row in zip(scenes, records(tables["scenes"])):
         lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
-    done = sum(status_of(item, variants[0]) == "registered" for item in objects)
+    statuses = [status_of(item, variants[0]) for item in objects]
+    done = f"{statuses.count('registered')} of {len(objects)} objects registered and fused"
+    done += f", {statuses.count('ungated')} fused without a check of the pose" if "ungated" in statuses else ""
     for item, row in zip(objects, records(tables["objects"])):
         lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
-    lines += _heading(f"{done} of {len(objects)} objects registered and fused") + _runtime_lines(tables["runtime"])
+    lines += _heading(done) + _runtime_lines(tables["runtime"])
     return "\n".join(lines) + "\n"
 
 
@@ -128,7 +137,7 @@ def _pairs(cells: list[tuple[str, Any, str]]) -> str:
 def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     unit = find(fields, "georeference.length_unit") or "scene units"
     if find(fields, "dense.points") is None:
-        return _line("missing", f"no dense cloud: {row.get('error') or 'no error in its logs; it has not run yet'}")
+        return _line("missing", f"no dense cloud: {row['error']}")
     cameras = f"{number(row['registered'])} of {number(row['photos'])} photos registered"
     lines = _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
@@ -141,19 +150,20 @@ def _completed_lines(fields: Fields) -> list[str]:
     """The scene with all its objects: what was added and what is not in it."""
     added = find(fields, "completed.added_points")
     if added is None:
-        return _line("completed", "not written: an object has no decision, or the log of complete_scene says why")
+        why = "not written with all decisions; look at the log of complete_scene, or run with --keep-going"
+        return _line("completed", why)
     parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
     parts += [f"{name} adds {count}" for name, count in added.items()]
     parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
+    parts += [f"without {name}, which failed" for name in find(fields, "completed.failed") or {}]
     return _line("completed", ", ".join(parts))
 
 
 def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> list[str]:
-    lines = _line("missing", item.missing) + _line("because", item.reason)
+    lines = _line("missing", item.missing) + _line("because", why_missing(item.failed) if item.missing else "")
     fields = item.variants[variants[0]]
-    lines += _line(
-        "reason", "" if status_of(item, variants[0]) == "missing" else str(reason_of(item, variants[0]) or "")
-    )
+    if find(fields, "fine.status"):
+        lines += _line("reason", str(reason_of(item, variants[0]) or ""))
     if row["registered"] is not None and row["registered"] == row["registered"]:
         cameras = f"{number(row['registered'])} of {number(row['frames'])} frames registered"
         lines += _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
@@ -213,11 +223,13 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     used = [k for k in shown if any(row[k] is not None for row in rows.values())]
     if not used:
         return []
-    decisions = {"registered": "ok", "unregistered": "refused"}
+    words = {"registered": "ok", "unregistered": "refused"}
     lines = [f"{'registration':<20}" + "".join(f"{shown[k]:>8}" for k in used)]
     for variant, row in rows.items():
-        decision = decisions.get(status_of(item, variant), "missing")
-        lines.append(f"  {variant[:10]:<10}{decision:>8}" + "".join(f"{_three(row[k]):>8}" for k in used))
+        status = status_of(item, variant)
+        lines.append(
+            f"  {variant[:10]:<10}{words.get(status, status):>8}" + "".join(f"{_three(row[k]):>8}" for k in used)
+        )
     rmse = number_in(item.variants[variants[0]], *REGISTRATION["inlier_rmse"])
     if rmse is not None:
         cells_of = [(k.replace("_", " "), k) for k in ("inlier_rmse", "threshold")]
@@ -226,7 +238,7 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
         lines += _line("", f"{variants[0]}: {_pairs(units)}")
     decided = find(item.variants[variants[0]], "fine.decided_by")
     if decided is not None:
-        lines += _line("pose", _DECIDED[decided] + _spread(item.variants[variants[0]]))
+        lines += _line("pose", _DECIDED.get(decided, decided) + _spread(item.variants[variants[0]]))
     return [line.rstrip() for line in lines]
 
 
