@@ -15,32 +15,36 @@ class JobRecords:
     """Folder of the benchmark files, {rule}/{job}.tsv; a job that ends well leaves one newer than its log."""
 
 
-def why_unfinished(name: str, jobs: JobRecords) -> str:
-    """Why the jobs of a scene or object stopped: the last error line of the newest unfinished log that holds one.
+def why_unfinished(jobs: JobRecords, *names: str) -> str:
+    """Why jobs stopped: the last error line of the newest unfinished log that holds one.
 
     A job that was killed, out of memory for instance, leaves a log without an error. "" when every job that left a
     log has finished.
+
+    Args:
+        jobs: where the records are.
+        names: of logs, {name}.log, in the order in which they are searched; after them, all whose name holds the first.
     """
-    named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(name)}($|[^A-Za-z0-9_])")
-    logs = (p for p in jobs.logs.rglob("*.log") if named.search(_job(p, jobs).as_posix()))
-    unfinished = sorted((p for p in logs if not _finished(p, jobs)), key=lambda p: (p.stat().st_mtime, p.as_posix()))
-    for path in reversed(unfinished):
-        lines = path.read_text(errors="replace").splitlines()
-        errors = [line.strip() for line in lines if re.match(r"\s*(error:|[\w.]*(Error|Exception)\b)", line)]
-        if errors:
-            return f"{errors[-1].removeprefix('error: ')} [{path.relative_to(jobs.logs).as_posix()}]"
-    if not unfinished:
-        return ""
-    log = unfinished[-1].relative_to(jobs.logs).as_posix()
-    return f"its job ended without a message: perhaps killed (out of memory?); see the log [{log}]"
+    named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(names[0])}($|[^A-Za-z0-9_])")
+    logs = [p for p in jobs.logs.rglob("*.log") if not _finished(p, jobs)]
+    logs.sort(key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True)
+    exact = ([p for p in logs if p.stem == name] for name in names)
+    for found in (*exact, [p for p in logs if named.search(p.relative_to(jobs.logs).as_posix())]):
+        if found:
+            return next(filter(None, (_error(p, jobs) for p in found)), "") or (
+                "its job ended without a message: perhaps killed (out of memory?);"
+                f" see the log [{found[0].relative_to(jobs.logs).as_posix()}]"
+            )
+    return ""
 
 
-def _job(log: Path, jobs: JobRecords) -> Path:
-    """{rule}/{job} of a log."""
-    return log.relative_to(jobs.logs).with_suffix("")
+def _error(log: Path, jobs: JobRecords) -> str:
+    """The last error line of a log, and the log; "" without one."""
+    lines = log.read_text(errors="replace").splitlines()
+    errors = [line.strip() for line in lines if re.match(r"\s*(error:|[\w.]*(Error|Exception)\b)", line)]
+    return f"{errors[-1].removeprefix('error: ')} [{log.relative_to(jobs.logs).as_posix()}]" if errors else ""
 
 
 def _finished(log: Path, jobs: JobRecords) -> bool:
-    job = _job(log, jobs)
-    benchmark = jobs.benchmarks / job.parent / f"{job.name}.tsv"
+    benchmark = jobs.benchmarks / log.relative_to(jobs.logs).with_suffix(".tsv")
     return benchmark.is_file() and benchmark.stat().st_mtime >= log.stat().st_mtime

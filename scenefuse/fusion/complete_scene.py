@@ -56,7 +56,9 @@ def complete_scene(
     start = time.perf_counter()
     before = read_cloud(inputs.scene)
     whole = _from(with_provenance(before, FROM_SCENE), FROM_SCENE)
-    failed = {name: _why_failed(name, inputs.jobs) for name in inputs.failed}
+    failed = {
+        name: why_unfinished(inputs.jobs, name, f"{name}-full") or "its jobs did not run" for name in inputs.failed
+    }
     unregistered: dict[str, str] = {}
     for number, folder in enumerate(inputs.objects, 1):
         if folder.name in failed:
@@ -77,11 +79,6 @@ def complete_scene(
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)
-
-
-def _why_failed(name: str, jobs: JobRecords) -> str:
-    """The failure of its registration, else of anything before."""
-    return why_unfinished(f"{name}-full", jobs) or why_unfinished(name, jobs) or "its jobs did not run"
 
 
 def _report(

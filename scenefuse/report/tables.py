@@ -159,7 +159,7 @@ def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
             "completed_by": None if added is None else ", ".join(added) or "none",
         }
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
-        row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(name, jobs))
+        row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(jobs, name))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -242,7 +242,7 @@ def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = ""
         there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
         fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
         per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
-    failed_variants = {variant: why_unfinished(f"{folder.name}-{variant}", jobs) for variant in gaps}
+    failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}") for variant in gaps}
     gap = next(iter(gaps.values()), gap)
     if fusion and all("fine.status" in per_variant[variant] for variant in variants):
         truth = read_fields(folder, ["truth.json"])
@@ -250,7 +250,7 @@ def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = ""
         _add_truth(per_variant, truth)
     unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
     per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
-    failed = why_unfinished(who, jobs) if gap else ""
+    failed = why_unfinished(jobs, who) if gap else ""
     return Collected(folder.name, stages, per_variant, fusion, gap, failed, failed_variants)
 
 

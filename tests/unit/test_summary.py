@@ -212,9 +212,9 @@ def test_the_last_error_is_that_of_the_named_object(tmp_path):
     (tmp_path / "fine").mkdir()
     (tmp_path / "fine/house-full.log").write_text("error: one\nerror: two\ndone\n")
     (tmp_path / "fine/greenhouse-full.log").write_text("ValueError: other\n")
-    assert why_unfinished("house", jobs) == "two [fine/house-full.log]"
-    assert why_unfinished("greenhouse", jobs) == "ValueError: other [fine/greenhouse-full.log]"
-    assert why_unfinished("hous", jobs) == ""
+    assert why_unfinished(jobs, "house") == "two [fine/house-full.log]"
+    assert why_unfinished(jobs, "greenhouse") == "ValueError: other [fine/greenhouse-full.log]"
+    assert why_unfinished(jobs, "hous") == ""
 
 
 def test_a_killed_job_is_named_with_its_log(results):
