@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from scenefuse.demo.cameras import Cameras
 from scenefuse.stage import StageError, quantity, threads
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.workspace import View, posed_images, read_model, view_of
+from scenefuse.workspace import View, read_views
 
 # The posed photos of a model that the truth knows, by name, each with the place of its true camera.
 Posed = list[tuple[View, int]]
@@ -88,15 +88,14 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Array:
 
 def read_posed(model: Path, truth: Cameras) -> Posed:
     """The posed photos of a COLMAP model whose names the truth knows; StageError when fewer than three are."""
-    reconstruction = read_model(model)
     place = {Path(name).stem: k for k, name in enumerate(truth.names)}
-    images = [image for image in posed_images(reconstruction) if Path(image.name).stem in place]
-    if len(images) < 3:
+    posed = [(view, place[Path(view.name).stem]) for view in read_views(model) if Path(view.name).stem in place]
+    if len(posed) < 3:
         raise StageError(
-            f"only {len(images)} posed photos of {model} are known to the truth, three are needed; "
+            f"only {len(posed)} posed photos of {model} are known to the truth, three are needed; "
             "give the truth of the capture that the model was made from"
         )
-    return [(view_of(reconstruction, image), place[Path(image.name).stem]) for image in images]
+    return posed
 
 
 def fit_cameras(posed: Posed, truth: Cameras) -> CameraFit:

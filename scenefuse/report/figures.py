@@ -15,7 +15,7 @@ from scenefuse.report.sheets import Image, Sheet, add_axes, draw_sheet, new_figu
 from scenefuse.report.values import find, flatten, number
 from scenefuse.stage import StageError, atomic_directory, read_json, value
 from scenefuse.transforms import Array, Sim3, rotation_between
-from scenefuse.workspace import posed_images, read_model, view_of
+from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
@@ -119,11 +119,10 @@ def draw_scene(
         StageError: an input is missing.
     """
     cloud = read_cloud(dense)
-    model = read_model(georeferenced)
-    centres = np.array([view_of(model, image).centre for image in posed_images(model)]).reshape(-1, 3)
+    centres = np.array([view.centre for view in read_views(georeferenced)]).reshape(-1, 3)
     shown = [folder for folder in objects if folder.name not in failed]
     boxes = {f.name: _box_corners(read_cloud(f / "registration/full/crop.ply").points) for f in shown}
-    note = f"{len(cloud):,} points, {len(centres)} cameras (red), {len(boxes)} objects (boxes)"
+    note = f"{len(cloud):,} points, cameras (red): {len(centres)}, objects (boxes): {len(boxes)}"
     save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
 
 

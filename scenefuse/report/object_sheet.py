@@ -15,7 +15,7 @@ from scenefuse.report.sheets import Image, Sheet, draw_sheet
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3, rotation_between
-from scenefuse.workspace import read_workspace
+from scenefuse.workspace import read_views
 
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 
@@ -82,7 +82,7 @@ def _render_row(workspace: Path, stage: Path) -> tuple[list[Image | None], list[
 
 def upright(cloud: Cloud, workspace: Path) -> Cloud:
     """The object's cloud turned so that z points up, from the photos' horizontal axes."""
-    poses = [view.world_from_cam for view in read_workspace(workspace).views]
+    poses = [view.world_from_cam for view in read_views(workspace / "sparse")]
     up, _ = estimate_up(np.array([pose[:3, :3] for pose in poses]), np.array([pose[:3, 3] for pose in poses]))
     return cloud.transformed(Sim3(1.0, rotation_between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3)))
 

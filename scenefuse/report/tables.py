@@ -4,7 +4,6 @@ A run may be partial: a value that does not exist is empty, an object without re
 """
 
 import itertools
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -334,9 +333,8 @@ def plain(item: Any) -> Any:
 
 
 def _measure(key: str) -> tuple[str, str]:
-    """A completion key as (measure, column): `nue_null` and `null_nue` and `nue.null` are the null of `nue`."""
+    """A completion key as (measure, column): `nue_null` is the null of `nue`, `nue_scene` the scene's own."""
     for column in ("null", "scene"):
-        name = re.sub(rf"(^{column}[._]|[._]{column}(?=$|_)|[._]of_{column}$)", "", key)
-        if name != key and name:
-            return name, column
-    return key.removesuffix(".value"), "value"
+        if key.endswith(f"_{column}"):
+            return key.removesuffix(f"_{column}"), column
+    return key, "value"

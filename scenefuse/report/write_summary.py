@@ -138,12 +138,17 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     unit = find(fields, "georeference.length_unit") or "scene units"
     if find(fields, "dense.points") is None:
         return _line("missing", f"no dense cloud: {row['error']}")
-    cameras = f"{number(row['registered'])} of {number(row['photos'])} photos registered"
-    lines = _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
+    lines = _line("cameras", _cameras(row, "photos"))
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame))
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
     return lines + _completed_lines(fields) + _truth_lines(fields) + _remarks(fields)
+
+
+def _cameras(row: dict[str, Any], pictures: str) -> str:
+    """How many photos or frames are registered, and how well."""
+    error = _pairs([("reprojection error", row["reprojection_error_px"], "px")])
+    return f"{number(row['registered'])} of {number(row[pictures])} {pictures} registered" + (error and f", {error}")
 
 
 def _completed_lines(fields: Fields) -> list[str]:
@@ -165,8 +170,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
     if find(fields, "fine.status"):
         lines += _line("reason", str(reason_of(item, variants[0]) or ""))
     if row["registered"] is not None and row["registered"] == row["registered"]:
-        cameras = f"{number(row['registered'])} of {number(row['frames'])} frames registered"
-        lines += _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
+        lines += _line("cameras", _cameras(row, "frames"))
     lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
     for stage in (1, 2, 3, 4):
         names = {
@@ -195,7 +199,7 @@ _DECIDED = {
 
 
 def _alignment(fields: Fields) -> str:
-    """What the photos alone say of the object's place."""
+    """Where the features that the photos share put the object."""
     found, reason = find(fields, "alignment.found"), find(fields, "alignment.reason")
     if not found:
         return "" if found is None else f"not found: {reason}"
