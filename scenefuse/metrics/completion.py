@@ -85,7 +85,7 @@ def _measure(
 def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
     """Mean over `at` of lambda_0 / (lambda_0 + lambda_1 + lambda_2) of the cloud's points within `radius`, 0..1/3.
 
-    Neighbourhoods of fewer than four points say nothing and are left out; None when there is no other.
+    Neighbourhoods of fewer than four points have no variation and are left out; None when there is no other.
 
     Args:
         cloud: (N, 3) points that are neighbours.

@@ -17,8 +17,7 @@ _TABLES = {
     "objects": "Objects by themselves",
     "registration": "Registration",
     "completion": "Completion",
-    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
-    "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the crop.",
+    "ablation": "Ablation",
     "runtime": "Time and memory",
 }
 _NOTES = {
@@ -37,8 +36,9 @@ _NOTES = {
     "distance from the null says something. Surface variation: 0 smooth to 1/3. NUE: evenness of the density after "
     "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
     "cloud is denser. Primitive fitting: share of added points on planes, spheres or cylinders.",
-    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published "
-    "recipe, which checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the crop.",
+    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
+    "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the "
+    "crop.",
     "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
     "largest resident size of one job.",
 }
