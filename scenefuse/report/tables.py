@@ -241,7 +241,8 @@ def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = ""
         there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
         fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
         per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
-    failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}") for variant in gaps}
+    # A variant's own log, else one of the object as a whole.
+    failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}", folder.name) for variant in gaps}
     gap = next(iter(gaps.values()), gap)
     if fusion and all("fine.status" in per_variant[variant] for variant in variants):
         truth = read_fields(folder, ["truth.json"])
