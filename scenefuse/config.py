@@ -19,6 +19,8 @@ from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
+from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
+from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
 from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
@@ -88,32 +90,6 @@ class VariantSettings:
     """Registration variants that run, of those in workflow/variants.yaml; `full` is fused and has to be among them."""
 
 
-@dataclass(frozen=True)
-class FusionMode:
-    """How the object is added."""
-
-    mode: Literal["fill", "append", "replace"] = setting("fill")
-    """Fill, append or replace."""
-
-
-@dataclass(frozen=True)
-class SceneEvaluation:
-    """Evaluation of a scene."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
-
-
-@dataclass(frozen=True)
-class ObjectEvaluation:
-    """Evaluation of an object."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
-    max_photos: int = setting(8, least=1)
-    """Photos whose depth maps are judged, spread evenly."""
-
-
 SECTIONS: dict[str, list[Any]] = {
     "": [RunSettings()],
     "demo.flight": [FlightSettings()],
@@ -148,10 +124,10 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
-    "fusion": [FusionMode(), FusionSettings()],
+    "fusion": [FusionSettings()],
     "metrics": [MetricSettings()],
-    "evaluation.scene": [SceneEvaluation()],
-    "evaluation.object": [ObjectEvaluation()],
+    "evaluation.scene": [SceneEvaluationSettings()],
+    "evaluation.object": [ObjectEvaluationSettings()],
 }
 # Set by another section, or by the workflow.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
