@@ -174,7 +174,7 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
             )
         camera.rescale(width, height)
         target = camera if _straight(camera) else pycolmap.undistort_camera(options, camera)
-        cam_from_object = np.linalg.inv(photo.object_from_cam)
+        cam_from_object = np.asarray(np.linalg.inv(photo.object_from_cam), dtype=np.float64)
         intrinsics = np.asarray(target.calibration_matrix(), dtype=np.float64)
         view = View(photo.name, intrinsics, cam_from_object, target.width, target.height)
         pairs.append((camera, view))

@@ -150,8 +150,9 @@ def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], s
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
     missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
     raise StageError(
-        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} that "
-        f"min_registered_share requires; not registered: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}. "
+        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} "
+        f"that min_registered_share requires; not registered: "
+        f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}. "
         f"Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs "
         f"that were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower "
         f"min_registered_share"

@@ -89,7 +89,6 @@ rule extract_scene_features:
     params:
         options=flags(config["scene"]["features"]),
         script=script("sfm/extract_features.py"),
-        files=state_of(scene_photos),
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
@@ -194,7 +193,6 @@ rule map_scene_photos:
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
-        files=state_of(scene_photos),
         code=code("sfm/map_photos.py"),
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
@@ -281,7 +279,6 @@ rule undistort_scene_photos:
         upright=lambda wildcards, input: f"--georeference {input.report}",
         options=flags(config["scene"]["undistort"]),
         script=script("sfm/undistort_photos.py"),
-        files=state_of(scene_photos),
         code=code("sfm/undistort_photos.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
