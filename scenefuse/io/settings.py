@@ -5,7 +5,7 @@ import difflib
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_type_hints
 
 import jsonschema
 import yaml
@@ -80,7 +80,15 @@ def read_settings(mine: Path | None) -> dict[str, Any]:
 
 
 def build(settings: type[T], values: Mapping[str, Any]) -> T:
-    """A settings dataclass from the keys of its name in a section of the settings, the rest as shipped; lists become
-    tuples."""
-    names = {field.name for field in dataclasses.fields(settings)}  # type: ignore[arg-type]
-    return settings(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in names})
+    """A settings dataclass from the keys of its name in a section of the settings, the rest as shipped.
+
+    Lists become tuples; dataclasses inside it are built from the same keys, as a command line flattens them.
+    """
+    kinds = get_type_hints(settings)
+    own = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in kinds}
+    inner = {
+        name: build(kind, values)
+        for name, kind in kinds.items()
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+    }
+    return settings(**inner | own)

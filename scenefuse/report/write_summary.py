@@ -213,7 +213,7 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     used = [k for k in shown if any(row[k] is not None for row in rows.values())]
     if not used:
         return []
-    decisions = {"registered": "ok", "unregistered": "refused"}
+    decisions = {"registered": "ok", "unregistered": "refused", "ungated": "ungated"}
     lines = [f"{'registration':<20}" + "".join(f"{shown[k]:>8}" for k in used)]
     for variant, row in rows.items():
         decision = decisions.get(status_of(item, variant), "missing")
