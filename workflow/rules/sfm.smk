@@ -7,8 +7,6 @@
 #           .../sparse/, sparse.json                                        cameras and sparse points
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
-#
-# Folders of photos are ancient(): whether a photo has changed, the hashes in photos.json say.
 
 
 rule list_photos:
@@ -67,7 +65,7 @@ rule extract_frames:
 rule extract_scene_features:
     """SIFT features (paper 3.1)."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
         "results/scenes/{scene}/features.db",
@@ -93,7 +91,7 @@ rule extract_scene_features:
 
 use rule extract_scene_features as extract_object_features with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
         "results/objects/{object}/features.db",
@@ -168,7 +166,7 @@ use rule match_scene_features as match_object_features with:
 rule map_scene_photos:
     """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
     output:
@@ -198,7 +196,7 @@ rule map_scene_photos:
 
 use rule map_scene_photos as map_object_photos with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
     output:
@@ -253,7 +251,7 @@ rule georegister:
 rule undistort_scene_photos:
     """Undistort the photos into a COLMAP workspace."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/georeferenced",
         report="results/scenes/{scene}/georeference.json",
@@ -284,7 +282,7 @@ rule undistort_scene_photos:
 
 use rule undistort_scene_photos as undistort_object_photos with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         model="results/objects/{object}/sparse",
         report="results/objects/{object}/sparse.json",
