@@ -19,6 +19,8 @@ from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
+from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
+from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
 from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
@@ -28,9 +30,10 @@ from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.crop.crop_scene import CropSettings
-from scenefuse.registration.fine import FineSettings
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
+from scenefuse.registration.verify import FineSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
@@ -87,51 +90,6 @@ class VariantSettings:
     """Registration variants that run, of those in workflow/variants.yaml; `full` is fused and has to be among them."""
 
 
-@dataclass(frozen=True)
-class CropMode:
-    """How the crop finds the object."""
-
-    mode: Literal["fiducials", "masks", "none"] = setting("fiducials")
-    """Fiducials; masks, by whose votes the scene's points are picked (used for objects without fiducials in any case);
-    or none, which keeps the whole scene."""
-
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """How the scale is estimated."""
-
-    method: Literal["rms", "prior", "none"] = setting("prior")
-    """Rms, prior or none."""
-    width_log: float = setting(0.5, least=0)
-    """Half width of the prior, natural logarithm of the scale; used by `prior` only."""
-
-
-@dataclass(frozen=True)
-class FusionMode:
-    """How the object is added."""
-
-    mode: Literal["fill", "append", "replace"] = setting("fill")
-    """Fill, append or replace."""
-
-
-@dataclass(frozen=True)
-class SceneEvaluation:
-    """Evaluation of a scene."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
-
-
-@dataclass(frozen=True)
-class ObjectEvaluation:
-    """Evaluation of an object."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
-    max_photos: int = setting(8, least=1)
-    """Photos whose depth maps are judged, spread evenly."""
-
-
 SECTIONS: dict[str, list[Any]] = {
     "": [RunSettings()],
     "demo.flight": [FlightSettings()],
@@ -162,14 +120,14 @@ SECTIONS: dict[str, list[Any]] = {
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
-    "registration.crop": [CropMode(), CropSettings()],
+    "registration.crop": [CropSettings()],
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
-    "fusion": [FusionMode(), FusionSettings()],
+    "fusion": [FusionSettings()],
     "metrics": [MetricSettings()],
-    "evaluation.scene": [SceneEvaluation()],
-    "evaluation.object": [ObjectEvaluation()],
+    "evaluation.scene": [SceneEvaluationSettings()],
+    "evaluation.object": [ObjectEvaluationSettings()],
 }
 # Set by another section, or by the workflow.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}

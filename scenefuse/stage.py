@@ -130,7 +130,7 @@ def scratch_directory(path: Path) -> Iterator[Path]:
 def _remove_leftovers(folder: Path, start: str, suffix: str = "") -> None:
     """Remove temporary outputs of one destination: this process's own, and those that killed ones left behind."""
     pattern = re.compile(rf"{re.escape(start)}(\d+)" + (rf"{re.escape(suffix)}.*" if suffix else ""))
-    for name in os.listdir(folder):
+    for name in os.listdir(folder) if folder.is_dir() else ():
         found = pattern.fullmatch(name)
         if found and (int(found[1]) == os.getpid() or not _alive(int(found[1]))):
             left = folder / name

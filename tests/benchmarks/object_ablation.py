@@ -17,7 +17,7 @@ import torch
 from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
 from scenefuse.mvs.views import load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
@@ -61,7 +61,6 @@ def one(
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         masks = folder / "masks" if variant.masks else white(folder / "masks", work / "masks")
-        inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": masks}
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:

@@ -8,29 +8,29 @@ def variant_options(part):
 
 def crop_mode(wildcards):
     """How a variant crops; without fiducials, the object's masks mark it."""
-    mode = VARIANTS[wildcards.variant]["crop"]["mode"]
-    unmarked = not object_row(wildcards.object).get("fiducials")
-    return "masks" if mode == "fiducials" and unmarked else mode
+    marked = object_row(wildcards.object).get("fiducials")
+    return VARIANTS[wildcards.variant]["crop"]["mode"] if marked else "masks"
 
 
 def crop_marks(wildcards):
     """The files that mark an object in its scene: option of the crop -> path."""
-    mode, row = crop_mode(wildcards), object_row(wildcards.object)
-    if mode == "masks":
+    if VARIANTS[wildcards.variant]["crop"].get("whole_scene"):
+        return {}
+    if crop_mode(wildcards) == "masks":
         folder = f"results/objects/{wildcards.object}"
         return {
-            "alignment": f"{folder}/alignment.json",
-            "cameras": f"{folder}/undistorted",
+            "alignment_json": f"{folder}/alignment.json",
+            "workspace": f"{folder}/undistorted",
             "masks": f"{folder}/masks",
         }
-    return {"fiducials": row["fiducials"]} if mode == "fiducials" else {}
+    return {"fiducials": object_row(wildcards.object)["fiducials"]}
 
 
 def crop_inputs(wildcards):
     """The same, and what else says that one of them has changed."""
     marks = crop_marks(wildcards)
     return [*marks.values()] + [
-        f"{path}.json" for name, path in marks.items() if name in ("cameras", "masks")
+        f"{path}.json" for name, path in marks.items() if name in ("workspace", "masks")
     ]
 
 
