@@ -88,7 +88,7 @@ def _module(path: Path, root: Path) -> _Module:
     known, key = _remembered(), hashlib.sha256(OWN_SOURCE + source.encode()).hexdigest()
     if key not in known:
         known[key] = _digest(_normalised(source, path))
-    names = set(_imports(source, path, root))
+    names = set(imported_names(source, path, root))
     files: frozenset[Path] = frozenset().union(*(_files(name, root) for name in names))
     packages = {name.split(".")[0] for name in names if not _in_project(name.split(".")[0], root)}
     return _Module(known[key], files, frozenset(packages - sys.stdlib_module_names))
@@ -139,7 +139,7 @@ def _files(name: str, root: Path) -> frozenset[Path]:
     return frozenset(here).union(_files(".".join(parts[:-1]), root) if len(parts) > 1 else ())
 
 
-def _imports(source: str, module: Path, root: Path) -> Iterator[str]:
+def imported_names(source: str, module: Path, root: Path) -> Iterator[str]:
     """Absolute dotted names of everything a module may import, at any depth; names that are no modules do no harm."""
     for base, listed in IMPORT.findall(source):
         names = re.findall(r"(?:^|,)\s*([\w.]+)", re.sub(r"#[^\n]*|[()\\]", "", listed))

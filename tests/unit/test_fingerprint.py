@@ -1,8 +1,10 @@
+import ast
 import os
+from pathlib import Path
 
 import pytest
 
-from scenefuse.fingerprint import files_fingerprint, fingerprint, forget
+from scenefuse.fingerprint import files_fingerprint, fingerprint, forget, imported_names
 
 
 @pytest.fixture
@@ -109,3 +111,14 @@ def test_a_folder_goes_by_what_lies_in_it(tmp_path):
         forget()
         found.add(files_fingerprint((str(tmp_path / "truth"),)))
     assert len(found) == 2
+
+
+def test_no_import_of_the_library_is_overlooked():
+    root = Path(__file__).resolve().parents[2]
+    for module in sorted((root / "scenefuse").rglob("*.py")):
+        source = module.read_text()
+        nodes = list(ast.walk(ast.parse(source)))
+        names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+        for node in (node for node in nodes if isinstance(node, ast.ImportFrom)):
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+        assert names <= set(imported_names(source, module, root)), module
