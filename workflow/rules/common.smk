@@ -79,6 +79,11 @@ def objects_in(wildcards):
     return [name for name, row in OBJECTS.items() if row["scene"] == wildcards.scene]
 
 
+def object_folders(wildcards):
+    """The result folders of the objects of a scene."""
+    return [f"results/objects/{name}" for name in objects_in(wildcards)]
+
+
 def of_objects(path):
     """Input function: a file of every object of the scene."""
     return lambda wildcards: [

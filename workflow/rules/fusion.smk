@@ -5,11 +5,6 @@
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 
 
-def object_folders(wildcards):
-    """The result folders of the objects of a scene."""
-    return [f"results/objects/{name}" for name in objects_in(wildcards)]
-
-
 rule fuse_object:
     """Add the registered object to the scene; an unregistered one leaves the scene as it is (F1, F2)."""
     input:

@@ -147,35 +147,6 @@ rule write_report:
         " --title scenefuse --report {output} &> {log}"
 
 
-def held_up(rule):
-    """The jobs of a rule that have not run, because of what failed before them. An object that fails holds up those that
-    wait for all objects; under --keep-going they run at the end without it."""
-    jobs = set(workflow.dag.needrun_jobs()) - workflow.scheduler.failed
-    return [job for job in jobs if job.rule.name == rule]
-
-
-def run_anyway(job, options=""):
-    """Run a job whose inputs are not all there. Its outputs stay marked as incomplete: the next run makes them anew."""
-    workflow.persistence.started(job)
-    folders = {str(Path(file).parent) for file in (*job.log, job.benchmark)}
-    command = f"{job.shellcmd.removeprefix('exec ')}{options}"
-    # The benchmark says that the job has ended well.
-    shell(f"mkdir -p {' '.join(folders)}; {command} && touch {job.benchmark} || true")
-
-
-def without_the_failed(job):
-    """The option that names the objects that a job has to do without; None when the scene itself is missing."""
-    missing = [
-        Path(file).parts
-        for other, files in workflow.dag.dependencies[job].items()
-        if not workflow.dag.noneedrun_finished(other)
-        for file in files
-    ]
-    if any(parts[:2] != ("results", "objects") for parts in missing):
-        return None
-    return f" --failed {' '.join(sorted({parts[2] for parts in missing}))}"
-
-
 onerror:
     stopped = getattr(workflow.scheduler, "_user_kill", None)
     keep_going = workflow.execution_settings.keep_going and not stopped
