@@ -66,7 +66,7 @@ def make_masks(
     Prompts give an upright box; the sparse points in it and above the ground seed GrabCut in each photo, whose masks
     carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with all points and the box
     around them, and again with the hull's box where it disagrees. Supplied masks are undistorted, never changed. A
-    photo without a usable mask, or whose mask disagrees with the hull, is left out. What `keep` says is applied last.
+    photo without a usable mask, or whose mask disagrees with the hull, is left out. `keep` is applied last.
 
     Args:
         inputs: see MaskInputs.

@@ -18,12 +18,12 @@ GROUND_MARGIN = 0.02
 """A sparse point is the object's only this much above the ground, as a share of the box's diagonal: as the ground
 scatters."""
 LEAST_OWN = 10
-"""Sparse points on the object that supplied masks have to hold: fewer say nothing of its extent."""
+"""Sparse points on the object that supplied masks have to hold: fewer do not tell its extent."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What the sparse model and the prompts say about the object.
+    """Where the object is, by the sparse model and the prompts.
 
     Attributes:
         box: where it is.

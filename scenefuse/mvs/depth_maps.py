@@ -90,7 +90,7 @@ def _choose_backend(backend: str) -> tuple[str, str]:
 
 
 def _about(reference: Reference, coverage: float) -> dict[str, Any]:
-    """What the report says of one photo."""
+    """One photo in the report."""
     return {
         "sources": [view.name for view in reference.sources],
         "near": round(reference.near, 4),

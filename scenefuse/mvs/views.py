@@ -57,7 +57,7 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
         masks: folder of {name}.png, above 127 on the object.
         width_px: target width; photos are never enlarged.
         hold_out_every: every n-th photo (in name order) is held out, 0 holds out none; a file held_out.txt in
-            `cameras`, one name a line, says it instead.
+            `cameras`, one name a line, lists them instead.
 
     Raises:
         StageError: no photo has a mask, a photo or mask cannot be read, or sizes differ between photos.
