@@ -82,7 +82,6 @@ def make_masks(
     cv2.setNumThreads(threads())
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
-    _check_names(photos.views)
     made, target, weights = _make(inputs, photos, settings, seed)
     for name, reason in sorted(made.dropped.items()):
         print(f"{name} left out: {reason}", flush=True)
@@ -101,17 +100,6 @@ def make_masks(
     content = _report(made, target, len(photos.views), kept, settings)
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
     write_json(report, content | ({"weights": quantity(weights, "")} if weights else {}) | {"files": files})
-
-
-def _check_names(views: list[View]) -> None:
-    """StageError where two photos would share a mask."""
-    by_stem: dict[str, str] = {}
-    for view in views:
-        other = by_stem.setdefault(Path(view.name).stem, view.name)
-        if other != view.name:
-            raise StageError(
-                f"the photos {other} and {view.name} would share the mask {Path(view.name).stem}.png; rename one"
-            )
 
 
 def _make(inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int) -> tuple[ScoredMasks, Target, str]:

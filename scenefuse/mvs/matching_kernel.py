@@ -44,7 +44,7 @@ def _place(inverse, directions, move, y, width, height, place, part_x, part_y, i
 
 @njit(fastmath=_MATH, error_model="numpy")
 def _warp(flat, width, place, part_x, part_y, value):
-    """Bilinear samples of a photo flat (H * width,) into value (w,), at place, part_x and part_y as `_place` writes them."""
+    """Bilinear samples value (w,) of a photo flat (H * width,); place, part_x and part_y as `_place` writes them."""
     for x in range(len(place)):
         at = np.uint32(place[x])
         below = np.uint32(at + width)
