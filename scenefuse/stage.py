@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import sys
@@ -52,9 +53,12 @@ def run(function: Callable[..., Any]) -> None:
 
     A StageError or a full disk ends in one sentence on stderr and exit status 1; a number that the function returns is
     the exit status. SIGTERM and SIGINT unwind the stack, so that temporary outputs are removed; the process also gets
-    SIGTERM when its parent dies.
+    SIGTERM when its parent dies. A log of the workflow, which sets SCENEFUSE, begins with the command, to be pasted.
     """
     import tyro
+
+    if "SCENEFUSE" in os.environ:
+        print(shlex.join(["python", *sys.argv]), flush=True)
 
     _die_with_parent()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -126,7 +130,7 @@ def scratch_directory(path: Path) -> Iterator[Path]:
 def _remove_leftovers(folder: Path, start: str, suffix: str = "") -> None:
     """Remove temporary outputs of one destination: this process's own, and those that killed ones left behind."""
     pattern = re.compile(rf"{re.escape(start)}(\d+)" + (rf"{re.escape(suffix)}.*" if suffix else ""))
-    for name in os.listdir(folder):
+    for name in os.listdir(folder) if folder.is_dir() else ():
         found = pattern.fullmatch(name)
         if found and (int(found[1]) == os.getpid() or not _alive(int(found[1]))):
             left = folder / name

@@ -158,6 +158,12 @@ def read_workspace(folder: Path) -> Workspace:
     )
 
 
+def read_views(folder: Path) -> list[View]:
+    """The posed photos of a COLMAP model in name order; a lens's distortion is left out."""
+    model = read_model(folder)
+    return [view_of(model, image) for image in posed_images(model)]
+
+
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); StageError that names the folder when it cannot be read."""
     try:

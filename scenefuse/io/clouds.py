@@ -139,7 +139,10 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
-    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are."""
+    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are.
+
+    PLY allows no spaces in a field's name: they become underscores.
+    """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))

@@ -32,15 +32,24 @@ class Matcher:
     """
 
     def __init__(
-        self, reference: View, sources: list[View], best_sources: int, window_px: int, device: torch.device | str
+        self,
+        reference: View,
+        sources: list[View],
+        best_sources: int,
+        window_px: int,
+        device: torch.device | str,
+        high_pass_px: float = HIGH_PASS_PX,
     ) -> None:
-        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1."""
+        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
+
+        Small photos may keep their slow changes of brightness: `high_pass_px` 0.
+        """
         height, width = reference.height, reference.width
         self.window, self.best = window_px, min(best_sources, len(sources))
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
-        self.reference = torch.from_numpy(_high_pass(reference.pixels)).to(device)
+        self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
         self.mean = box(self.reference, self.window)
         self.variance = (box(self.reference**2, self.window) - self.mean**2).clamp(min=0)
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -52,7 +61,7 @@ class Matcher:
             directions = (to_grid @ turn @ rays).reshape(3, height, width)
             self.sources.append(
                 (
-                    torch.from_numpy(_high_pass(source.pixels))[None, None].to(device),
+                    torch.from_numpy(_high_pass(source.pixels, high_pass_px))[None, None].to(device),
                     torch.from_numpy(directions.astype(np.float32)).to(device),
                     torch.from_numpy((to_grid @ move).astype(np.float32)).to(device),
                 )
@@ -130,6 +139,6 @@ def box(values: Tensor, window: int) -> Tensor:
     return (sums[..., window:, :] - sums[..., :-window, :]) / window**2
 
 
-def _high_pass(gray: NDArray[np.float32]) -> NDArray[np.float32]:
-    """The photo (H, W) without its slow changes of brightness."""
-    return gray - cv2.GaussianBlur(gray, (0, 0), HIGH_PASS_PX)
+def _high_pass(gray: NDArray[np.float32], high_pass_px: float) -> NDArray[np.float32]:
+    """The photo (H, W) without its slow changes of brightness, or with 0 without its mean."""
+    return gray - (cv2.GaussianBlur(gray, (0, 0), high_pass_px) if high_pass_px else gray.mean())

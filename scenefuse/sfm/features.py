@@ -68,11 +68,11 @@ def extract_features(*, folder: Path, photos: Path, features: Path, settings: Fe
                 device=pycolmap.Device.cpu,
             )
         counts = _feature_counts(temporary)
-    missing = [p.name for p in listed if p.name not in counts]
-    if missing:
-        raise StageError(
-            f"COLMAP could not read {len(missing)} photos, {missing[0]} for one; save them again as JPEG or PNG"
-        )
+        missing = [p.name for p in listed if p.name not in counts]
+        if missing:
+            raise StageError(
+                f"COLMAP could not read {len(missing)} photos, {missing[0]} for one; save them again as JPEG or PNG"
+            )
     few = [name for name, count in counts.items() if count < FEW_FEATURES]
     if few:
         print(f"note: {len(few)} photos have fewer than {FEW_FEATURES} features, {few[0]} for one", flush=True)

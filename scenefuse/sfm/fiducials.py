@@ -24,7 +24,7 @@ class Clicks:
         path: the file they come from, for messages.
         points: N point names; a point appears once for each photo it was clicked in.
         photos: N photo names.
-        pixels: (N, 2) x and y in pixels of the original photo, pixel centres at +0.5.
+        pixels: (N, 2) x and y in pixels of the original photo as people see it, pixel centres at +0.5.
     """
 
     path: Path

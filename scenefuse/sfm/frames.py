@@ -154,5 +154,5 @@ def _write_frame(
         size = (settings.max_width_px, round(height * scale))
         frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
     name = f"frame_{index:06d}.jpg"
-    write_picture(output / name, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB), JPEG_QUALITY)
+    write_picture(output / name, np.ascontiguousarray(frame[..., ::-1], dtype=np.uint8), JPEG_QUALITY)
     return {name: {"frame": index, "width": width, "height": height, "sharpness": round(score, 3)}}

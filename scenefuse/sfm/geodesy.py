@@ -13,6 +13,10 @@ from scenefuse.transforms import Sim3, fit_sim3
 
 Array = NDArray[np.float64]
 
+# Of positions spread evenly, none is farther from the middle than twice the median distance. Only wild ones are farther
+# than this many.
+FAR = 10.0
+
 
 @dataclass(frozen=True)
 class LocalFrame:
@@ -83,18 +87,24 @@ class LocalFrame:
 def local_frame(positions: Array) -> LocalFrame:
     """The frame about the middle of (N, 3) WGS84 positions, rounded (about 1 m) so that it is easily written down.
 
-    The middle is the median, which a few wild positions do not move; altitudes of NaN take no part.
+    A few wild positions do not move it; altitudes of NaN take no part.
     """
     latitude, longitude, altitude = np.asarray(positions, dtype=np.float64).T
     # About the mean direction, longitudes on both sides of the antimeridian are neighbours.
-    mean = np.degrees(np.angle(np.exp(1j * np.radians(longitude)).sum()))
-    middle = mean + np.median((longitude - mean + 180.0) % 360.0 - 180.0)
+    mean = float(np.degrees(np.angle(np.exp(1j * np.radians(longitude)).sum())))
+    middle = mean + _middle((longitude - mean + 180.0) % 360.0 - 180.0)
     known = altitude[np.isfinite(altitude)]
     return LocalFrame(
-        round(float(np.median(latitude)), 5),
-        round(float((middle + 180.0) % 360.0 - 180.0), 5),
-        float(round(np.median(known))) if len(known) else 0.0,
+        round(_middle(latitude), 5),
+        round((middle + 180.0) % 360.0 - 180.0, 5),
+        float(round(_middle(known))) if len(known) else 0.0,
     )
+
+
+def _middle(values: Array) -> float:
+    """Mean of the values that are no farther from the median than `FAR` times the median distance."""
+    distance = np.abs(values - np.median(values))
+    return float(values[distance <= FAR * np.median(distance)].mean())
 
 
 def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | None:

@@ -9,7 +9,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.sfm.geodesy import LocalFrame, local_frame
+from scenefuse.sfm.geodesy import FAR, LocalFrame, local_frame
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import gps_positions, read_photos
 from scenefuse.stage import atomic_directory, quantity, setting, write_json
@@ -24,8 +24,6 @@ MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
 OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
-# Positions farther from the middle than this many median distances do not count for spread and width.
-FAR = 10.0
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 

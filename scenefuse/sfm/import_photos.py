@@ -11,13 +11,14 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.io.mask_files import mask_files, matte_of
 from scenefuse.io.pictures import write_picture
+from scenefuse.masks.supplied import mask_files, matte_of
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.photos import JPEG_QUALITY
 from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
 from scenefuse.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.transforms import Array
 from scenefuse.workspace import View, write_model
 
 Picture = NDArray[np.uint8]
@@ -174,8 +175,9 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
             )
         camera.rescale(width, height)
         target = camera if _straight(camera) else pycolmap.undistort_camera(options, camera)
-        cam_from_object = np.linalg.inv(photo.object_from_cam)
-        view = View(photo.name, target.calibration_matrix(), cam_from_object, target.width, target.height)
+        cam_from_object: Array = np.array(np.linalg.inv(photo.object_from_cam), dtype=np.float64)
+        intrinsics: Array = np.array(target.calibration_matrix(), dtype=np.float64)
+        view = View(photo.name, intrinsics, cam_from_object, target.width, target.height)
         pairs.append((camera, view))
     smallest: dict[tuple[int, int], tuple[int, int]] = {}
     for camera, view in pairs:

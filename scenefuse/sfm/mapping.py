@@ -149,12 +149,13 @@ def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], s
         return
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
     missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
+    some = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
     raise StageError(
-        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} asked for "
-        f"by min_registered_share; not registered: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}. "
-        f"Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs "
-        f"that were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower "
-        f"min_registered_share"
+        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} that"
+        f" min_registered_share requires; not registered: {some}."
+        " Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs that"
+        " were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower"
+        " min_registered_share"
     )
 
 

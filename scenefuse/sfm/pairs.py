@@ -57,7 +57,7 @@ def choose_pairs(photos: list[Photo], is_video: bool, settings: MatchSettings) -
     if kind == "auto":
         kind, reason = _automatic(photos, is_video, settings)
     if kind == "spatial" and not _gps_usable(photos):
-        kind, reason = "exhaustive", "spatial pairs were asked for, but too few photos have a useful GPS position"
+        kind, reason = "exhaustive", "pairs are set to spatial, but too few photos have a useful GPS position"
     if kind == "exhaustive":
         return kind, reason, list(combinations(names, 2))
     if kind == "spatial":

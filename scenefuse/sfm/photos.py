@@ -10,13 +10,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
-from PIL.ExifTags import IFD, Base
+from PIL.ExifTags import GPS, IFD, Base
 
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
 # Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
+# What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.
+KEPT_EXIF = {
+    IFD.Exif: (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.DateTimeOriginal),
+    IFD.GPSInfo: (GPS.GPSLatitudeRef, GPS.GPSLatitude, GPS.GPSLongitudeRef, GPS.GPSLongitude)
+    + (GPS.GPSAltitudeRef, GPS.GPSAltitude),
+}
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,7 @@ def _stood_upright(folder: Path, name: str, output: Path) -> Photo:
 
 
 def save_upright(source: Path, target: Path, max_width_px: int | None = None) -> tuple[int, int]:
-    """Write a photo as people see it, at most `max_width_px` wide; position, camera and exposure in its EXIF stay.
+    """Write a photo as people see it, at most `max_width_px` wide; position, camera and focal length in EXIF stay.
 
     Returns:
         Width and height of the upright photo before it was scaled.
@@ -112,19 +118,18 @@ def save_upright(source: Path, target: Path, max_width_px: int | None = None) ->
     with open(source, "rb") as file, Image.open(file) as image:
         before = image.getexif()
         exif = Image.Exif()
-        # Other tags of a TIFF say how its own pixels are stored.
-        exif.update({tag: before[tag] for tag in (Base.Make, Base.Model, Base.DateTime) if tag in before})
-        for block in (IFD.Exif, IFD.GPSInfo):
-            # What points into the old file would point nowhere in the new one.
-            pointers = (IFD.MakerNote, IFD.Interop)
-            if tags := {tag: entry for tag, entry in before.get_ifd(block).items() if tag not in pointers}:
+        exif.update({tag: before[tag] for tag in (Base.Make, Base.Model) if tag in before})
+        for block, wanted in KEPT_EXIF.items():
+            if tags := {tag: entry for tag, entry in before.get_ifd(block).items() if tag in wanted}:
                 exif[block] = tags
         upright = ImageOps.exif_transpose(image)
         size = upright.size
         if max_width_px is not None and upright.width > max_width_px:
             height = round(upright.height * max_width_px / upright.width)
             upright = upright.resize((max_width_px, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
-        coded = {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        coded: dict[str, Any] = (
+            {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        )
         upright.save(target, exif=exif.tobytes(), **coded)
     return size
 
@@ -139,16 +144,16 @@ def check_unchanged(folder: Path, photos: Iterable[Photo]) -> None:
     missing = [p.name for p in photos if not (folder / p.name).is_file()]
     if missing:
         raise StageError(
-            f"{len(missing)} photos are missing in {folder}, {missing[0]} for one; put them back, or list the photos"
-            " again"
+            f"{len(missing)} photos are missing in {folder}, {missing[0]} for one; put them back, or delete the"
+            " photos.json that lists them and run again"
         )
     with ThreadPoolExecutor(threads()) as pool:
         found = pool.map(lambda photo: sha256(folder / photo.name), photos)
         changed = [photo.name for photo, digest in zip(photos, found) if digest != photo.sha256]
     if changed:
         raise StageError(
-            f"{folder / changed[0]} is not the photo that was listed any more ({len(changed)} have changed); list the"
-            " photos again"
+            f"{folder / changed[0]} is not the photo that was listed any more ({len(changed)} have changed); delete the"
+            " photos.json that lists it and run again"
         )
 
 

@@ -108,7 +108,7 @@ def test_manifest_names_contents_and_ignores_snakemake(tmp_path):
     assert list(manifest(tmp_path)) == ["d/a"]
 
 
-def test_stage_error_is_one_sentence_and_a_signal_leaves_no_partial_output(tmp_path):
+def test_an_error_is_one_sentence_a_log_begins_with_the_command_and_a_signal_leaves_nothing(tmp_path):
     script = tmp_path / "stage.py"
     script.write_text(SCRIPT)
     out = tmp_path / "out"
@@ -116,8 +116,11 @@ def test_stage_error_is_one_sentence_and_a_signal_leaves_no_partial_output(tmp_p
     failed = subprocess.run([*command, "True"], capture_output=True, text=True)
     assert failed.returncode == 1
     assert failed.stderr == "error: the folder x is empty; give one with photos\n"
-    process = subprocess.Popen([*command, "False"], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    workflow = os.environ | {"SCENEFUSE": str(tmp_path)}
+    process = subprocess.Popen([*command, "False"], stdout=subprocess.PIPE, text=True, env=workflow)
+    assert process.stdout is not None
+    assert process.stdout.readline() == f"python {script} --out {out} --fail False\n"
+    assert process.stdout.readline() == "ready\n"
     time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 128 + signal.SIGTERM

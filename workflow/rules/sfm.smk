@@ -7,8 +7,9 @@
 #           .../sparse/, sparse.json                                        cameras and sparse points
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
-#
-# Folders of photos are ancient(): whether a photo has changed, the hashes in photos.json say.
+
+
+include: "../functions/sfm.smk"
 
 
 rule list_photos:
@@ -30,6 +31,7 @@ rule list_photos:
     params:
         folder=scene_folder,
         script=script("sfm/list_photos.py"),
+        files=state_of(scene_photos),
         code=code("sfm/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
@@ -57,6 +59,7 @@ rule extract_frames:
         source=object_source,
         options=flags(config["object"]["frames"]),
         script=script("sfm/extract_frames.py"),
+        files=state_of(object_photos),
         code=code("sfm/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
@@ -67,7 +70,7 @@ rule extract_frames:
 rule extract_scene_features:
     """SIFT features (paper 3.1)."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
         "results/scenes/{scene}/features.db",
@@ -93,7 +96,7 @@ rule extract_scene_features:
 
 use rule extract_scene_features as extract_object_features with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
         "results/objects/{object}/features.db",
@@ -168,7 +171,7 @@ use rule match_scene_features as match_object_features with:
 rule map_scene_photos:
     """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
     output:
@@ -198,7 +201,7 @@ rule map_scene_photos:
 
 use rule map_scene_photos as map_object_photos with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
     output:
@@ -253,7 +256,7 @@ rule georegister:
 rule undistort_scene_photos:
     """Undistort the photos into a COLMAP workspace."""
     input:
-        folder=ancient("results/scenes/{scene}/photos"),
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/georeferenced",
         report="results/scenes/{scene}/georeference.json",
@@ -284,7 +287,7 @@ rule undistort_scene_photos:
 
 use rule undistort_scene_photos as undistort_object_photos with:
     input:
-        folder=ancient("results/objects/{object}/frames"),
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         model="results/objects/{object}/sparse",
         report="results/objects/{object}/sparse.json",
