@@ -173,6 +173,12 @@ def read_model(folder: Path) -> pycolmap.Reconstruction:
         raise StageError(f"{folder} is not a readable COLMAP model ({why}); rerun the stage that writes it") from None
 
 
+def read_cameras(folder: Path) -> dict[str, pycolmap.Camera]:
+    """The cameras of a COLMAP model, with their distortion, by the name of the photo."""
+    model = read_model(folder)
+    return {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+
+
 def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images of a model that have a pose, sorted by name."""
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)

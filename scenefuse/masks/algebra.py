@@ -1,4 +1,4 @@
-"""Mask algebra: what an object's masks keep, said as `object and not 'data/house/sky'`."""
+"""Mask algebra: what an object's masks keep, written as `object and not 'data/house/sky'`."""
 
 import ast
 from pathlib import Path

@@ -10,6 +10,17 @@ from scipy.spatial import ConvexHull
 from scenefuse.mvs.visual_hull import Box
 from scenefuse.transforms import Array
 
+REACH = 1.5
+"""Ground is looked for so far beside the box, in half widths of it: farther off it may be another level."""
+SCATTER = 0.02
+"""How far a ground point may lie off the plane, as a share of the box's diagonal: grass, gravel, and errors of SfM."""
+MAX_TILT_DEG = 30.0
+"""Of the ground against the horizontal; steeper planes are walls."""
+SAMPLES = 300
+"""Of RANSAC: finds a plane that holds a quarter of the points in 99 of 100 runs."""
+LEAST_BESIDE, LEAST_ON_PLANE, LEAST_SHARE = 20, 12, 0.25
+"""Sparse points beside the box, those of them on the plane, and their share, below which there is no ground to see."""
+
 
 def upright_box(points: Array, up: Array, margin: float) -> Box:
     """The smallest upright box around (N, 3) points, its third axis along `up`, grown on all sides.
@@ -68,31 +79,31 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
     centre, half = (box.low + box.high) / 2, (box.high - box.low) / 2
     nowhere = Ground(np.array([box.low[2], 0, 0, 0, 0, 0]), centre[:2])
     sideways = np.abs(points_in_box[:, :2] - centre[:2])
-    around = (sideways < half[:2] + 1.5 * half[:2].max()).all(1) & (points_in_box[:, 2] < box.high[2])
+    around = (sideways < half[:2] + REACH * half[:2].max()).all(1) & (points_in_box[:, 2] < box.high[2])
     beside = points_in_box[around & (sideways > half[:2]).any(1)]
-    if len(beside) < 20:
+    if len(beside) < LEAST_BESIDE:
         return nowhere, False
-    tolerance = 0.02 * box.diagonal
+    tolerance = SCATTER * box.diagonal
     generator = np.random.default_rng(seed)
     design = np.column_stack([beside[:, :2], np.ones(len(beside))])
     best = np.zeros(len(beside), dtype=bool)
-    for _ in range(300):
+    for _ in range(SAMPLES):
         pick = generator.choice(len(beside), 3, replace=False)
         if abs(np.linalg.det(design[pick])) < 1e-6 * half[:2].max() ** 2:
             continue
         plane = np.linalg.solve(design[pick], beside[pick, 2])
         inliers = np.abs(beside[:, 2] - design @ plane) < tolerance
-        if np.hypot(*plane[:2]) <= np.tan(np.radians(30)) and inliers.sum() > best.sum():
+        if np.hypot(*plane[:2]) <= np.tan(np.radians(MAX_TILT_DEG)) and inliers.sum() > best.sum():
             best = inliers
-    if best.sum() < max(12, 0.25 * len(beside)):
+    if best.sum() < max(LEAST_ON_PLANE, LEAST_SHARE * len(beside)):
         return nowhere, False
     slope = np.linalg.lstsq(design[best], beside[best, 2], rcond=None)[0]
-    near = points_in_box[around & ~in_hull(points_in_box, span(prompts_in_box, 0.02 * box.diagonal))]
+    near = points_in_box[around & ~in_hull(points_in_box, span(prompts_in_box, tolerance))]
     terms = _quadratic(near[:, :2] - centre[:2])
     fit = np.array([slope @ [*centre[:2], 1.0], slope[0], slope[1], 0, 0, 0])
-    # Bending is as unwelcome as twenty points that are off by it at the edge of the box: few points cannot
-    # bend the surface much.
-    ridge = np.diag([0, 0, 0, 1, 1, 1]) * np.sqrt(20) * half[:2].max() ** 2
+    # Bending weighs as much as twenty points that are off by it at the edge of the box: few points cannot bend the
+    # surface much.
+    ridge = np.diag([0, 0, 0, 1, 1, 1]) * np.sqrt(LEAST_BESIDE) * half[:2].max() ** 2
     for width in (3, 2, 1.5, 1):
         use = np.abs(near[:, 2] - terms @ fit) < width * tolerance
         fit = np.linalg.lstsq(np.vstack([terms[use], ridge]), np.concatenate([near[use, 2], np.zeros(6)]), rcond=None)[

@@ -1,4 +1,4 @@
-"""Masks by GrabCut (Rother et al. 2004), seeded by what the sparse reconstruction knows of object and background."""
+"""Masks by GrabCut (Rother et al. 2004), seeded by the sparse points of object and background."""
 
 from dataclasses import dataclass
 

@@ -23,6 +23,10 @@ FIRST_ROUNDS = 4
 """Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one."""
 REFERENCE_WIDTH_PX = 640
 """Photo width that `band_px` is meant for."""
+SEED_RADIUS = 0.003
+"""Radius of the disc that a sparse point makes certain, as a share of the photo's width: about two pixels at 640."""
+SEED_EDGE = 0.06
+"""Longest side of a triangle of sparse points that is filled, as a share of the box's diagonal: holes are larger."""
 
 
 def first_cuts(target: Target, photos: Workspace, width_px: int) -> list[Mask]:
@@ -81,8 +85,8 @@ def stamp(trimap: Trimap, target: Target, view: View, seen: Rows, seen_at: Array
         seen: (K,) rows of the sparse points that it observes.
         seen_at: (K, 2) pixels where it does.
     """
-    radius, diagonal = 0.003 * view.width, target.box.diagonal
-    stamp_seeds(trimap, seen_at, target.sparse[seen], target.kind[seen], radius, 0.06 * diagonal)
+    radius, edge = SEED_RADIUS * view.width, SEED_EDGE * target.box.diagonal
+    stamp_seeds(trimap, seen_at, target.sparse[seen], target.kind[seen], radius, edge)
     pixels, depth = view.project(target.spanning)
     for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
         if (depth[part] > 0).all():

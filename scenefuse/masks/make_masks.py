@@ -66,7 +66,7 @@ def make_masks(
     Prompts give an upright box; the sparse points in it and above the ground seed GrabCut in each photo, whose masks
     carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with all points and the box
     around them, and again with the hull's box where it disagrees. Supplied masks are undistorted, never changed. A
-    photo without a usable mask, or whose mask disagrees with the hull, is left out. What `keep` says is applied last.
+    photo without a usable mask, or whose mask disagrees with the hull, is left out. `keep` is applied last.
 
     Args:
         inputs: see MaskInputs.
@@ -82,7 +82,6 @@ def make_masks(
     cv2.setNumThreads(threads())
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
-    _check_names(photos.views)
     made, target, weights = _make(inputs, photos, settings, seed)
     for name, reason in sorted(made.dropped.items()):
         print(f"{name} left out: {reason}", flush=True)
@@ -101,17 +100,6 @@ def make_masks(
     content = _report(made, target, len(photos.views), kept, settings)
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
     write_json(report, content | ({"weights": quantity(weights, "")} if weights else {}) | {"files": files})
-
-
-def _check_names(views: list[View]) -> None:
-    """StageError where two photos would share a mask."""
-    by_stem: dict[str, str] = {}
-    for view in views:
-        other = by_stem.setdefault(Path(view.name).stem, view.name)
-        if other != view.name:
-            raise StageError(
-                f"the photos {other} and {view.name} would share the mask {Path(view.name).stem}.png; rename one"
-            )
 
 
 def _make(inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int) -> tuple[ScoredMasks, Target, str]:

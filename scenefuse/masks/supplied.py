@@ -10,7 +10,7 @@ from scenefuse.io.pictures import read_raw
 from scenefuse.mvs.visual_hull import Mask
 from scenefuse.sfm.undistort import undistort_picture
 from scenefuse.stage import StageError
-from scenefuse.workspace import View, read_model
+from scenefuse.workspace import View, read_cameras
 
 STRETCH = 0.02
 """Relative difference of a mask's proportions from its photo's beyond which it belongs to another picture."""
@@ -32,8 +32,7 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
         raise StageError(
             f"the folder of masks {folder} does not exist; set its path in config/objects.tsv, or in object.masks.keep"
         )
-    files, model = mask_files(folder), read_model(sparse)
-    originals = {image.name: model.cameras[image.camera_id] for image in model.images.values()}
+    files, originals = mask_files(folder), read_cameras(sparse)
     masks: dict[str, Mask] = {}
     unusable: dict[str, str] = {}
     for view in views:

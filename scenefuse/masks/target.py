@@ -17,13 +17,16 @@ BOX_MARGIN = 0.15
 GROUND_MARGIN = 0.02
 """A sparse point is the object's only this much above the ground, as a share of the box's diagonal: as the ground
 scatters."""
+PART_EDGE = 0.12
+"""Longest edge between prompts that enclose a part of the object, as a share of the box's diagonal: close clicks mark
+the corners of a small part."""
 LEAST_OWN = 10
-"""Sparse points on the object that supplied masks have to hold: fewer say nothing of its extent."""
+"""Sparse points on the object that supplied masks have to hold: fewer do not tell its extent."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """What the sparse model and the prompts say about the object.
+    """Where the object is, by the sparse model and the prompts.
 
     Attributes:
         box: where it is.
@@ -79,7 +82,7 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
         kind[height < 0.5 * above] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
     kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < 3] = 0
-    return Target(box, ground, found, points, grow, _parts(points, 0.12 * box.diagonal), sparse, kind)
+    return Target(box, ground, found, points, grow, _parts(points, PART_EDGE * box.diagonal), sparse, kind)
 
 
 def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:

@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from scenefuse.transforms import Array
 
 MOST_VIEWS = 64
 """Views that a view is compared with at most: what more photos cost then grows with them, not with their square."""
 
 
 @dataclass(frozen=True)
-class Agreement:
-    """What the other views say about N points of one view.
+class DepthAgreement:
+    """How the depths of other views agree with N points of one view.
 
     Attributes:
         agree: (N,) views whose depth at the point is the point's own, within the tolerance.
@@ -22,18 +22,18 @@ class Agreement:
         hidden: (N,) views for which the point is behind their surface.
         off_mask: (N,) views in whose picture the point lies off the mask.
         mean: (N, 3) mean of the point and the points that agree with it.
-        compared: number of other views that were asked.
+        compared: number of other views.
     """
 
     agree: NDArray[np.int32]
     through: NDArray[np.int32]
     hidden: NDArray[np.int32]
     off_mask: NDArray[np.int32]
-    mean: Floats
+    mean: Array
     compared: int
 
 
-def others(view: int, frame_from_cam: Floats) -> NDArray[np.int64]:
+def others(view: int, frame_from_cam: Array) -> NDArray[np.int64]:
     """Indices of the views that `view` is compared with: all others, of many the near ones and ever fewer farther off.
 
     Near views see the same surface, far ones see it from another side and have it in their outline.
@@ -53,8 +53,8 @@ def others(view: int, frame_from_cam: Floats) -> NDArray[np.int64]:
 
 
 def back_project(
-    depth: Floats, intrinsics: Floats, frame_from_cam: Floats, rows: NDArray[Any], columns: NDArray[Any]
-) -> Floats:
+    depth: Array, intrinsics: Array, frame_from_cam: Array, rows: NDArray[Any], columns: NDArray[Any]
+) -> Array:
     """Points (N, 3) of pixels (integer rows and columns) with depths (N,) along z."""
     x = (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
     y = (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
@@ -63,15 +63,15 @@ def back_project(
 
 
 def surface_points(
-    depth: NDArray[np.float32], intrinsics: Floats, frame_from_cam: Floats
-) -> tuple[Floats, NDArray[Any], NDArray[Any]]:
+    depth: NDArray[np.float32], intrinsics: Array, frame_from_cam: Array
+) -> tuple[Array, NDArray[Any], NDArray[Any]]:
     """Points (N, 3) of all pixels of a map (H, W) that have a depth, and their rows and columns."""
     rows, columns = np.nonzero(depth > 0)
     known = depth[rows, columns].astype(np.float64)
     return back_project(known, intrinsics, frame_from_cam, rows, columns), rows, columns
 
 
-def extent(points: Floats) -> float:
+def extent(points: Array) -> float:
     """Diagonal of the box of points (N, 3), half a per cent at each side left out; 0 without points."""
     if len(points) == 0:
         return 0.0
@@ -80,14 +80,14 @@ def extent(points: Floats) -> float:
 
 
 def compare(
-    points: Floats,
+    points: Array,
     view: int,
     depths: NDArray[np.float32],
     masks: NDArray[np.bool_],
-    intrinsics: Floats,
-    frame_from_cam: Floats,
+    intrinsics: Array,
+    frame_from_cam: Array,
     tolerance: float,
-) -> Agreement:
+) -> DepthAgreement:
     """Project points of one view into the others (of many, `others`) and compare depths.
 
     Args:
@@ -103,8 +103,8 @@ def compare(
     agree, through, hidden, off_mask = (np.zeros(count, np.int32) for _ in range(4))
     total = points.copy()
     height, width = depths.shape[1:]
-    asked = others(view, frame_from_cam)
-    for other in asked:
+    compared = others(view, frame_from_cam)
+    for other in compared:
         pose, k = frame_from_cam[other], intrinsics[other]
         in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
         z = in_camera[:, 2]
@@ -126,11 +126,11 @@ def compare(
         total[confirmed] += (
             in_camera[confirmed] * (measured[same] / z[confirmed])[:, None] @ pose[:3, :3].T + pose[:3, 3]
         )
-    return Agreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(asked))
+    return DepthAgreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(compared))
 
 
 def normals_from_depth(
-    depth: NDArray[np.float32], intrinsics: Floats, radius_px: int, jump: float
+    depth: NDArray[np.float32], intrinsics: Array, radius_px: int, jump: float
 ) -> NDArray[np.float32]:
     """Unit normals (H, W, 3) in the camera frame, towards the camera, zero where there is no depth.
 

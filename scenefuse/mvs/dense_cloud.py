@@ -85,19 +85,9 @@ def fuse_depth_maps(
     kept = agreed[_near_others(agreed.points)]
     print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
     measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
-    content = {
-        "points": quantity(len(kept), "1"),
-        "dropped_outliers": quantity(len(agreed) - len(kept), "1"),
-        "spacing": quantity(spacing(kept.points), length_unit(georeference_json)),
-        "median_views": quantity(float(np.median(kept.fields["views"])), "1"),
-        "depth_maps": quantity(len(maps), "1"),
-        **_fused_share(kept, measured),
-        "backend": quantity(_all(stages, "backend"), ""),
-        "device": quantity(_all(stages, "device"), ""),
-        "reason": quantity(value(stages[0], "reason") if stages else "", ""),
-    }
+    content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
     write_cloud(cloud, kept)
-    write_json(report, content)
+    write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
 
 
 def _all(stages: list[dict[str, Any]], name: str) -> str:
@@ -109,8 +99,8 @@ def _path(folder: Path, part: str, name: str) -> Path:
     return folder / part / f"{name}.bin"
 
 
-def _fused_share(cloud: Cloud, measured: int) -> dict[str, Any]:
-    """Which share of the measured pixels is in the cloud, and a note where it is small."""
+def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
+    """The cloud in numbers, with a note where it holds few of the measured pixels; and how its depth maps were made."""
     share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
     if share < FEW_FUSED:
         notes.append(
@@ -118,7 +108,17 @@ def _fused_share(cloud: Cloud, measured: int) -> dict[str, Any]:
             " the cameras, or raise max_depth_error, max_reprojection_px or max_normal_error_deg"
         )
         print(f"note: {notes[0]}", flush=True)
-    return {"fused_share": quantity(share, "1"), "notes": quantity(notes, "")}
+    return {
+        "points": quantity(len(cloud), "1"),
+        "dropped_outliers": quantity(dropped, "1"),
+        "spacing": quantity(spacing(cloud.points), unit),
+        "median_views": quantity(float(np.median(cloud.fields["views"])), "1"),
+        "fused_share": quantity(share, "1"),
+        "notes": quantity(notes, ""),
+        "backend": quantity(_all(stages, "backend"), ""),
+        "device": quantity(_all(stages, "device"), ""),
+        "reason": quantity(value(stages[0], "reason") if stages else "", ""),
+    }
 
 
 def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSettings, beside: Path) -> Cloud:

@@ -61,26 +61,16 @@ def estimate_depth_maps(
         names = [reference.view.name for reference in references]
         coverage = [float((read_depth(folder / "depth_maps" / f"{name}.bin") > 0).mean()) for name in names]
         files = manifest(folder)
-    write_json(
-        report,
-        {
-            "backend": quantity(backend, ""),
-            "reason": quantity(reason, ""),
-            "device": quantity(device, ""),
-            "chunk": quantity(f"{chunk} of {chunks}", ""),
-            "median_coverage": quantity(float(np.median(coverage)) if coverage else 0.0, "1"),
-            "photos": {name: _about(r, share) for name, r, share in zip(names, references, coverage)},
-            "files": files,
-        },
-    )
+    how = {"backend": backend, "reason": reason, "device": device, "chunk": f"{chunk} of {chunks}"}
+    write_json(report, _report(how, references, coverage) | {"files": files})
 
 
 def _choose_backend(backend: str) -> tuple[str, str]:
     """The backend that runs, and why."""
     if backend == "torch":
-        return "torch", "set so"
+        return "torch", "as set"
     if pycolmap.has_cuda:
-        return "colmap", "set so" if backend == "colmap" else "pycolmap has CUDA"
+        return "colmap", "as set" if backend == "colmap" else "pycolmap has CUDA"
     if backend == "colmap":
         raise StageError(
             "COLMAP's patch-match needs CUDA, and this pycolmap has none; install pycolmap-cuda12, "
@@ -89,14 +79,20 @@ def _choose_backend(backend: str) -> tuple[str, str]:
     return "torch", "fallback: this pycolmap has no CUDA, so its patch-match cannot run"
 
 
-def _about(reference: Reference, coverage: float) -> dict[str, Any]:
-    """What the report says of one photo."""
-    return {
-        "sources": [view.name for view in reference.sources],
-        "near": round(reference.near, 4),
-        "far": round(reference.far, 4),
-        "coverage": round(coverage, 4),
+def _report(how: dict[str, str], references: list[Reference], coverage: list[float]) -> dict[str, Any]:
+    """How depths were made, and what came out for each photo; without the files."""
+    photos = {
+        reference.view.name: {
+            "sources": [view.name for view in reference.sources],
+            "near": round(reference.near, 4),
+            "far": round(reference.far, 4),
+            "coverage": round(share, 4),
+        }
+        for reference, share in zip(references, coverage)
     }
+    median = float(np.median(coverage)) if coverage else 0.0
+    texts = {key: quantity(text, "") for key, text in how.items()}
+    return texts | {"median_coverage": quantity(median, "1"), "photos": photos}
 
 
 def _run_plane_sweep(

@@ -1,4 +1,4 @@
-"""CPU kernel in Numba that matches depth hypotheses; its PyTorch twin is `_Matcher._keep_best` in plane_sweep.py.
+"""CPU kernel in Numba that matches depth hypotheses; its PyTorch twin is `Matcher.keep_best` in matcher.py.
 
 A band of rows is warped, summed over windows and compared row by row, so that everything but the photos stays in the
 cache. What a pixel gets does not depend on bands or threads.
@@ -17,7 +17,12 @@ _MATH = {"contract", "reassoc", "nsz"}
 
 @njit(fastmath=_MATH, error_model="numpy")
 def _place(inverse, directions, move, y, width, height, place, part_x, part_y, inside):
-    """Where one row lies in the source photo: its upper left pixel, the place between pixels, and whether it does."""
+    """Where one row y of the reference lies in the source photo.
+
+    All float32 but `place`: inverse (w,) inverse depths; directions (3, h, w) and move (3,) give places in -1..1; width
+    and height of the source photo. Written: place (w,) int32 index of the upper left pixel of four, part_x and part_y
+    (w,) the place between them in 0..1, inside (w,) 1 where it lies in the photo, else 0.
+    """
     direction_x, direction_y, direction_z = directions[0, y], directions[1, y], directions[2, y]
     half_x, half_y = np.float32(width) * _HALF, np.float32(height) * _HALF
     last_x, last_y = np.float32(width - 1), np.float32(height - 1)
@@ -39,7 +44,7 @@ def _place(inverse, directions, move, y, width, height, place, part_x, part_y, i
 
 @njit(fastmath=_MATH, error_model="numpy")
 def _warp(flat, width, place, part_x, part_y, value):
-    """Bilinear samples of a photo, all its rows behind each other."""
+    """Bilinear samples value (w,) of a photo flat (H * width,); place, part_x and part_y as `_place` writes them."""
     for x in range(len(place)):
         at = np.uint32(place[x])
         below = np.uint32(at + width)
@@ -52,7 +57,10 @@ def _warp(flat, width, place, part_x, part_y, value):
 
 @njit(fastmath=_MATH)
 def _sums_along(value, reference, window, sums):
-    """Sums over `window` pixels of a row, its square and its product with the reference (3 w,); outside is zero."""
+    """Sums over `window` pixels of a row value (w,), of its square and of its product with the reference (w,).
+
+    Written: sums (3 w,), one behind the other; outside the row is zero.
+    """
     width, radius = len(value), window // 2
     row = np.zeros(width + 2 * radius, np.float32)
     inner = row[radius : radius + width]
@@ -69,7 +77,7 @@ def _sums_along(value, reference, window, sums):
 
 @njit(fastmath=_MATH)
 def _sum_across(rows, out):
-    """Sum of the rows (n, w)."""
+    """Sum of the rows (n, w), into out (w,)."""
     out[:] = rows[0]
     for w in range(1, len(rows)):
         row = rows[w]
@@ -79,7 +87,11 @@ def _sum_across(rows, out):
 
 @njit(fastmath=_MATH, error_model="numpy")
 def _correlate(sums, share, mean, variance, inside, score):
-    """Normalised cross-correlation of a row's windows from their sums (3 w,)."""
+    """Normalised cross-correlation of a row's windows, into score (w,).
+
+    sums (3 w,) as `_sums_along` writes them, over whole windows; share: 1 / pixels of a window; mean and variance (w,)
+    of the reference's windows; inside (w,) as `_place` writes it.
+    """
     width = len(score)
     first, second, both = sums[:width], sums[width : 2 * width], sums[2 * width :]
     for x in range(width):
@@ -92,7 +104,7 @@ def _correlate(sums, share, mean, variance, inside, score):
 
 @njit
 def _insert(score, best):
-    """Keep the better of two rows of scores in `best`, the other in `score`."""
+    """Keep the better of two rows of scores (w,) in `best`, the other in `score`."""
     for x in range(len(score)):
         better = max(best[x], score[x])
         score[x] = min(best[x], score[x])

@@ -1,4 +1,4 @@
-"""Depths moved to where the photos match best: a map says where the surface is, the photos say how exactly."""
+"""Depths moved to where the photos match best: a map has about the right depth, and matching makes it exact."""
 
 from dataclasses import dataclass, replace
 

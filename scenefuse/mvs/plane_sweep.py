@@ -2,9 +2,8 @@
 
 The CPU and GPU counterpart of COLMAP's patch-match stereo. Every hypothesis is an inverse depth per pixel, so that one
 warp serves the fronto-parallel sweep and the refinement around a surface that is already known, where the matching
-window follows the slant of that surface. Sources: Collins 1996 (plane sweep); Hirschmueller 2008
-(semi-global matching);
-Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
+window follows the slant of that surface. Sources: Collins 1996 (plane sweep); Hirschmueller 2008 (semi-global
+matching).
 """
 
 import math
@@ -60,7 +59,7 @@ class DepthMapSettings:
 
 @dataclass(frozen=True)
 class DepthEstimate:
-    """What stereo knows of one photo.
+    """Depths of one photo by stereo.
 
     Attributes:
         depth: (H, W) float32 along z, in world units; 0 where there is none.

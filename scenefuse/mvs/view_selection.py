@@ -9,7 +9,7 @@ from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
 
 LEAST_SHARED = 8
-"""Sparse points that a photo has to have, and to share with a source: fewer say little of depths and angles."""
+"""Sparse points that a photo has to have, and to share with a source: fewer do not tell depths and angles."""
 GOOD_ANGLES_DEG = (8, 25)
 """Between two rays to a point: below there is little baseline to measure with, above surfaces look different."""
 WORTH_BELOW_DEG, WORTH_ABOVE_DEG = 4.0, 10.0

@@ -49,40 +49,40 @@ class Views:
         return View(self.names[index], self.intrinsics[index], pose, width, height, self.images[index])
 
 
-def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -> Views:
+def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int) -> Views:
     """Read an undistorted COLMAP workspace and its masks, scaled to `width_px` columns.
 
     Args:
-        cameras: workspace with images/ and sparse/, PINHOLE cameras.
+        workspace: folder with images/ and sparse/, PINHOLE cameras.
         masks: folder of {name}.png, above 127 on the object.
         width_px: target width; photos are never enlarged.
-        hold_out_every: every n-th photo (in name order) is held out, 0 holds out none; a file held_out.txt in
-            `cameras`, one name a line, says it instead.
+        hold_out_every: every n-th photo (in name order) is held out, 0 holds out none; a file held_out.txt in the
+            workspace, one name a line, lists them instead.
 
     Raises:
         StageError: no photo has a mask, a photo or mask cannot be read, or sizes differ between photos.
     """
-    workspace = read_workspace(cameras)
-    files = [masks / f"{Path(view.name).stem}.png" for view in workspace.views]
-    workspace = workspace.subset([k for k, file in enumerate(files) if file.is_file()])
+    read = read_workspace(workspace)
+    files = [masks / f"{Path(view.name).stem}.png" for view in read.views]
+    read = read.subset([k for k, file in enumerate(files) if file.is_file()])
     files = [file for file in files if file.is_file()]
     if not files:
         raise StageError(
-            f"no photo in {cameras} has a mask in {masks}; mask files are named like their photo, with .png"
+            f"no photo in {workspace} has a mask in {masks}; mask files are named like their photo, with .png"
         )
-    photos = [_scaled(workspace.rgb(view), width_px) for view in workspace.views]
-    mattes = [_scaled(_matte(file, view), width_px).pixels for file, view in zip(files, workspace.views)]
+    photos = [_scaled(read.rgb(view), width_px) for view in read.views]
+    mattes = [_scaled(_matte(file, view), width_px).pixels for file, view in zip(files, read.views)]
     if len({(view.width, view.height) for view in photos}) > 1:
-        raise StageError(f"the photos in {cameras}/images have different sizes; use photos of one camera at one size")
+        raise StageError(f"the photos in {workspace}/images have different sizes; use photos of one camera at one size")
     return Views(
         [view.name for view in photos],
         np.stack([view.pixels for view in photos]),
         np.stack(mattes),
         np.stack([view.intrinsics for view in photos]),
         np.stack([view.world_from_cam for view in photos]),
-        _held_out(cameras, [view.name for view in photos], hold_out_every),
-        workspace.points,
-        [np.unique(rows) for rows in workspace.seen],
+        _held_out(workspace, [view.name for view in photos], hold_out_every),
+        read.points,
+        [np.unique(rows) for rows in read.seen],
     )
 
 
@@ -100,10 +100,10 @@ def _matte(path: Path, view: View) -> View:
     return replace(view, pixels=matte)
 
 
-def _held_out(cameras: Path, names: list[str], hold_out_every: int) -> NDArray[np.bool_]:
+def _held_out(workspace: Path, names: list[str], hold_out_every: int) -> NDArray[np.bool_]:
     """(V,) True for photos that are held out: those listed in held_out.txt, else every n-th."""
     held_out = np.zeros(len(names), dtype=bool)
-    listed = cameras / "held_out.txt"
+    listed = workspace / "held_out.txt"
     if listed.is_file():
         held_out = np.isin(names, listed.read_text().splitlines())
     elif hold_out_every > 0:

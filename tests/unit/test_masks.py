@@ -291,6 +291,16 @@ def test_a_photo_of_which_nothing_is_kept_is_left_out(capture, tmp_path):
     assert read_json(tmp_path / "masks.json")["dropped"]["f3.png"].startswith("nothing is left of the mask")
 
 
+def test_a_photo_whose_other_mask_cannot_be_read_is_left_out(capture, tmp_path):
+    (tmp_path / "sky").mkdir()
+    cv2.imwrite(str(tmp_path / "sky" / "f2.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    (tmp_path / "sky" / "f3.png").write_bytes(b"no picture")
+    run_stage(capture, tmp_path, keep=f"object and not '{tmp_path}/sky'")
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "masks") == PHOTOS - 1 and "f3.png cannot be read" in report["dropped"]["f3.png"]
+    assert not (tmp_path / "masks" / "f3.png").exists()
+
+
 def test_mask_algebra():
     own, sky, tree = (np.array(bits, bool) for bits in ([1, 1, 1, 0], [0, 1, 0, 0], [0, 0, 1, 1]))
     others = {Path("sky"): sky, Path("tree"): tree}

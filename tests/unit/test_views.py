@@ -1,0 +1,107 @@
+"""Views of an object, as its training stages read them, from a planted workspace with masks; and which views match."""
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.mvs.view_selection import select_views
+from scenefuse.mvs.views import load_views
+from scenefuse.mvs.visual_hull import count_silhouettes
+from scenefuse.stage import StageError
+from scenefuse.workspace import View, read_workspace
+
+WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
+POINTS = np.random.default_rng(0).uniform([-1, -1, 9], [1, 1, 11], (40, 3))
+# Left of the points, straight before them, and two on the right; no two see them from the same angle.
+SHIFTS = (-2.0, 0.0, 1.0, 8.0)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Four photos that look along +z from beside each other, each observing every point, the first one twice."""
+    for name in ("images", "sparse", "masks"):
+        (tmp_path / name).mkdir()
+    model = pycolmap.Reconstruction()
+    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=params)
+    )
+    ids = [model.add_point3D(p, pycolmap.Track(), np.zeros(3, np.uint8)) for p in POINTS]
+    for k, shift in enumerate(SHIFTS, 1):
+        image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D([float(j), 5.0]) for j in range(len(ids) + 1)])
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0, 0])))
+        for j, point in enumerate([*ids, ids[0]]):
+            model.add_observation(point, pycolmap.TrackElement(k, j))
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), np.full((HEIGHT, WIDTH, 3), (10, 20, 40 * k), np.uint8))
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:, WIDTH // 2 :] = 255
+        cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
+    model.write_binary(tmp_path / "sparse")
+    return tmp_path
+
+
+def test_views_are_the_photos_with_masks_scaled_with_their_cameras(folder):
+    (folder / "masks" / "2.png").unlink()
+    views = load_views(folder, folder / "masks", width_px=40, hold_out_every=0)
+    assert views.names == ["1.png", "3.png", "4.png"] and not views.held_out.any()
+    assert views.images.shape == (3, 30, 40, 3) and (views.images[1] == (120, 20, 10)).all()
+    assert views.masks[0, :, 20:].all() and not views.masks[0, :, :20].any()
+    np.testing.assert_allclose(views.intrinsics[0], [[35, 0, 20], [0, 35, 15], [0, 0, 1]])
+    np.testing.assert_allclose(views.object_from_cam[:, :3, 3], [[s, 0, 0] for s in (-2, 1, 8)])
+    np.testing.assert_array_equal(views.sparse, POINTS)
+    # A point that a photo observes twice counts once.
+    assert [t.tolist() for t in views.tracks] == [list(range(len(POINTS)))] * 3
+
+
+def test_a_view_of_views_projects_as_its_photo(folder):
+    view = load_views(folder, folder / "masks", width_px=40, hold_out_every=0).view(2)
+    whole = read_workspace(folder).views[2]
+    np.testing.assert_allclose(view.project(POINTS)[0], whole.project(POINTS)[0] / 2)
+    assert view.pixels.shape == (view.height, view.width, 3)
+
+
+def test_held_out_photos_are_every_nth_or_listed(folder):
+    assert load_views(folder, folder / "masks", 40, 2).held_out.tolist() == [False, True, False, True]
+    (folder / "held_out.txt").write_text("4.png\n1.png\n")
+    assert load_views(folder, folder / "masks", 40, 2).held_out.tolist() == [True, False, False, True]
+
+
+def test_views_without_usable_masks_are_an_error_in_one_sentence(folder):
+    cv2.imwrite(str(folder / "masks" / "2.png"), np.zeros((HEIGHT + 1, WIDTH), np.uint8))
+    with pytest.raises(StageError, match="2.png and the photo 2.png differ in size"):
+        load_views(folder, folder / "masks", 40, 0)
+    with pytest.raises(StageError, match="no photo in .* has a mask"):
+        load_views(folder, folder / "images" / "none", 40, 0)
+
+
+def test_a_workspace_of_some_views_keeps_what_they_observe(folder):
+    whole = read_workspace(folder)
+    part = whole.subset([3, 1])
+    assert [view.name for view in part.views] == ["4.png", "2.png"] and len(part.points) == len(POINTS)
+    np.testing.assert_array_equal(part.seen_at[0], whole.seen_at[3])
+
+
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_silhouettes_count_the_photos_that_frame_a_point_and_those_that_have_it_off_the_mask(precision):
+    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    right = np.zeros((HEIGHT, WIDTH), bool)
+    right[:, WIDTH // 2 :] = True
+    behind = np.diag([-1.0, 1, -1, 1])
+    views = [View("a", k, np.eye(4), WIDTH, HEIGHT, right), View("b", k, np.eye(4), WIDTH, HEIGHT, ~right)]
+    views += [View("c", k, behind, WIDTH, HEIGHT, right)]
+    points = np.array([[0.5, 0, 5], [-0.5, 0, 5], [9, 0, 5], [0.5, 0, -5], [0, 0, 5]], precision)
+    shown, missed = count_silhouettes(points, iter(views))
+    assert shown.tolist() == [2, 2, 0, 1, 2] and missed.tolist() == [1, 1, 0, 1, 1]
+
+
+def test_sources_are_views_of_good_angles_the_best_first(folder):
+    selected = select_views(read_workspace(folder), sources=2, min_angle_deg=2.0)
+    # From the second photo the first lies 11 degrees aside, the third 6, the fourth 39.
+    assert [view.name for view in selected["2.png"].sources] == ["1.png", "3.png"]
+    assert selected["2.png"].near < POINTS[:, 2].min() < POINTS[:, 2].max() < selected["2.png"].far
+    narrow = select_views(read_workspace(folder), sources=2, min_angle_deg=8.0)
+    assert [view.name for view in narrow["2.png"].sources] == ["1.png", "4.png"]
+    with pytest.raises(StageError, match="shares points with another at 80.0 degrees"):
+        select_views(read_workspace(folder), sources=2, min_angle_deg=80.0)
