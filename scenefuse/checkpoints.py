@@ -4,6 +4,7 @@ Nothing here knows what is trained: a state is a dictionary of tensors, numbers,
 """
 
 import contextlib
+import hashlib
 import math
 import signal
 import sys
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -107,6 +109,21 @@ def load_checkpoint(path: Path | None, like: State) -> State | None:
         print(f"note: {path} was saved by another version; training starts afresh", flush=True)
         return None
     return state
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hex digits that change when any part changes: arrays and tensors by content, others by their repr.
+
+    A checkpoint in a folder of this name is found by no training that has other settings or inputs.
+    """
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, Tensor):
+            part = part.detach().cpu().numpy()
+        if isinstance(part, np.ndarray):
+            digest.update(f"{part.dtype}{part.shape}".encode())
+        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    return digest.hexdigest()[:16]
 
 
 def require_finite(state: State) -> None:

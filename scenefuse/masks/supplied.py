@@ -2,13 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 
 from scenefuse.io.mask_files import mask_files, matte_of
 from scenefuse.io.pictures import read_raw
 from scenefuse.mvs.visual_hull import Mask
+from scenefuse.sfm.undistort import undistort_picture
 from scenefuse.stage import StageError
 from scenefuse.workspace import View, read_model
 
@@ -41,7 +41,8 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
         if file is None or view.name not in originals:
             continue
         try:
-            masks[view.name] = _undistorted(_read(file, originals[view.name]), originals[view.name], view)
+            mask = _read(file, originals[view.name]).astype(np.float32)
+            masks[view.name] = undistort_picture(mask, originals[view.name], view) > 0.5
         except StageError as error:
             unusable[view.name] = str(error)
     if not masks and unusable:
@@ -69,15 +70,3 @@ def _read(file: Path, camera: pycolmap.Camera) -> Mask:
             " it at the photo's size"
         )
     return mask
-
-
-def _undistorted(mask: Mask, camera: pycolmap.Camera, view: View) -> Mask:
-    """A mask in the pixels of the original photo, moved into those of the undistorted one."""
-    height, width = view.height, view.width
-    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.intrinsics).T
-    pixels = np.asarray(camera.img_from_cam(rays)).reshape(height, width, 2)
-    scale = np.array([mask.shape[1] / camera.width, mask.shape[0] / camera.height])
-    x, y = np.moveaxis((pixels * scale - 0.5).astype(np.float32), -1, 0)
-    soft = cv2.remap(mask.astype(np.float32), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-    return soft > 0.5

@@ -1,27 +1,26 @@
 """A temporary workspace in the convention of COLMAP's dense part, and the maps that its stereo leaves there."""
 
 import os
-import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from scenefuse.stage import StageError
+from scenefuse.stage import StageError, scratch_directory
 from scenefuse.workspace import posed_images, read_model
 
 MAPS = ("depth_maps", "normal_maps")
 
 
 @contextmanager
-def linked_workspace(workspace: Path, folder: Path, map_widths: Mapping[str, int]) -> Iterator[Path]:
-    """A COLMAP workspace in `folder`, removed afterwards: links to the photos, and shifted cameras.
+def linked_workspace(workspace: Path, beside: Path, map_widths: Mapping[str, int]) -> Iterator[Path]:
+    """A temporary COLMAP workspace, removed afterwards: links to the photos, and shifted cameras.
 
     COLMAP's dense part takes the first pixel's centre as 0, its sparse part as 0.5, so principal points move by half
     a pixel of the map. With exact depth maps this takes the fused cloud from a quarter of a pixel's error to none.
 
     Args:
         workspace: with images/ and sparse/, PINHOLE cameras.
-        folder: a temporary name on the file system of what comes out, so that maps can be moved there.
+        beside: path that it lies beside, on the file system of what comes out, so that maps can be moved there.
         map_widths: width of the depth map of each photo, in pixels; photos of one camera have maps of one width.
     """
     model = read_model(workspace / "sparse")
@@ -30,14 +29,11 @@ def linked_workspace(workspace: Path, folder: Path, map_widths: Mapping[str, int
         half = 0.5 * camera.width / widths.get(camera.camera_id, camera.width)
         fx, fy, cx, cy = camera.params
         camera.params = [fx, fy, cx - half, cy - half]
-    shutil.rmtree(folder, ignore_errors=True)
-    try:
-        (folder / "sparse").mkdir(parents=True)
+    with scratch_directory(beside) as folder:
+        (folder / "sparse").mkdir()
         model.write_binary(folder / "sparse")
         (folder / "images").symlink_to((workspace / "images").resolve())
         yield folder
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def collect_maps(stereo: Path, names: Iterable[str], kind: str, output: Path) -> None:

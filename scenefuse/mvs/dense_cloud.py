@@ -1,6 +1,5 @@
 """The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion."""
 
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,7 +77,7 @@ def fuse_depth_maps(
         raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
     stages = [read_json(path) for path in depth_json]
     print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
-    fused = _fuse(workspace, maps, settings, cloud.with_name(f".{cloud.stem}.tmp-{os.getpid()}"))
+    fused = _fuse(workspace, maps, settings, cloud)
     # COLMAP counts pixels, of which one photo may bring several; we count photos.
     agreed = fused[fused.fields["views"] >= settings.min_photos]
     if len(agreed) == 0:
@@ -122,8 +121,14 @@ def _fused_share(cloud: Cloud, measured: int) -> dict[str, Any]:
     return {"fused_share": quantity(share, "1"), "notes": quantity(notes, "")}
 
 
-def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSettings, temporary: Path) -> Cloud:
-    """COLMAP's fusion of the maps of photos, found below the folder of each, as a cloud with `views`.
+def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSettings, beside: Path) -> Cloud:
+    """COLMAP's fusion as a cloud with `views`.
+
+    Args:
+        workspace: that the maps belong to.
+        maps: photo -> folder that its maps lie below.
+        settings: see DenseCloudSettings.
+        beside: path that COLMAP works beside.
 
     Raises:
         StageError: no point at all.
@@ -136,7 +141,7 @@ def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSetting
     options.max_normal_error = settings.max_normal_error_deg
     options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
     widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
-    with linked_workspace(workspace, temporary, widths) as folder:
+    with linked_workspace(workspace, beside, widths) as folder:
         for name, source in maps.items():
             for part in MAPS:
                 link = folder / "stereo" / part / f"{name}.geometric.bin"

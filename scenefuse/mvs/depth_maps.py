@@ -141,7 +141,7 @@ def run_patch_match(
         # This pass reads the sources' photometric maps, so these need one too: every photo is a reference there.
         names |= {view.name for r in references for view in r.sources}
     widths = {view.name: view.at_most(settings.max_image_size_px).width for view in workspace.views}
-    with linked_workspace(workspace.folder, folder / ".colmap", widths) as temporary:
+    with linked_workspace(workspace.folder, folder / "patch_match", widths) as temporary:
         stereo = temporary / "stereo"
         for part in (*MAPS, "consistency_graphs"):
             for name in names:

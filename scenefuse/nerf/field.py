@@ -8,23 +8,29 @@ from torch import Tensor, nn
 from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
 from scenefuse.stage import setting
 
+# Of the density network's 16 outputs the first is the density's logarithm (Mueller et al. 2022, section 5.4).
 GEOMETRY_FEATURES = 15
+# exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
+LARGEST_LOG_DENSITY = 11.0
+FIRST_FEATURE = 1e-4  # initial features are uniform in +-1e-4, as in instant-ngp
+# Training from coarse to fine begins with half of the levels, and with so many at least.
+LEVELS_AT_START = 4
 
 
 @dataclass(frozen=True)
 class FieldSettings:
     """Size of the radiance field."""
 
-    levels: int = setting(12, least=0)
-    """levels of the hash grid"""
-    log2_table: int = setting(16, least=0)
-    """2-logarithm of the rows a hashed level has"""
-    coarsest: int = setting(16, least=0)
-    """cells per side at the coarsest level"""
-    finest: int = setting(512, least=0)
-    """cells per side at the finest level"""
-    width: int = setting(32, least=0)
-    """width of the hidden layers"""
+    levels: int = setting(12, least=1)
+    """Levels of the hash grid."""
+    log2_table: int = setting(16, least=4, most=24)
+    """2-logarithm of the rows that a hashed level of the grid has; more holds finer detail, and is slower."""
+    finest: int = setting(512, least=2)
+    """Cells per side of the cube around the object at the finest level."""
+    width: int = setting(32, least=1)
+    """Width of the hidden layers."""
+    coarsest: int = 16
+    """Cells per side at the coarsest level, as in instant-ngp."""
 
 
 class Field(nn.Module):
@@ -37,7 +43,7 @@ class Field(nn.Module):
         super().__init__()
         self.settings = settings
         self.grid = hash_grid(settings.levels, settings.log2_table, settings.coarsest, settings.finest)
-        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * 1e-4)
+        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * FIRST_FEATURE)
         width, inputs = settings.width, 2 * settings.levels
         self.density_in = _linear(inputs, width, generator)
         self.density_out = _linear(width, 1 + GEOMETRY_FEATURES, generator)
@@ -53,7 +59,7 @@ class Field(nn.Module):
         inside = x.clamp(0.0, 1.0 - 1e-6)
         features = encode(inside, self.table, self.grid, self.level_weight, boost, fine_from)
         out = self.density_out(torch.relu(self.density_in(features)))
-        return torch.exp(out[:, 0].clamp(max=11.0)), out
+        return torch.exp(out[:, 0].clamp(max=LARGEST_LOG_DENSITY)), out
 
     def color(self, features: Tensor, direction: Tensor) -> Tensor:
         """RGB (R, S, 3) in 0..1 from features (R S, 16) of S samples on each of R rays with unit directions (R, 3)."""
@@ -67,14 +73,19 @@ class Field(nn.Module):
         return self.geometry(x)[0]
 
 
-def coarse_to_fine(field: Field, progress: float, finished: float, levels_at_start: int) -> None:
-    """Open the levels one after the other: all of them once `progress` (0..1) reaches `finished`."""
+def coarse_to_fine(field: Field, progress: float, finished: float) -> None:
+    """Open the levels one after the other: all of them once `progress` (0..1) reaches `finished`.
+
+    The window is linear; Park et al. 2021 (Nerfies, equation 8) and Lin et al. 2021 (BARF) use a cosine.
+    """
     levels = field.settings.levels
-    opened = levels if finished <= 0 else levels_at_start + (levels - levels_at_start) * progress / finished
+    first = max(LEVELS_AT_START, levels // 2)
+    opened = levels if finished <= 0 else first + (levels - first) * progress / finished
     field.level_weight.copy_((opened - torch.arange(levels, device=field.level_weight.device)).clamp(0.0, 1.0))
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
+    """A layer with uniform weights after Glorot and Bengio 2010, and biases of 0."""
     layer = nn.Linear(inputs, outputs)
     bound = (6.0 / (inputs + outputs)) ** 0.5
     with torch.no_grad():

@@ -25,6 +25,10 @@ ZERO = np.float32(0.0)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
+DIAGONAL, FAR = np.float32(1.7320508), np.float32(1e9)  # of the unit cube, and beyond it
+PARALLEL, TINY = np.float32(1e-9), np.float32(1e-12)  # a direction that never meets a face; no divisor is smaller
+LEAST_KNOWN = np.float32(1e-4)  # as in `render`
+RAYS_A_BLOCK = 64  # rays that share a thread's buffers
 AHEAD = 16  # samples
 NEAR_ROWS = 1 << 17  # a level of so many rows, one MiB, stays in a core's cache
 
@@ -239,110 +243,140 @@ def _encode_backward_x(threads, x, gradient, table, resolution, stride, offset, 
                 out[n, 2] += gy * (gx * (v4 - v0) + fx * (v5 - v1)) + fy * (gx * (v6 - v2) + fx * (v7 - v3))
 
 
+@_inline
+def _span(origin, direction, r):
+    """Where ray r enters the unit cube and leaves it; it misses the cube where it leaves first."""
+    low, high = ZERO, FAR
+    for k in range(3):
+        o, d = origin[r, k], direction[r, k]
+        if abs(d) < PARALLEL:
+            if o < ZERO or o > ONE:
+                high = -ONE
+        else:
+            a, b = (ZERO - o) / d, (ONE - o) / d
+            low, high = max(low, min(a, b)), min(high, max(a, b))
+    return low, high
+
+
+@_inline
+def _index(origin, direction, t, scale, grid):
+    """The cell of a grid, along one axis, at a distance along a ray."""
+    return min(max(int((origin + t * direction) * scale), 0), grid - 1)
+
+
+@_inline
+def _peak(raw, k, used):
+    """The largest of an interval's weight and its neighbours': densities are cached, surfaces move a little."""
+    return max(raw[k], max(raw[max(k - 1, 0)], raw[min(k + 1, used - 1)]))
+
+
+@_inline
+def _shares(uniform, prior, near_count, total):
+    """Shares of the samples: spread evenly, by the grid's weights, near the prior. They add up to one."""
+    share_prior = prior if near_count > 0 else ZERO
+    share_uniform = uniform * (ONE - share_prior)
+    share_weight = (ONE - share_prior) - share_uniform
+    if total < LEAST_KNOWN:
+        share_uniform += share_weight
+        share_weight = ZERO
+    return share_uniform, share_weight, share_prior
+
+
+@_inline
+def _walk(ray, low, high, alpha, blocks_used, step, expected, width, start, raw, near):
+    """Fill the beginnings, weights and nearness to the prior of the intervals of a ray that lie in occupied cells.
+
+    ray (6,): origin and direction; returns how many intervals there are, their total weight, how many are near.
+    """
+    grid = alpha.shape[0]
+    scale = np.float32(grid)
+    ox, oy, oz, dx, dy, dz = ray
+    used, near_count = 0, 0
+    transmittance, total = ONE, ZERO
+    for i in range(min(int(np.ceil((high - low) / step)), len(start) - 1)):
+        t = low + (np.float32(i) + HALF) * step
+        ix, iy, iz = _index(ox, dx, t, scale, grid), _index(oy, dy, t, scale, grid), _index(oz, dz, t, scale, grid)
+        if blocks_used[ix >> 2, iy >> 2, iz >> 2] == 0:
+            continue
+        opacity = alpha[ix, iy, iz]
+        if opacity < ZERO:
+            continue
+        start[used] = t - HALF * step
+        raw[used] = transmittance * opacity
+        total += raw[used]
+        transmittance *= ONE - opacity
+        close = abs(t - expected) <= width
+        near[used] = 1 if close else 0
+        near_count += 1 if close else 0
+        used += 1
+    return used, total, near_count
+
+
+@_inline
+def _place(r, jitter, shares, near_count, used, step, start, raw, near, out_t, out_delta):
+    """Cut the mass of a ray's intervals into equal shares, and put a sample into each."""
+    share_uniform, share_weight, share_prior = shares
+    samples = jitter.shape[1]
+    blurred = ZERO
+    for i in range(used):
+        blurred += _peak(raw, i, used)
+    blurred = max(blurred, TINY)
+    k = -1
+    before, after, edge = ZERO, ZERO, ZERO
+    for s in range(samples):
+        goal = np.float32(s + 1) / np.float32(samples)
+        while k < used - 1 and (k < 0 or after < goal):
+            k += 1
+            before = after
+            mass = share_uniform / np.float32(used) + share_weight * _peak(raw, k, used) / blurred
+            if near[k] == 1:
+                mass += share_prior / np.float32(near_count)
+            after = before + mass
+        inside = (goal - before) / max(after - before, TINY)
+        end = np.float32(k) + min(max(inside, ZERO), ONE)
+        if s == samples - 1:
+            end = np.float32(used)
+        end = max(end, edge)
+        middle = edge + (end - edge) * jitter[r, s]
+        cell = min(int(middle), used - 1)
+        out_t[r, s] = start[cell] + (middle - np.float32(cell)) * step
+        out_delta[r, s] = (end - edge) * step
+        edge = end
+
+
 @_jit
-def march(
-    origin,
-    direction,
-    alpha,
-    blocks_used,
-    step,
-    jitter,
-    uniform_share,
-    prior,
-    prior_width,
-    prior_share,
-    out_t,
-    out_delta,
-    out_hit,
-):
+def march(rays, occupancy, jitter, uniform, prior, out):
     """Importance samples along rays through an occupancy grid.
 
     A ray is cut into intervals of length `step` inside the unit cube; only those in occupied cells count. Their
     probability mass mixes a uniform part, the compositing weights of the grid's cached density, and the intervals
     near a depth prior; S equal shares of the mass give one sample each. Lengths are lengths of occupied ray.
 
-    origin, direction (R, 3); alpha (G, G, G): opacity of one interval, negative in empty cells; blocks_used
-    (G / 4, G / 4, G / 4) uint8: whether any cell of the block is occupied (it stays in the cache, most of the cube is
-    empty); jitter (R, S) in 0..1; prior, prior_width, prior_share (R,); out_t, out_delta (R, S), out_hit (R,) uint8.
+    rays: origin, direction (R, 3); occupancy: alpha (G, G, G), opacity of one interval, negative in empty cells,
+    blocks_used (G / 4, G / 4, G / 4) uint8, whether any cell of the block is occupied (it stays in the cache, most of
+    the cube is empty), step; jitter (R, S) in 0..1; uniform: share of the samples spread evenly; prior: distance,
+    width, share (R,); out: t, delta (R, S), hit (R,) uint8.
     """
-    grid = alpha.shape[0]
-    scale = np.float32(grid)
-    samples = jitter.shape[1]
-    blocks = (origin.shape[0] + 63) // 64
-    longest = int(np.float32(1.7320508) / step) + 3
-    for block in prange(blocks):
+    origin, direction = rays
+    alpha, blocks_used, step = occupancy
+    distance, width, share = prior
+    out_t, out_delta, out_hit = out
+    longest = int(DIAGONAL / step) + 3
+    for block in prange((origin.shape[0] + RAYS_A_BLOCK - 1) // RAYS_A_BLOCK):
         start = np.empty(longest, np.float32)
         raw = np.empty(longest, np.float32)
         near = np.empty(longest, np.uint8)
-        for r in range(block * 64, min((block + 1) * 64, origin.shape[0])):
-            low, high = np.float32(0.0), np.float32(1e9)
-            for k in range(3):
-                o, d = origin[r, k], direction[r, k]
-                if abs(d) < np.float32(1e-9):
-                    if o < np.float32(0.0) or o > ONE:
-                        high = np.float32(-1.0)
-                else:
-                    a, b = (np.float32(0.0) - o) / d, (ONE - o) / d
-                    low, high = max(low, min(a, b)), min(high, max(a, b))
+        for r in range(block * RAYS_A_BLOCK, min((block + 1) * RAYS_A_BLOCK, origin.shape[0])):
+            low, high = _span(origin, direction, r)
             out_hit[r] = 0
             if high <= low:
                 continue
-            used = 0
-            transmittance = ONE
-            total = np.float32(0.0)
-            near_count = 0
-            count = min(int(np.ceil((high - low) / step)), longest - 1)
-            for i in range(count):
-                t = low + (np.float32(i) + HALF) * step
-                ix = min(max(int((origin[r, 0] + t * direction[r, 0]) * scale), 0), grid - 1)
-                iy = min(max(int((origin[r, 1] + t * direction[r, 1]) * scale), 0), grid - 1)
-                iz = min(max(int((origin[r, 2] + t * direction[r, 2]) * scale), 0), grid - 1)
-                if blocks_used[ix >> 2, iy >> 2, iz >> 2] == 0:
-                    continue
-                opacity = alpha[ix, iy, iz]
-                if opacity < ZERO:
-                    continue
-                start[used] = t - HALF * step
-                raw[used] = transmittance * opacity
-                total += raw[used]
-                transmittance *= ONE - opacity
-                close = abs(t - prior[r]) <= prior_width[r]
-                near[used] = 1 if close else 0
-                near_count += 1 if close else 0
-                used += 1
+            ray = origin[r, 0], origin[r, 1], origin[r, 2], direction[r, 0], direction[r, 1], direction[r, 2]
+            used, total, near_count = _walk(
+                ray, low, high, alpha, blocks_used, step, distance[r], width[r], start, raw, near
+            )
             if used == 0:
                 continue
             out_hit[r] = 1
-            share_prior = prior_share[r] if near_count > 0 else np.float32(0.0)
-            share_uniform = uniform_share * (ONE - share_prior)
-            share_weight = (ONE - share_prior) - share_uniform
-            if total < np.float32(1e-4):
-                share_uniform += share_weight
-                share_weight = np.float32(0.0)
-            blurred = np.float32(0.0)
-            for i in range(used):
-                blurred += max(raw[i], max(raw[max(i - 1, 0)], raw[min(i + 1, used - 1)]))
-            blurred = max(blurred, np.float32(1e-12))
-            k = -1
-            before, after = np.float32(0.0), np.float32(0.0)
-            edge = np.float32(0.0)
-            for s in range(samples):
-                goal = np.float32(s + 1) / np.float32(samples)
-                while k < used - 1 and (k < 0 or after < goal):
-                    k += 1
-                    before = after
-                    peak = max(raw[k], max(raw[max(k - 1, 0)], raw[min(k + 1, used - 1)]))
-                    mass = share_uniform / np.float32(used) + share_weight * peak / blurred
-                    if near[k] == 1:
-                        mass += share_prior / np.float32(near_count)
-                    after = before + mass
-                inside = (goal - before) / max(after - before, np.float32(1e-12))
-                end = np.float32(k) + min(max(inside, np.float32(0.0)), ONE)
-                if s == samples - 1:
-                    end = np.float32(used)
-                end = max(end, edge)
-                middle = edge + (end - edge) * jitter[r, s]
-                cell = min(int(middle), used - 1)
-                out_t[r, s] = start[cell] + (middle - np.float32(cell)) * step
-                out_delta[r, s] = (end - edge) * step
-                edge = end
+            shares = _shares(uniform, share[r], near_count, total)
+            _place(r, jitter, shares, near_count, used, step, start, raw, near, out_t, out_delta)

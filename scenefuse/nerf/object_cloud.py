@@ -1,11 +1,11 @@
 """Object cloud from rendered depth: views fused where they agree, carved by the masks, thinned, cleaned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -17,58 +17,81 @@ from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.views import Views, load_views
+from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
+
+Maps = NDArray[np.float32]
+
+# Fewer points than these are no surface.
+LEAST_POINTS = 100
+# A point may lie this far beyond another photo's mask: masks are cut off a little.
+MASK_REACH_PX = 2
+# A point is as far from the others as the mean of its distances to so many.
+NEAR_POINTS = 8
+# Points belong to one group where steps of this many spacings lead from one to the other.
+STEP_SPACINGS = 3
+# Points that a normal's plane is fitted to.
+PLANE_POINTS = 16
+
+
+@dataclass(frozen=True)
+class CloudGates:
+    """Which points of rendered depth maps are kept."""
+
+    point_agreement: float = 0.006
+    """Largest difference of depth that agrees, share of the object's diagonal."""
+    min_confidence: float = 0.3
+    """Rendered depths below this confidence (0..1) are not used."""
+    through_share: float = 0.3
+    """Share of the views that may see past a point."""
+    mask_share: float = 0.1
+    """Share of the views in whose mask a point need not lie."""
+    outlier_deviations: float = 3.0
+    """Points whose neighbours are farther than the mean by so many standard deviations are dropped."""
+    min_component: float = 0.01
+    """Connected groups with a smaller share of the points are dropped."""
 
 
 @dataclass(frozen=True)
 class CloudSettings:
     """How rendered depth maps become one cloud."""
 
-    min_views: int = setting(2, least=0)
-    """views that must agree on a point, its own included"""
-    agreement: float = setting(0.006, unit="of the diagonal", least=0)
-    """largest difference of depth that agrees, share of the diagonal"""
-    min_confidence: float = setting(0.3, least=0)
-    """rendered depths below this confidence (0..1) are not used"""
-    through_share: float = setting(0.3, least=0)
-    """share of the views that may see past a point"""
-    mask_share: float = setting(0.1, least=0)
-    """share of the views in whose mask a point need not lie"""
-    spacing: float = setting(0.004, unit="of the diagonal", least=0)
-    """distance between points, share of the diagonal"""
-    outlier_deviations: float = setting(3, least=0)
-    """points whose neighbours are farther than the mean by so many standard deviations are dropped"""
-    min_component: float = setting(0.01, least=0)
-    """connected groups with a smaller share of the points are dropped"""
+    min_views: int = setting(2, least=1)
+    """Views that must agree on a point, its own included; more keep fewer and better points."""
+    spacing: float = setting(0.004, above=0, most=1)
+    """Distance between points, share of the object's diagonal."""
+    gates: CloudGates = CloudGates()
+    """Which points are kept."""
+    refinement: RefinementSettings = RefinementSettings()
+    """Of rendered depths by photos."""
 
 
-def make_object_cloud(
-    *,
-    cameras: Path,
-    masks: Path,
-    stage: Path,
-    stage_report: Path,
-    cameras_report: Path,
-    cloud: Path,
-    report: Path,
-    refinement: RefinementSettings,
-    settings: CloudSettings,
-    seed: int,
-) -> None:
+@dataclass(frozen=True)
+class CloudInputs:
+    """What an object's cloud is made from."""
+
+    workspace: Path
+    """Undistorted COLMAP workspace of the object."""
+    workspace_json: Path
+    """Its JSON, for `up_in_camera_frame`."""
+    masks: Path
+    """Folder of masks named like the photos, .png."""
+    stage: Path
+    """Folder of the last NeRF stage."""
+    stage_json: Path
+    """Its JSON, for `nerf_from_object`."""
+
+
+def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, settings: CloudSettings, seed: int) -> None:
     """Fuse a NeRF stage's depth maps into the object's cloud (method N13), in the object's camera (SfM) frame.
 
-    Rendered depths are first moved to where the photos match best, where they match, and those that the photos deny
-    are left out (`refine_by_photos`).
+    Rendered depths are first moved to where the photos match best, where they match, and those that no photo confirms
+    although there is texture are left out (`refine_by_photos`).
 
     Args:
-        cameras: undistorted COLMAP workspace of the object.
-        masks: folder of masks named like the photos, .png.
-        stage: folder of the last NeRF stage.
-        stage_report: its JSON, for `nerf_from_object`.
-        cameras_report: JSON of the cameras stage, for `up_in_camera_frame`.
+        inputs: photos, masks and the NeRF stage.
         cloud: output PLY with normals, colours, and the fields `confidence` (0..1) and `views`.
         report: output JSON.
-        refinement: of rendered depths by photos.
         settings: gates and spacing.
         seed: of the sample that measures spacing.
 
@@ -76,110 +99,101 @@ def make_object_cloud(
         StageError: a map is missing, or no point passes the gates.
     """
     use_threads(threads())
-    if not (stage / "model.pt").is_file():
-        raise StageError(f"{stage}/model.pt does not exist; run the NeRF stage first")
-    saved = torch.load(stage / "model.pt", map_location="cpu", weights_only=True)
-    nerf_from_object = read_json(stage_report)["nerf_from_object"]
-    up = read_json(cameras_report).get("up_in_camera_frame")
-    width = read_depth(stage / "depth_maps" / f"{saved['names'][0]}.bin").shape[1]
-    views = load_views(cameras, masks, width, 0)
-    if views.names != list(saved["names"]):
-        raise StageError(f"{stage} was made from other photos than {cameras} holds now; run the NeRF stage again")
-    poses = saved["object_from_cam"].numpy()
-    depths, confidence, normals = _maps(stage, views, settings.min_confidence)
-    rendered = max(int((depths > 0).sum()), 1)
-    refined = refine_by_photos(views, poses, depths, refinement)
-    depths = np.where(refined.inconsistent, 0, refined.depths)
-    raw, diagonal = fuse_depths(views, poses, depths, confidence, normals, settings)
-    if len(raw) < 100:
+    saved = read_nerf(inputs.stage)
+    known = {"nerf_from_object": read_json(inputs.stage_json)["nerf_from_object"]}
+    if up := read_json(inputs.workspace_json).get("up_in_camera_frame"):
+        known["up_in_camera_frame"] = up
+    views = _views(inputs, saved["names"])
+    maps = _read_maps(inputs.stage, views, settings.gates.min_confidence)
+    poses, rendered = saved["object_from_cam"].numpy(), max(int((maps.depths > 0).sum()), 1)
+    refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
+    maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
+    raw, diagonal = fuse_depths(views, poses, maps, settings)
+    if len(raw) < LEAST_POINTS:
         raise StageError(
-            f"no surface found: {len(raw)} points of {stage} pass the gates; "
-            "check masks and held-out renders, or loosen min_views, agreement and min_confidence"
+            f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
+            "or lower min_views"
         )
     thinned = voxel_downsample(raw, settings.spacing * diagonal)
-    cleaned = clean(thinned, settings.outlier_deviations, settings.min_component, settings.spacing * diagonal)
-    cleaned = with_plane_normals(cleaned, neighbours=16)
+    gates = settings.gates
+    cleaned = clean(thinned, gates.outlier_deviations, gates.min_component, settings.spacing * diagonal)
+    cleaned = with_plane_normals(cleaned)
+    shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)
     write_cloud(cloud, cleaned)
-    content = {
-        "points": quantity(len(cleaned), "1"),
-        "refined_share": quantity(float(refined.moved.sum() / rendered), "1"),
-        "inconsistent_share": quantity(float(refined.inconsistent.sum() / rendered), "1"),
-        "points_before_thinning": quantity(len(raw), "1"),
-        "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
-        "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),
-        "diagonal": quantity(cleaned.diagonal, "object units"),
-        "views_per_point": quantity(float(np.mean(cleaned.fields["views"])), "1"),
-        "confidence_mean": quantity(float(np.mean(cleaned.fields["confidence"])), "1"),
-        "nerf_from_object": nerf_from_object,
-    }
-    write_json(report, content | ({"up_in_camera_frame": up} if up else {}))
+    write_json(report, _report(raw, thinned, cleaned, shares, seed) | known)
     print(f"{len(cleaned)} points on a diagonal of {cleaned.diagonal:.4g}", flush=True)
 
 
+@dataclass(frozen=True)
+class SurfaceMaps:
+    """Rendered maps of V views: depths (V, H, W) along z, 0 for none; confidence (V, H, W) in 0..1; normals
+    (V, H, W, 3) in the camera's axes, 0 for none."""
+
+    depths: Maps
+    confidence: Maps
+    normals: Maps
+
+
 def fuse_depths(
-    views: Views,
-    poses: NDArray[np.float64],
-    depths: NDArray[np.float32],
-    confidence: NDArray[np.float32],
-    normals: NDArray[np.float32],
-    settings: CloudSettings,
+    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, settings: CloudSettings
 ) -> tuple[Cloud, float]:
     """Points of all views that other views confirm, each the mean of those that agree, and the object's diagonal.
 
     Args:
         views: photos, masks and intrinsics at the maps' size.
         poses: (V, 4, 4) object_from_cam that the maps were rendered with.
-        depths: (V, H, W) along z, 0 for none.
-        confidence: (V, H, W) in 0..1.
-        normals: (V, H, W, 3) in the camera frame.
+        maps: of the views.
         settings: the gates.
     """
-    known = [surface_points(*view) for view in zip(depths, views.intrinsics, poses)]
-    together = np.concatenate([points for points, _, _ in known])
+    points = [surface_points(*view)[0] for view in zip(maps.depths, views.intrinsics, poses)]
+    together = np.concatenate(points)
     if len(together) == 0:
         return Cloud(together), 0.0
     diagonal = extent(together)
-    grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for m in views.masks])
-    parts = []
-    for index, (points, rows, columns) in enumerate(known):
-        said = compare(points, index, depths, grown, views.intrinsics, poses, settings.agreement * diagonal)
-        seen = said.agree + said.through
-        keep = (said.agree + 1 >= settings.min_views) & (said.through <= settings.through_share * seen)
-        keep &= said.off_mask <= settings.mask_share * said.compared
-        rows, columns = rows[keep], columns[keep]
-        turned = normals[index, rows, columns] @ poses[index, :3, :3].T.astype(np.float32)
-        towards = poses[index, :3, 3] - said.mean[keep]
-        missing = ~turned.any(1)
-        turned[missing] = (towards[missing] / np.linalg.norm(towards[missing], axis=1, keepdims=True)).astype(
-            np.float32
-        )
-        parts.append(
-            Cloud(
-                said.mean[keep],
-                turned,
-                views.images[index, rows, columns],
-                {
-                    "confidence": confidence[index, rows, columns].astype(np.float32),
-                    "views": (said.agree[keep] + 1).astype(np.int32),
-                },
-            )
-        )
+    size = 2 * MASK_REACH_PX + 1
+    grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for m in views.masks])
+    tolerance = settings.gates.point_agreement * diagonal
+    parts = [_confirmed(views, poses, maps, grown, tolerance, index, settings) for index in range(len(poses))]
     return concatenate(parts), diagonal
+
+
+def _confirmed(
+    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, grown: NDArray[np.bool_], tolerance: float,
+    index: int, settings: CloudSettings,
+) -> Cloud:  # fmt: skip
+    """The points of one view that pass the gates; `grown` (V, H, W) are the masks that points may lie in."""
+    points, rows, columns = surface_points(maps.depths[index], views.intrinsics[index], poses[index])
+    found = compare(points, index, maps.depths, grown, views.intrinsics, poses, tolerance)
+    gates = settings.gates
+    keep = found.agree + 1 >= settings.min_views
+    keep &= found.through <= gates.through_share * (found.agree + found.through)
+    keep &= found.off_mask <= gates.mask_share * found.compared
+    rows, columns = rows[keep], columns[keep]
+    normals = maps.normals[index, rows, columns] @ poses[index, :3, :3].T.astype(np.float32)
+    towards = poses[index, :3, 3] - found.mean[keep]
+    missing = ~normals.any(1)
+    normals[missing] = towards[missing] / np.linalg.norm(towards[missing], axis=1, keepdims=True)
+    fields = {
+        "confidence": maps.confidence[index, rows, columns].astype(np.float32),
+        "views": (found.agree[keep] + 1).astype(np.int32),
+    }
+    return Cloud(found.mean[keep], normals, views.images[index, rows, columns], fields)
 
 
 def clean(cloud: Cloud, deviations: float, min_component: float, step: float) -> Cloud:
     """Drop points with far neighbours, then small groups that no chain of steps of 3 x `step` joins to the rest."""
-    distance = cKDTree(cloud.points).query(cloud.points, k=min(9, len(cloud)), workers=threads())[0][:, 1:].mean(1)
+    near = min(NEAR_POINTS + 1, len(cloud))
+    distance = cKDTree(cloud.points).query(cloud.points, k=near, workers=threads())[0][:, 1:].mean(1)
     cloud = cloud[distance <= distance.mean() + deviations * distance.std()]
-    pairs = cKDTree(cloud.points).query_pairs(3 * step, output_type="ndarray")
+    pairs = cKDTree(cloud.points).query_pairs(STEP_SPACINGS * step, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cloud), len(cloud)))
     group = connected_components(graph, directed=False)[1]
     return cloud[np.bincount(group)[group] >= min_component * len(cloud)]
 
 
-def with_plane_normals(cloud: Cloud, neighbours: int) -> Cloud:
+def with_plane_normals(cloud: Cloud) -> Cloud:
     """Normals of local planes through the nearest points, on the side of the rendered normals they replace."""
-    index = cKDTree(cloud.points).query(cloud.points, k=min(neighbours, len(cloud)), workers=threads())[1]
+    index = cKDTree(cloud.points).query(cloud.points, k=min(PLANE_POINTS, len(cloud)), workers=threads())[1]
     local = cloud.points[index] - cloud.points[index].mean(1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
     if cloud.normals is not None:
@@ -187,13 +201,38 @@ def with_plane_normals(cloud: Cloud, neighbours: int) -> Cloud:
     return Cloud(cloud.points, normal.astype(np.float32), cloud.colors, cloud.fields)
 
 
-def _maps(
-    stage: Path, views: Views, least: float
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Depth (0 below the least confidence), confidence and normals of all views."""
-    folders = "depth_maps", "confidence_maps", "normal_maps"
-    depths, confidence, normals = (
-        np.stack([(read_normals if k == "normal_maps" else read_depth)(stage / k / f"{n}.bin") for n in views.names])
-        for k in folders
+def _views(inputs: CloudInputs, names: list[str]) -> Views:
+    """The photos at the size of the stage's maps."""
+    width = read_depth(inputs.stage / "depth_maps" / f"{names[0]}.bin").shape[1]
+    views = load_views(inputs.workspace, inputs.masks, width, 0)
+    if views.names != list(names):
+        raise StageError(
+            f"{inputs.stage} was made from other photos than {inputs.workspace} holds now; run the NeRF stage again"
+        )
+    return views
+
+
+def _read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps:
+    """The maps of all views, without depths outside the masks or below the least confidence."""
+    depths, confidence = (
+        np.stack([read_depth(stage / folder / f"{name}.bin") for name in views.names])
+        for folder in ("depth_maps", "confidence_maps")
     )
-    return np.where((confidence >= least) & views.masks, depths, 0).astype(np.float32), confidence, normals
+    normals = np.stack([read_normals(stage / "normal_maps" / f"{name}.bin") for name in views.names])
+    kept = np.where((confidence >= least_confidence) & views.masks, depths, 0).astype(np.float32)
+    return SurfaceMaps(kept, confidence, normals)
+
+
+def _report(raw: Cloud, thinned: Cloud, cleaned: Cloud, shares: tuple[float, float], seed: int) -> dict[str, Any]:
+    """The cloud at its three stages, and the shares of rendered depths that photos moved and contradicted."""
+    return {
+        "points": quantity(len(cleaned), "1"),
+        "refined_share": quantity(shares[0], "1"),
+        "inconsistent_share": quantity(shares[1], "1"),
+        "points_before_thinning": quantity(len(raw), "1"),
+        "points_dropped_as_outliers": quantity(len(thinned) - len(cleaned), "1"),
+        "spacing": quantity(spacing(cleaned.points, seed=seed), "object units"),
+        "diagonal": quantity(cleaned.diagonal, "object units"),
+        "views_per_point": quantity(float(np.mean(cleaned.fields["views"])), "1"),
+        "confidence_mean": quantity(float(np.mean(cleaned.fields["confidence"])), "1"),
+    }

@@ -8,13 +8,20 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from scenefuse.transforms import Sim3
-
-INSIDE, OUTSIDE = 0, 1
+# Pixels beside the object are drawn from a ring of so many pixels around its mask: farther away the hull is empty.
+RING_PX = 12
+# Half-width of the zone around mask edges and depth jumps in which the adaptive grid learns faster.
+EDGE_PX = 3
+# A neighbour's depth that differs by more than this share is a jump, no slanted surface.
+DEPTH_JUMP = 0.03
+# Share of a photo's rays that are drawn beside the object: they teach that nothing is there.
+OUTSIDE_SHARE = 0.1
+# A mask that the ignored band would leave less than this share of is drawn from as a whole: it is thin everywhere.
+THIN_SHARE = 0.2
 
 
 @dataclass(frozen=True)
-class Photos:
+class PhotoTensors:
     """V photos of one size, in the frame of the unit cube ("nerf").
 
     Attributes:
@@ -40,14 +47,18 @@ class Photos:
     def __len__(self) -> int:
         return self.images.shape[0]
 
-    def select(self, index: NDArray[np.int64]) -> "Photos":
+    def select(self, index: NDArray[np.int64]) -> "PhotoTensors":
         """The photos at these indices."""
         chosen = torch.from_numpy(np.asarray(index, dtype=np.int64))
-        return Photos(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return PhotoTensors(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+
+    def camera(self, view: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Intrinsics (3, 3), rotation (3, 3) and centre (3,) of one photo."""
+        return self.intrinsics[view], self.rotation[view], self.center[view]
 
 
 @dataclass(frozen=True)
-class Pool:
+class PixelPool:
     """Pixels that training draws from, view after view: `pixel` holds row * W + column, `start` (V + 1,) the bounds.
 
     Attributes:
@@ -66,7 +77,7 @@ class Pool:
 
 
 @dataclass(frozen=True)
-class Batch:
+class RayBatch:
     """Rays of one step, image after image.
 
     Attributes:
@@ -89,6 +100,10 @@ class Batch:
     confidence: Tensor
     edge: Tensor
 
+    def to(self, device: torch.device) -> "RayBatch":
+        """The same on a device."""
+        return RayBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+
 
 def dilate(masks: Tensor, radius_px: int) -> Tensor:
     """Grow (V, H, W) bool masks by a square of half-width `radius_px`; negative radii shrink them."""
@@ -101,45 +116,42 @@ def dilate(masks: Tensor, radius_px: int) -> Tensor:
     return grown if radius_px > 0 else ~grown
 
 
-def pixel_pool(photos: Photos, band_px: int, ring_px: int, edge_px: int) -> Pool:
+def pixel_pool(photos: PhotoTensors, band_px: int) -> PixelPool:
     """Split the pixels into inside, outside and an ignored band of `band_px` on both sides of the mask's edge.
 
     Args:
         photos: the training photos.
         band_px: half-width of the band that no loss touches; 0 draws from every pixel with some of the object in it.
-        ring_px: how far beyond the band outside pixels are drawn.
-        edge_px: half-width of the zone around mask edges and depth jumps that counts as edge.
     """
     whole = photos.masks if band_px else photos.mattes > 0
     inner = dilate(whole, -band_px)
-    few = inner.flatten(1).sum(1) < 0.2 * whole.flatten(1).sum(1)
-    inner[few] = whole[few]
+    thin = inner.flatten(1).sum(1) < THIN_SHARE * whole.flatten(1).sum(1)
+    inner[thin] = whole[thin]
     outer = dilate(whole, band_px)
-    ring = dilate(outer, ring_px) & ~outer
-    inside, inside_start = _flatten(inner)
-    outside, outside_start = _flatten(ring)
+    ring = dilate(outer, RING_PX) & ~outer
     border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
-    edges = dilate(border | depth_jumps(photos.depths), edge_px)
-    return Pool(inside, inside_start, outside, outside_start, edges.float())
+    edges = dilate(border | depth_jumps(photos.depths), EDGE_PX)
+    return PixelPool(*_flatten(inner), *_flatten(ring), edges.float())
 
 
-def depth_jumps(depths: Tensor, relative: float = 0.03) -> Tensor:
-    """Pixels (V, H, W) whose depth differs from a neighbour's by more than `relative`; never those without depth."""
+def depth_jumps(depths: Tensor) -> Tensor:
+    """Pixels (V, H, W) where the depth jumps from one to the next; never those without depth."""
     jump = torch.zeros_like(depths, dtype=torch.bool)
     for axis in (1, 2):
         a, b = depths.narrow(axis, 0, depths.shape[axis] - 1), depths.narrow(axis, 1, depths.shape[axis] - 1)
-        found = (a > 0) & (b > 0) & ((a - b).abs() > relative * torch.minimum(a, b))
+        found = (a > 0) & (b > 0) & ((a - b).abs() > DEPTH_JUMP * torch.minimum(a, b))
         jump.narrow(axis, 0, depths.shape[axis] - 1).logical_or_(found)
         jump.narrow(axis, 1, depths.shape[axis] - 1).logical_or_(found)
     return jump
 
 
 def _flatten(masks: Tensor) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+    """Pixels of (V, H, W) masks, view after view, and the bounds (V + 1,) of each view."""
     views, pixels = np.nonzero(masks.flatten(1).numpy())
     return pixels.astype(np.int32), np.searchsorted(views, np.arange(len(masks) + 1))
 
 
-def draw_batch(photos: Photos, pool: Pool, seed: int, step: int, images: int, rays: int, outside: float) -> Batch:
+def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, images: int, rays: int) -> RayBatch:
     """Draw `rays` pixels in each of `images` photos; the same seed and step give the same batch.
 
     Args:
@@ -149,30 +161,16 @@ def draw_batch(photos: Photos, pool: Pool, seed: int, step: int, images: int, ra
         step: training step.
         images: photos of the batch; drawn without repetition as far as they go.
         rays: pixels per photo.
-        outside: share of the pixels drawn outside the mask.
     """
     rng = np.random.default_rng((seed, step))
     order = np.concatenate([rng.permutation(len(photos)) for _ in range(-(-images // len(photos)))])[:images]
-    count_out = round(rays * outside)
-    pixel = np.empty((images, rays), dtype=np.int64)
-    inside = np.zeros((images, rays), dtype=bool)
-    for row, view in enumerate(order):
-        first, last = pool.inside_start[view], pool.inside_start[view + 1]
-        out_first, out_last = pool.outside_start[view], pool.outside_start[view + 1]
-        outside_here = count_out if out_last > out_first else 0
-        outside_here = rays if last == first else outside_here
-        inside[row, outside_here:] = True
-        if outside_here:
-            pixel[row, :outside_here] = (
-                pool.outside[rng.integers(out_first, out_last, outside_here)] if out_last > out_first else 0
-            )
-        if outside_here < rays:
-            pixel[row, outside_here:] = pool.inside[rng.integers(first, last, rays - outside_here)]
-    width = photos.images.shape[2]
+    drawn = [_draw_pixels(pool, int(view), rays, rng) for view in order]
+    flat = torch.from_numpy(np.concatenate([pixels for pixels, _ in drawn]))
+    inside = np.arange(rays) >= np.array([outside for _, outside in drawn])[:, None]
     view = torch.from_numpy(np.repeat(order, rays))
-    flat = torch.from_numpy(pixel.reshape(-1))
+    width = photos.images.shape[2]
     down, across = flat // width, flat % width
-    return Batch(
+    return RayBatch(
         view,
         torch.stack([across + 0.5, down + 0.5], dim=1).float(),
         torch.from_numpy(inside.reshape(-1)),
@@ -182,6 +180,20 @@ def draw_batch(photos: Photos, pool: Pool, seed: int, step: int, images: int, ra
         photos.confidence[view, down, across],
         pool.edge[view, down, across],
     )
+
+
+def _draw_pixels(pool: PixelPool, view: int, rays: int, rng: np.random.Generator) -> tuple[NDArray[np.int64], int]:
+    """Pixels (R,) of one photo, and how many of them, the first ones, lie beside the object."""
+    first, last = pool.inside_start[view : view + 2]
+    ring_first, ring_last = pool.outside_start[view : view + 2]
+    outside = round(rays * OUTSIDE_SHARE) if ring_last > ring_first else 0
+    outside = rays if last == first else outside
+    pixels = np.zeros(rays, dtype=np.int64)
+    if outside and ring_last > ring_first:
+        pixels[:outside] = pool.outside[rng.integers(ring_first, ring_last, outside)]
+    if outside < rays:
+        pixels[outside:] = pool.inside[rng.integers(first, last, rays - outside)]
+    return pixels, outside
 
 
 def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -202,34 +214,3 @@ def camera_rays(intrinsics: Tensor, rotation: Tensor, center: Tensor, uv: Tensor
     length = in_camera.norm(dim=1)
     direction = (rotation @ (in_camera / length[:, None])[:, :, None])[:, :, 0]
     return center, direction, length
-
-
-def cube_from_cameras(
-    masks: NDArray[np.bool_], intrinsics: NDArray[np.float64], object_from_cam: NDArray[np.float64]
-) -> Sim3:
-    """A generous cube around the object from masks and cameras alone: unit_from_object.
-
-    Its centre is the point nearest to the viewing rays of the masks' centres; its size follows from their extents.
-
-    Raises:
-        ValueError: fewer than two photos have a mask.
-    """
-    normal, right, rays, angles = np.zeros((3, 3)), np.zeros(3), [], []
-    for mask, k, pose in zip(masks, intrinsics, object_from_cam):
-        rows, columns = np.nonzero(mask)
-        if len(rows) < 16:
-            continue
-        box = np.percentile(columns, [0.5, 99.5]), np.percentile(rows, [0.5, 99.5])
-        middle = np.array([box[0].mean() + 0.5, box[1].mean() + 0.5, 1.0])
-        direction = pose[:3, :3] @ np.linalg.solve(k, middle)
-        direction /= np.linalg.norm(direction)
-        project = np.eye(3) - np.outer(direction, direction)
-        normal, right = normal + project, right + project @ pose[:3, 3]
-        rays.append(pose[:3, 3])
-        angles.append(0.5 * np.hypot(np.ptp(box[0]) / k[0, 0], np.ptp(box[1]) / k[1, 1]))
-    if len(rays) < 2:
-        raise ValueError("fewer than two photos have a mask of the object")
-    center = np.linalg.solve(normal, right)
-    radius = max(np.percentile(np.linalg.norm(np.array(rays) - center, axis=1) * np.array(angles), 90), 1e-9)
-    scale = 0.5 / (1.5 * radius)
-    return Sim3(scale, np.eye(3), 0.5 - scale * center)

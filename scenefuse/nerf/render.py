@@ -12,9 +12,17 @@ from scenefuse.nerf.field import Field
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.rays import camera_rays
 
+# Share of a ray's samples that is spread evenly over its occupied part: what the grid does not know yet is seen too.
+UNIFORM_SHARE = 0.25
+# Sum of compositing weights below which the grid knows no surface on a ray.
+LEAST_KNOWN = 1e-4
+# Rays that a view is rendered in at a time: the samples of more would leave the processor's caches.
+RAYS_AT_ONCE = 4096
+TINY = 1e-12
+
 
 @dataclass(frozen=True)
-class Samples:
+class RaySamples:
     """S samples on each ray that meets an occupied cell.
 
     Attributes:
@@ -29,7 +37,7 @@ class Samples:
 
 
 @dataclass(frozen=True)
-class Prior:
+class RayPrior:
     """Where a depth prior expects the surface: distance (R,) along the ray, half-width (R,), share of samples (R,)."""
 
     distance: Tensor
@@ -37,9 +45,15 @@ class Prior:
     share: Tensor
 
 
+def no_prior(rays: int, device: torch.device) -> RayPrior:
+    """Nothing is expected anywhere."""
+    none = torch.zeros(rays, device=device)
+    return RayPrior(none - 1, none, none)
+
+
 def march(
-    origin: Tensor, direction: Tensor, occupancy: Occupancy, jitter: Tensor, uniform: float, prior: Prior
-) -> Samples:
+    origin: Tensor, direction: Tensor, occupancy: Occupancy, jitter: Tensor, uniform: float, prior: RayPrior
+) -> RaySamples:
     """Draw samples along rays, more of them where the grid or a depth prior expects the surface.
 
     Args:
@@ -56,56 +70,31 @@ def march(
         t, delta = torch.zeros(jitter.shape), torch.zeros(jitter.shape)
         hit = torch.zeros(len(jitter), dtype=torch.uint8)
         kernels.march(
-            origin.numpy(), direction.numpy(), occupancy.alpha.numpy(), occupancy.blocks_used.numpy(),
-            _f32(occupancy.step), jitter.numpy(), _f32(uniform), prior.distance.numpy(), prior.width.numpy(),
-            prior.share.numpy(), t.numpy(), delta.numpy(), hit.numpy(),
-        )  # fmt: skip
+            (origin.numpy(), direction.numpy()),
+            (occupancy.alpha.numpy(), occupancy.blocks_used.numpy(), np.float32(occupancy.step)),
+            jitter.numpy(),
+            np.float32(uniform),
+            (prior.distance.numpy(), prior.width.numpy(), prior.share.numpy()),
+            (t.numpy(), delta.numpy(), hit.numpy()),
+        )
     ray = torch.nonzero(hit)[:, 0]
-    return Samples(ray, t[ray], delta[ray])
+    return RaySamples(ray, t[ray], delta[ray])
 
 
 def march_reference(
-    origin: Tensor, direction: Tensor, occupancy: Occupancy, jitter: Tensor, uniform: float, prior: Prior
+    origin: Tensor, direction: Tensor, occupancy: Occupancy, jitter: Tensor, uniform: float, prior: RayPrior
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`kernels.march` in plain PyTorch: t (R, S), delta (R, S), hit (R,)."""
     step = occupancy.step
-    safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
-    a, b = -origin / safe, (1 - origin) / safe
-    low = torch.minimum(a, b).amax(1).clamp(min=0)
-    high = torch.maximum(a, b).amin(1)
-    intervals = int(math.sqrt(3.0) / step) + 2
-    index = torch.arange(intervals, device=origin.device)
-    middle = low[:, None] + (index + 0.5) * step
-    x = origin[:, None] + middle[..., None] * direction[:, None]
-    cell = (x * occupancy.size).long().clamp(0, occupancy.size - 1)
-    opacity = occupancy.alpha[cell.unbind(-1)]
-    valid = (index < torch.ceil((high - low).clamp(min=0) / step)[:, None]) & (opacity >= 0)
-    # Occupied intervals first, in their order along the ray.
-    order = torch.argsort((~valid).to(torch.int8), dim=1, stable=True)
-    valid, start = valid.gather(1, order), (middle - 0.5 * step).gather(1, order)
-    alpha = opacity.gather(1, order) * valid
-    ahead = torch.cumprod(1 - alpha, 1)
-    raw = torch.cat([torch.ones_like(ahead[:, :1]), ahead[:, :-1]], 1) * alpha
-    padded = torch.nn.functional.pad(raw, (1, 1))
-    peak = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), raw) * valid
+    start, alpha, valid = _occupied_intervals(origin, direction, occupancy)
     used = valid.sum(1, keepdim=True)
-    near = valid & ((start + 0.5 * step - prior.distance[:, None]).abs() <= prior.width[:, None])
-    near_count = near.sum(1, keepdim=True)
-    share_prior = torch.where(near_count > 0, prior.share[:, None], torch.zeros_like(raw[:, :1]))
-    known = raw.sum(1, keepdim=True) >= 1e-4
-    share_uniform = torch.where(known, uniform * (1 - share_prior), 1 - share_prior)
-    share_weight = 1 - share_prior - share_uniform
-    mass = (
-        share_uniform / used.clamp(min=1) * valid
-        + share_weight * peak / peak.sum(1, keepdim=True).clamp(min=1e-12)
-        + share_prior / near_count.clamp(min=1) * near
-    )
+    mass = _mass(start + 0.5 * step, alpha, valid, uniform, prior)
     cdf = torch.cumsum(mass, 1)
     samples = jitter.shape[1]
     goal = ((torch.arange(samples, device=origin.device) + 1) / samples).expand(len(origin), samples).contiguous()
     k = torch.searchsorted(cdf, goal).minimum(used - 1).clamp(min=0)
     before = (cdf - mass).gather(1, k)
-    end = k + ((goal - before) / mass.gather(1, k).clamp(min=1e-12)).clamp(0, 1)
+    end = k + ((goal - before) / mass.gather(1, k).clamp(min=TINY)).clamp(0, 1)
     end[:, -1:] = used.to(end.dtype)
     edge = torch.cat([torch.zeros_like(end[:, :1]), end[:, :-1]], 1)
     position = edge + (end - edge) * jitter
@@ -114,25 +103,82 @@ def march_reference(
     return t, (end - edge) * step, used[:, 0] > 0
 
 
-def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Volume rendering of S samples on each of R rays.
+def _occupied_intervals(origin: Tensor, direction: Tensor, occupancy: Occupancy) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays cut into N intervals: where they start (R, N), their opacity, and which count; occupied ones come first."""
+    step = occupancy.step
+    safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
+    a, b = -origin / safe, (1 - origin) / safe
+    low = torch.minimum(a, b).amax(1).clamp(min=0)
+    high = torch.maximum(a, b).amin(1)
+    index = torch.arange(int(math.sqrt(3.0) / step) + 2, device=origin.device)
+    middle = low[:, None] + (index + 0.5) * step
+    x = origin[:, None] + middle[..., None] * direction[:, None]
+    cell = (x * occupancy.size).long().clamp(0, occupancy.size - 1)
+    opacity = occupancy.alpha[cell.unbind(-1)]
+    valid = (index < torch.ceil((high - low).clamp(min=0) / step)[:, None]) & (opacity >= 0)
+    order = torch.argsort((~valid).to(torch.int8), dim=1, stable=True)
+    valid, start = valid.gather(1, order), (middle - 0.5 * step).gather(1, order)
+    return start, opacity.gather(1, order) * valid, valid
+
+
+def _mass(middle: Tensor, alpha: Tensor, valid: Tensor, uniform: float, prior: RayPrior) -> Tensor:
+    """Share of a ray's samples that each of its intervals (R, N) gets.
+
+    A mixture of three: the same for all, the compositing weights of the grid, blurred by a maximum over neighbours
+    (as Mip-NeRF 360 does, section 3), and the intervals near the prior.
+    """
+    ahead = torch.cumprod(1 - alpha, 1)
+    raw = torch.cat([torch.ones_like(ahead[:, :1]), ahead[:, :-1]], 1) * alpha
+    padded = torch.nn.functional.pad(raw, (1, 1))
+    peak = torch.maximum(torch.maximum(padded[:, :-2], padded[:, 2:]), raw) * valid
+    near = valid & ((middle - prior.distance[:, None]).abs() <= prior.width[:, None])
+    near_count = near.sum(1, keepdim=True)
+    share_prior = torch.where(near_count > 0, prior.share[:, None], torch.zeros_like(raw[:, :1]))
+    known = raw.sum(1, keepdim=True) >= LEAST_KNOWN
+    share_uniform = torch.where(known, uniform * (1 - share_prior), 1 - share_prior)
+    return (
+        share_uniform / valid.sum(1, keepdim=True).clamp(min=1) * valid
+        + (1 - share_prior - share_uniform) * peak / peak.sum(1, keepdim=True).clamp(min=TINY)
+        + share_prior / near_count.clamp(min=1) * near
+    )
+
+
+@dataclass(frozen=True)
+class Composited:
+    """S samples on each of R rays, seen as one.
+
+    Attributes:
+        color: (R, 3) on black.
+        opacity: (R,).
+        moment: (R,) sum of w t; over the opacity it is the expected distance.
+        distortion: (R,).
+        weights: (R, S) compositing weights w, without gradient.
+    """
+
+    color: Tensor
+    opacity: Tensor
+    moment: Tensor
+    distortion: Tensor
+    weights: Tensor
+
+
+def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> Composited:
+    """Volume rendering by quadrature: equation (3) of NeRF (Mildenhall et al. 2020).
+
+    The distortion is equation (15) of Mip-NeRF 360 (Barron et al. 2022), its double sum as running sums.
 
     Args:
         sigma: (R, S) density.
         rgb: (R, S, 3).
         t: (R, S) distance along the ray, increasing.
         delta: (R, S) length each sample stands for.
-
-    Returns:
-        colour (R, 3) on black, opacity (R,), sum of w t (R,), distortion (R,), and the weights w (R, S), which carry
-        no gradient.
     """
     tau = sigma * delta
     before = torch.cumsum(tau, 1) - tau
     w = torch.exp(-before) * (1 - torch.exp(-tau))
     mass, moment = torch.cumsum(w, 1) - w, torch.cumsum(w * t, 1) - w * t
     distortion = (2 * w * (t * mass - moment) + w * w * delta / 3).sum(1)
-    return (w[..., None] * rgb).sum(1), w.sum(1), (w * t).sum(1), distortion, w.detach()
+    return Composited((w[..., None] * rgb).sum(1), w.sum(1), (w * t).sum(1), distortion, w.detach())
 
 
 def median_distance(t: Tensor, delta: Tensor, weights: Tensor) -> Tensor:
@@ -146,7 +192,7 @@ def median_distance(t: Tensor, delta: Tensor, weights: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Rendered:
+class RenderedView:
     """A view as rendered: maps (H, W), zero where the ray was not traced or met nothing.
 
     Attributes:
@@ -162,52 +208,51 @@ class Rendered:
     deviation: Tensor
 
 
+Camera = tuple[Tensor, Tensor, Tensor]
+
+
 @torch.no_grad()
 def render_view(
-    field: Field, occupancy: Occupancy, intrinsics: Tensor, rotation: Tensor, center: Tensor, where: Tensor,
-    samples: int, uniform: float, colored: bool, chunk: int = 4096,
-) -> Rendered:  # fmt: skip
+    field: Field, occupancy: Occupancy, camera: Camera, where: Tensor, samples: int, colored: bool
+) -> RenderedView:
     """Render the pixels of one view.
 
     Args:
         field: trained field.
         occupancy: its grid.
-        intrinsics: (3, 3) in pixels.
-        rotation: (3, 3) nerf_from_cam.
-        center: (3,) camera centre.
+        camera: intrinsics (3, 3) in pixels, nerf_from_cam rotation (3, 3), centre (3,), on the CPU.
         where: (H, W) bool, the pixels to trace.
         samples: samples per ray.
-        uniform: share of the samples spread evenly over the occupied ray.
         colored: False leaves the colours out, which is faster.
-        chunk: rays at once.
     """
+    device = field.table.device
     maps = [torch.zeros(*where.shape, 3), *(torch.zeros(where.shape) for _ in range(3))]
-    for pixels in torch.nonzero(where).split(chunk):
+    for pixels in torch.nonzero(where).split(RAYS_AT_ONCE):
         uv = pixels.flip(1).float() + 0.5
-        count = len(uv)
-        origin, direction, length = camera_rays(
-            intrinsics.expand(count, 3, 3), rotation.expand(count, 3, 3), center.expand(count, 3), uv
-        )
-        device = field.table.device
+        intrinsics, rotation, center = (part.expand(len(uv), *part.shape) for part in camera)
+        origin, direction, length = camera_rays(intrinsics, rotation, center, uv)
         origin, direction = origin.contiguous().to(device), direction.contiguous().to(device)
-        none = torch.zeros(count, device=device)
-        jitter = torch.full((count, samples), 0.5, device=device)
-        drawn = march(origin, direction, occupancy, jitter, uniform, Prior(none - 1, none, none))
+        jitter = torch.full((len(uv), samples), 0.5, device=device)
+        drawn = march(origin, direction, occupancy, jitter, UNIFORM_SHARE, no_prior(len(uv), device))
         if len(drawn.ray) == 0:
             continue
-        x = origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]
-        sigma, features = field.geometry(x.view(-1, 3))
-        rgb = field.color(features, direction[drawn.ray]) if colored else torch.zeros(*drawn.t.shape, 3, device=device)
-        color, opacity, moment, _, w = composite(sigma.view(drawn.t.shape), rgb, drawn.t, drawn.delta)
-        mean = moment / opacity.clamp(min=1e-6)
-        variance = (w * (drawn.t - mean[:, None]) ** 2).sum(1) / opacity.clamp(min=1e-6)
         hit = drawn.ray.cpu()
+        color, distance, opacity, deviation = _render_rays(field, origin, direction, drawn, colored)
         rows, columns = pixels[hit].unbind(1)
-        depth = median_distance(drawn.t, drawn.delta, w).cpu() / length[hit]
-        for target, values in zip(maps, (color, depth, opacity, variance.sqrt())):
-            target[rows, columns] = values.cpu()
-    return Rendered(*maps)
+        for target, values in zip(maps, (color, distance / length[hit], opacity, deviation)):
+            target[rows, columns] = values
+    return RenderedView(*maps)
 
 
-def _f32(value: float) -> np.float32:
-    return np.float32(value)
+def _render_rays(
+    field: Field, origin: Tensor, direction: Tensor, drawn: RaySamples, colored: bool
+) -> tuple[Tensor, ...]:
+    """Colour (H, 3), median distance, opacity and deviation (H,) of the rays that have samples, on the CPU."""
+    x = origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]
+    sigma, features = field.geometry(x.view(-1, 3))
+    rgb = field.color(features, direction[drawn.ray]) if colored else torch.zeros_like(x)
+    ray = composite(sigma.view(drawn.t.shape), rgb, drawn.t, drawn.delta)
+    total = ray.opacity.clamp(min=1e-6)
+    variance = (ray.weights * (drawn.t - (ray.moment / total)[:, None]) ** 2).sum(1) / total
+    distance = median_distance(drawn.t, drawn.delta, ray.weights)
+    return tuple(part.cpu() for part in (ray.color, distance, ray.opacity, variance.sqrt()))

@@ -2,20 +2,22 @@
 
 import shutil
 import time
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.maps import read_depth, read_normals
+from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.io.settings import build, read_settings
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.rendered_maps import MapSettings
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
+from scenefuse.nerf.training import NerfRecipe
 from scenefuse.report.object_sheet import depth_colors
 from scenefuse.report.sheets import Image, Sheet, draw_sheet, save_png
 from scenefuse.sfm.import_photos import import_photos
@@ -23,7 +25,46 @@ from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 NO_CLOUD = 3
-SHEET_ROWS = 6
+SHEET_ROWS, TILE_PX = 6, 320
+
+
+@dataclass(frozen=True)
+class TrainingOptions:
+    """What a NeRF trained on its own can be told beside the keys of a settings file."""
+
+    recipe: NerfRecipe = NerfRecipe()
+    """Batches, rates and samples."""
+    losses: LossWeights = LossWeights()
+    """Weights of the losses."""
+    maps: MapSettings = MapSettings()
+    """Of the rendered maps."""
+    gates: CloudGates = CloudGates()
+    """Which points of the cloud are kept."""
+
+
+AS_SHIPPED = TrainingOptions()
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Where everything lies in the output folder."""
+
+    out: Path
+
+    @property
+    def workspace(self) -> Path:
+        return self.out / "cameras"
+
+    @property
+    def masks(self) -> Path:
+        return self.out / "masks"
+
+    @property
+    def stage(self) -> Path:
+        return self.out / "nerf"
+
+    def json(self, step: str) -> Path:
+        return self.out / "steps" / f"{step}.json"
 
 
 def train_nerf(
@@ -33,7 +74,9 @@ def train_nerf(
     images: Path | None = None,
     masks: Path | None = None,
     config: Path | None = None,
+    epochs: int = 40,
     seed: int | None = None,
+    options: TrainingOptions = AS_SHIPPED,
 ) -> int:
     """Train a NeRF of one object on posed photos, and write its cloud.
 
@@ -46,115 +89,118 @@ def train_nerf(
         images: folder of the photos, where a COLMAP model's are not in images/ beside it.
         masks: folder of masks named like the photos, white on the object; not needed with mask_path or alpha.
         config: YAML of settings that differ from the shipped ones, with the keys of config/config.yaml.
+        epochs: epochs of the training; each is `object.nerf.rays_per_epoch` rays.
         seed: of all random choices; the config's if not given.
+        options: of the training that are no settings.
     """
     start = time.perf_counter()
     settings = read_settings(config)
     seed = settings["seed"] if seed is None else seed
-    if out.exists() and not out.is_dir():
-        raise StageError(f"--out {out} is a file; give a folder")
-    for old in ("report.json", "object.ply", "renders.png"):
-        (out / old).unlink(missing_ok=True)
-    cameras, mattes, stage, steps = out / "cameras", out / "masks", out / "nerf", out / "steps"
-    wanted = settings["object"]
+    wanted, places = settings["object"], _Places(out)
+    _clear(out)
     import_photos(
         data=data,
         images=images,
         masks=masks,
-        cameras=cameras,
-        mattes=mattes,
-        report=steps / "photos.json",
+        workspace=places.workspace,
+        mattes=places.masks,
+        report=places.json("photos"),
         settings=build(UndistortSettings, wanted["undistort"]),
     )
-    photos = read_json(steps / "photos.json")
-    exact = {"mask_band_px": 0} if value(photos, "masks_exact") else {}
-    chosen = wanted["nerf"] | wanted["nerf_alone"] | exact
-    refinement = RefinementSettings()
+    exact = value(read_json(places.json("photos")), "masks_exact")
+    chosen = _nerf_settings(wanted, options, epochs, exact)
     train_object_nerf(
-        cameras=cameras,
-        masks=mattes,
-        prior=None,
-        previous=None,
-        stage=stage,
-        report=steps / "nerf.json",
+        inputs=NerfInputs(places.workspace, places.masks),
+        stage=places.stage,
+        report=places.json("nerf"),
         checkpoints=out / "checkpoints",
-        field=build(FieldSettings, chosen),
-        schedule=build(Schedule, chosen),
-        losses=build(LossWeights, chosen),
-        refinement=refinement,
-        settings=build(NerfSettings, chosen),
+        settings=chosen,
         hold_out_every=wanted["hold_out_every"],
-        device=chosen["device"],
         seed=seed,
     )
     shutil.rmtree(out / "checkpoints", ignore_errors=True)
-    save_png(out / "renders.png", render_sheet(cameras, mattes, stage))
-    nerf = read_json(steps / "nerf.json")
-    written = [out / "report.json", out / "renders.png", stage]
-    try:
-        make_object_cloud(
-            cameras=cameras,
-            masks=mattes,
-            stage=stage,
-            stage_report=steps / "nerf.json",
-            cameras_report=steps / "photos.json",
-            cloud=out / "object.ply",
-            report=steps / "cloud.json",
-            refinement=refinement,
-            settings=build(CloudSettings, wanted["cloud"]),
-            seed=seed,
-        )
-        cloud, refused = read_json(steps / "cloud.json"), None
-        written.append(out / "object.ply")
-    except StageError as error:
-        cloud, refused = {}, str(error)
-    write_json(
-        out / "report.json",
-        {
-            "photos": photos,
-            "nerf": nerf,
-            "cloud": cloud,
-            "no_cloud_because": quantity(refused, ""),
-            "settings": quantity(chosen | {"cloud": wanted["cloud"]}, ""),
-            "seed": quantity(seed, ""),
-            "seconds": quantity(round(time.perf_counter() - start, 1), "s"),
-        },
-    )
-    quality = f"PSNR {value(nerf, 'psnr_held_out'):.2f} dB inside the masks, SSIM {value(nerf, 'ssim'):.3f}"
-    print(f"quality    {quality}, on {value(nerf, 'photos_measured')} {value(nerf, 'measured_on')}")
-    print(f"cloud      {value(cloud, 'points')} points" if cloud else f"cloud      none: {refused}")
-    print(f"written    {', '.join(map(str, written))}", flush=True)
+    save_png(out / "renders.png", render_sheet(places.workspace, places.masks, places.stage))
+    fused = replace(build(CloudSettings, wanted["cloud"]), gates=options.gates)
+    refused = _make_cloud(places, fused, seed)
+    report = _report(places, {"nerf": asdict(chosen), "cloud": asdict(fused)}, refused, seed)
+    write_json(out / "report.json", report | {"seconds": quantity(round(time.perf_counter() - start, 1), "s")})
+    _print_summary(report, places, refused)
     return 0 if refused is None else NO_CLOUD
 
 
-def render_sheet(cameras: Path, masks: Path, stage: Path) -> Image:
+def _clear(out: Path) -> None:
+    """Remove the results of an earlier run, so that none of them can be taken for this one's."""
+    if out.exists() and not out.is_dir():
+        raise StageError(f"--out {out} is a file; give a folder")
+    for old in ("report.json", "object.ply", "renders.png"):
+        (out / old).unlink(missing_ok=True)
+
+
+def _nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int, exact: bool) -> NerfSettings:
+    """Settings and options together; where masks are exact, no band around their edges is left out."""
+    built = build(NerfSettings, wanted["nerf"] | {"epochs": epochs})
+    recipe = replace(options.recipe, mask_band_px=0) if exact else options.recipe
+    return replace(built, recipe=recipe, losses=options.losses, maps=options.maps)
+
+
+def _make_cloud(places: _Places, settings: CloudSettings, seed: int) -> str | None:
+    """Write the cloud, or say why there is none."""
+    inputs = CloudInputs(places.workspace, places.json("photos"), places.masks, places.stage, places.json("nerf"))
+    try:
+        make_object_cloud(
+            inputs=inputs, cloud=places.out / "object.ply", report=places.json("cloud"), settings=settings, seed=seed
+        )
+    except StageError as error:
+        return str(error)
+    return None
+
+
+def _report(places: _Places, settings: dict[str, Any], refused: str | None, seed: int) -> dict[str, Any]:
+    """What the three steps say, and all settings."""
+    return {
+        "photos": read_json(places.json("photos")),
+        "nerf": read_json(places.json("nerf")),
+        "cloud": {} if refused else read_json(places.json("cloud")),
+        "no_cloud_because": quantity(refused, ""),
+        "settings": quantity(settings, ""),
+        "seed": quantity(seed, ""),
+    }
+
+
+def _print_summary(report: dict[str, Any], places: _Places, refused: str | None) -> None:
+    nerf, cloud, out = report["nerf"], report["cloud"], places.out
+    quality = f"PSNR {value(nerf, 'psnr_held_out'):.2f} dB inside the masks, SSIM {value(nerf, 'ssim'):.3f}"
+    written = [out / "report.json", out / "renders.png", places.stage, *([] if refused else [out / "object.ply"])]
+    print(f"quality    {quality}, on {value(nerf, 'photos_measured')} {value(nerf, 'measured_on')}")
+    print(f"cloud      none: {refused}" if refused else f"cloud      {value(cloud, 'points')} points")
+    print(f"written    {', '.join(map(str, written))}", flush=True)
+
+
+def render_sheet(workspace: Path, masks: Path, stage: Path) -> Image:
     """A row for each of some rendered photos: the photo inside its mask, the render, its depth, its normals."""
-    files = {path.stem: path for path in sorted((cameras / "images").iterdir())}
+    photos = {path.stem: path for path in sorted((workspace / "images").iterdir())}
     stems = sorted(path.stem for path in (stage / "renders").glob("*.png"))
     shown = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, SHEET_ROWS).round().astype(int))]
-    rows: list[list[Image | None]] = []
-    for stem in shown:
-        render = _rgb(stage / "renders" / f"{stem}.png")
-        height, width = render.shape[:2]
-        photo = cv2.resize(_rgb(files[stem]), (width, height), interpolation=cv2.INTER_AREA)
-        matte = cv2.resize(_rgb(masks / f"{stem}.png"), (width, height), interpolation=cv2.INTER_AREA)
-        cut_out = (photo * (matte / 255.0) + 0.5).astype(np.uint8)
-        depth = read_depth(stage / "depth_maps" / f"{files[stem].name}.bin")
-        known = depth[depth > 0]
-        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
-        normals = read_normals(stage / "normal_maps" / f"{files[stem].name}.bin")
-        rows.append([cut_out, render, depth_colors(depth, float(low), float(high)), _normal_colors(normals)])
+    rows = [_sheet_row(photos[stem], masks, stage) for stem in shown]
     note = f"{len(shown)} of {len(stems)} rendered photos; depth near bright, far dark; normals in the camera's axes"
     labels = ["photo in its mask", "render", "depth", "normals"]
-    tile = (320, round(320 * rows[0][0].shape[0] / rows[0][0].shape[1]))  # type: ignore[union-attr]
-    return draw_sheet(Sheet("Renders beside the photos", note, rows, shown, labels, {}, tile))
+    height, width = rows[0][0].shape[:2]
+    cells: list[list[Image | None]] = [[*row] for row in rows]
+    tile = (TILE_PX, round(TILE_PX * height / width))
+    return draw_sheet(Sheet("Renders beside the photos", note, cells, shown, labels, {}, tile))
 
 
-def _rgb(file: Path) -> Image:
-    picture = cv2.imread(str(file), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None:
-        raise StageError(f"{file} is not a readable picture; run again")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+def _sheet_row(photo: Path, masks: Path, stage: Path) -> list[Image]:
+    render = read_rgb(stage / "renders" / f"{photo.stem}.png")
+    size = render.shape[1::-1]
+    picture = cv2.resize(read_rgb(photo), size, interpolation=cv2.INTER_AREA)
+    matte = cv2.resize(read_gray(masks / f"{photo.stem}.png"), size, interpolation=cv2.INTER_AREA)
+    cut_out = (picture * (matte[..., None] / 255.0) + 0.5).astype(np.uint8)
+    depth = read_depth(stage / "depth_maps" / f"{photo.name}.bin")
+    known = depth[depth > 0]
+    low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+    normals = read_normals(stage / "normal_maps" / f"{photo.name}.bin")
+    return [cut_out, render, depth_colors(depth, float(low), float(high)), _normal_colors(normals)]
 
 
 def _normal_colors(normals: NDArray[np.float32]) -> Image:

@@ -1,340 +1,354 @@
-"""Training of the depth-guided NeRF: one loop, resumable, the same result for the same seed."""
+"""Training of the depth-guided NeRF: one loop, resumable, the same result for the same seed.
+
+Everything lies in the frame of the unit cube ("nerf"): lengths and depths are shares of the cube's side.
+"""
 
 import contextlib
 import ctypes
-import math
-import os
-import signal
 import sys
-import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from scenefuse.cores import use_threads
+from scenefuse.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
 from scenefuse.nerf import losses
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
-from scenefuse.nerf.rays import Batch, Photos, camera_rays, draw_batch, pixel_pool
-from scenefuse.nerf.render import Prior, composite, march
+from scenefuse.nerf.pose_refinement import corrected
+from scenefuse.nerf.progress import Progress
+from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
+from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
 from scenefuse.stage import setting
 
-DEPTH_DELTA = 0.01
+# Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
+ADAM_BETAS, ADAM_EPSILON = (0.9, 0.99), 1e-15
 OCCUPANCY_EVERY = 16
+# The grid drops no cell in the first tenth of a training: the densities there mean nothing yet.
+PRUNE_FROM = 0.1
+# Samples fall to their last number by the middle of the training, when the grid knows the surface.
+SAMPLES_FALL_UNTIL = 0.5
+# The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
+LOWEST_RATE = 0.02
+# Poses stay as they are at first: the gradients of an untrained field would scatter them.
+POSES_FROM = 0.2
+# Where a prior expects the surface, at most this share of a ray's samples lies within this distance of it.
+PRIOR_SHARE, PRIOR_HALF_WIDTH = 0.6, 0.04
+# A step's random numbers come from a seed of their own, so that a resumed training draws the same ones.
+SEED_STRIDE = 1_000_003
 
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast a NeRF stage trains."""
+    """How long a NeRF stage trains."""
 
-    epochs: int = setting(20, least=0)
-    """epochs of this stage"""
-    rays_per_epoch: int = setting(60000, least=0)
-    """rays drawn per epoch"""
-    images_per_batch: int = setting(24, least=0)
-    """photos per batch"""
-    rays_per_image: int = setting(96, least=0)
-    """rays per photo of a batch"""
-    warmup_epochs: float = setting(1, least=0)
-    """epochs of linear warm-up, before the cosine"""
-    learning_rate: float = setting(0.005, least=0)
-    """highest learning rate of the networks"""
-    grid_learning_rate: float = setting(0.01, least=0)
-    """highest learning rate of the hash grid"""
-    samples_first: int = setting(32, least=0)
-    """samples per ray at the start"""
-    samples_last: int = setting(16, least=0)
-    """samples per ray at the end"""
-    coarse_until: float = setting(0.3, least=0)
-    """share of the steps after which all levels are open"""
-    edge_boost: float = setting(1, least=0)
-    """adaptive grid: gradients of fine levels are multiplied by 1 + this at edges"""
-    pose_learning_rate: float = setting(0, least=0)
-    """learning rate of the camera poses, 0 keeps them"""
+    epochs: int = setting(20, least=1)
+    """Epochs of this stage; an epoch is a number of rays."""
+    rays_per_epoch: int = setting(60000, least=1)
+    """Rays drawn per epoch."""
+
+
+@dataclass(frozen=True)
+class NerfRecipe:
+    """How a NeRF stage trains.
+
+    Adam, warm-up, cosine and batches of 24 photos are the paper's (section 4.2.2); its highest rate, 0.001, is too low
+    for a hash grid (method N7).
+    """
+
+    images_per_batch: int = 24
+    """Photos per batch."""
+    rays_per_image: int = 96
+    """Rays per photo of a batch."""
+    warmup_epochs: float = 1.0
+    """Epochs of linear warm-up, before the cosine."""
+    learning_rate: float = 5e-3
+    """Highest learning rate of the networks."""
+    grid_learning_rate: float = 1e-2
+    """Highest learning rate of the hash grid."""
+    samples_first: int = 32
+    """Samples per ray at the start."""
+    samples_last: int = 16
+    """Samples per ray from the middle of the training on."""
+    coarse_until: float = 0.3
+    """Share of the steps after which all levels are open (method N9)."""
+    edge_boost: float = 1.0
+    """The paper's adaptive grid: gradients of fine levels are multiplied by 1 + this at edges (method N9)."""
+    pose_learning_rate: float = 0.0
+    """The paper's pose refinement: learning rate of the camera poses, 0 keeps them (method N11)."""
+    mask_band_px: int = 2
+    """Half-width of the band around a mask's edge that no loss touches; 0: masks are exact, grey values included."""
+
+    occupancy_cells: int = 128
+    """Cells per side of the occupancy grid, a multiple of 4 times a power of 2."""
 
     @property
-    def steps(self) -> int:
-        """Optimiser steps of the stage."""
-        return max(1, round(self.epochs * self.rays_per_epoch / (self.images_per_batch * self.rays_per_image)))
+    def rays_per_step(self) -> int:
+        """Rays of a batch."""
+        return self.images_per_batch * self.rays_per_image
 
 
 @dataclass
-class Model:
+class Nerf:
     """All that is trained: the field, its occupancy grid, and corrections (V, 6) of the poses (rotation, centre)."""
 
     field: Field
     occupancy: Occupancy
     pose: Tensor
 
-    def state(self) -> dict[str, Any]:
-        """As plain tensors, for a file."""
+    def state(self) -> State:
+        """As plain tensors on the CPU, for a file that any machine can read."""
         return {
             "settings": asdict(self.field.settings),
-            "field": self.field.state_dict(),
+            "field": {name: tensor.cpu() for name, tensor in self.field.state_dict().items()},
             "hull": self.occupancy.hull.cpu(),
             "density": self.occupancy.density.cpu(),
             "occupied": self.occupancy.occupied.cpu(),
             "pose": self.pose.detach().cpu(),
         }
 
-    @classmethod
-    def from_state(cls, state: dict[str, Any], device: str = "cpu") -> "Model":
-        """Back from `state`."""
-        field = Field(FieldSettings(**state["settings"]), torch.Generator().manual_seed(0))
-        field.load_state_dict(state["field"])
-        occupancy = Occupancy(*(state[k].to(device) for k in ("hull", "density", "occupied")))
-        return cls(field.to(device), occupancy, state["pose"].to(device))
 
-
-def new_model(settings: FieldSettings, hull: Tensor, photos: int, seed: int, device: str) -> Model:
-    """An untrained model."""
+def new_nerf(settings: FieldSettings, hull: Tensor, photos: int, seed: int, device: str) -> Nerf:
+    """An untrained NeRF in a hull (G, G, G), for a number of training photos."""
     field = Field(settings, torch.Generator().manual_seed(seed)).to(device)
-    return Model(field, Occupancy.from_hull(hull.to(device)), torch.zeros(photos, 6, device=device))
+    return Nerf(field, Occupancy.from_hull(hull.to(device)), torch.zeros(photos, 6, device=device))
+
+
+def go_on_from(nerf: Nerf, earlier: State) -> None:
+    """Take over the field and the densities of an earlier stage (`Nerf.state`); all of the new hull is occupied."""
+    nerf.field.load_state_dict(earlier["field"])
+    nerf.field.level_weight.fill_(1.0)
+    hull = nerf.occupancy.hull
+    nerf.occupancy = Occupancy(hull, earlier["density"].to(hull.device), hull)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What a training works on, the same at every step.
+
+    Attributes:
+        photos: training photos in the unit cube's frame.
+        schedule: its length.
+        recipe: batches, rates, samples.
+        weights: of the losses.
+        warm: the NeRF is already trained: all levels are open and the grid is pruned from the start.
+        seed: decides every random draw together with the step's number.
+    """
+
+    photos: PhotoTensors
+    schedule: Schedule
+    recipe: NerfRecipe
+    weights: LossWeights
+    warm: bool
+    seed: int
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps."""
+        return max(1, round(self.schedule.epochs * self.schedule.rays_per_epoch / self.recipe.rays_per_step))
+
+    @property
+    def warmup_steps(self) -> float:
+        """Steps of linear warm-up."""
+        return self.recipe.warmup_epochs / self.schedule.epochs * self.steps
 
 
 def train(
-    model: Model,
-    photos: Photos,
-    schedule: Schedule,
-    weights: LossWeights,
-    *,
-    warm: bool,
-    seed: int,
-    threads: int,
-    checkpoint: Path | None,
-    report: Callable[[str], None],
-    band_px: int,
+    nerf: Nerf, training: Training, *, checkpoint: Path | None, report: Callable[[str], None]
 ) -> dict[str, float]:
-    """Train `model` in place on `photos`.
+    """Train `nerf` in place.
 
     Args:
-        model: new, or of an earlier stage.
-        photos: training photos in the unit cube's frame.
-        schedule: lengths and rates.
-        weights: of the losses.
-        warm: the model is already trained: all levels open and the grid pruned from the start.
-        seed: decides every random draw together with the step's number.
-        threads: CPU threads.
+        nerf: new, or of an earlier stage.
+        training: photos, lengths, rates and weights.
         checkpoint: file to resume from and save to (every 30 s, and when the process is asked to end), or None.
         report: called with progress lines.
-        band_px: half-width of the band around the masks' edges that no loss touches; 0: mattes are exact.
 
     Returns:
         final loss terms and `psnr` (means over the last tenth), `steps`, `seconds`, `rays_per_second`,
         `samples_per_second`.
+
+    Raises:
+        StageError: the training diverged.
     """
-    use_threads(threads)
-    keep_memory()
-    pool = pixel_pool(photos, band_px=band_px, ring_px=12, edge_px=3)
-    pose = nn.Parameter(model.pose.clone())
-    networks = [p for name, p in model.field.named_parameters() if name != "table"]
-    optimizer = Optimizer(model.field.table, networks, pose)
-    first = _resume(checkpoint, model, optimizer, pose)
-    if first:
-        report(f"resumed at step {first} of {schedule.steps}")
-    meter = _Meter(schedule, first, report)
-    saved = time.monotonic()
-    with _between_steps() as asked:
-        for step in range(first, schedule.steps):
-            terms, counts = _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, step)
-            meter.add(step, terms, counts)
-            if checkpoint and (asked or time.monotonic() - saved > 30):
-                _save(checkpoint, model, optimizer, pose, step + 1)
-                saved = time.monotonic()
-            if asked:
-                report(f"stopped after step {step + 1} of {schedule.steps}")
-                sys.exit(128 + asked[0])
-    model.pose = pose.detach().clone()
-    return meter.summary()
+    pool = pixel_pool(training.photos, training.recipe.mask_band_px)
+    pose = nn.Parameter(nerf.pose.clone())
+    optimizer = _optimizer(nerf.field, pose)
+    done = 0
+
+    def state() -> State:
+        return {"model": nerf.state(), "optimizer": optimizer.state_dict(), "pose": pose.detach(), "step": done}
+
+    saved = load_checkpoint(checkpoint, like=state())
+    if saved is not None:
+        done = _resume(saved, nerf, optimizer, pose)
+        report(f"resumed at step {done} of {training.steps}")
+    progress = Progress(training.steps, done, report)
+    with checkpointed(checkpoint, state) as step_done:
+        for step in range(done, training.steps):
+            _prepare(nerf, training, step)
+            batch = _draw(training, pool, step, nerf.field.table.device)
+            terms, samples = _loss_terms(nerf, training, batch, pose, step)
+            _descend(optimizer, training, terms, step)
+            progress.add(step, {name: float(term.detach()) for name, term in terms.items()}, len(batch.view), samples)
+            done = step + 1
+            step_done(done)
+    nerf.pose = pose.detach().clone()
+    return progress.summary()
 
 
-@contextlib.contextmanager
-def _between_steps() -> Iterator[list[int]]:
-    """Hold SIGTERM and SIGINT back until a step is whole: yields the list of signals that came."""
-    asked: list[int] = []
-    if threading.current_thread() is not threading.main_thread():
-        yield asked
-        return
-    numbers = (signal.SIGTERM, signal.SIGINT)
-    before = [signal.signal(number, lambda n, _: asked.append(n)) for number in numbers]
-    try:
-        yield asked
-    finally:
-        for number, handler in zip(numbers, before):
-            signal.signal(number, handler)
+def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer, pose: Tensor) -> int:
+    """Put a checkpoint into NeRF, optimiser and poses; the steps that are done."""
+    nerf.field.load_state_dict(saved["model"]["field"])
+    device = nerf.field.table.device
+    nerf.occupancy = Occupancy(*(saved["model"][name].to(device) for name in ("hull", "density", "occupied")))
+    optimizer.load_state_dict(saved["optimizer"])
+    with torch.no_grad():
+        pose.copy_(saved["pose"])
+    return int(saved["step"])
 
 
-def _step(model, photos, pool, schedule, weights, pose, optimizer, warm, seed, step):  # type: ignore[no-untyped-def]
-    """One optimiser step: loss terms (detached tensors) and (rays, samples)."""
-    progress = step / schedule.steps
-    field, occupancy = model.field, model.occupancy
-    device = field.table.device
-    if not warm:
-        coarse_to_fine(field, progress, schedule.coarse_until, max(4, field.settings.levels // 2))
-    if step % OCCUPANCY_EVERY == 0 and (step or warm):
-        hull_cells = int(occupancy.hull.sum())
-        prune = warm or progress > 0.1
-        occupancy = updated(occupancy, field, seed, step, min(hull_cells // 2, 65536) + 4096, 0.9, prune, 0.005)
-        model.occupancy = occupancy
-    batch = draw_batch(photos, pool, seed, step, schedule.images_per_batch, schedule.rays_per_image, 0.1)
-    batch = Batch(*(getattr(batch, name).to(device) for name in batch.__dataclass_fields__))
-    count = round(schedule.samples_first + (schedule.samples_last - schedule.samples_first) * min(1, 2 * progress))
-    rng = torch.Generator().manual_seed(seed * 1_000_003 + step)
-    refine = schedule.pose_learning_rate > 0 and progress > 0.2
-    terms, samples = _loss_terms(field, occupancy, photos, batch, schedule, weights, pose if refine else None,
-                                 count, rng)  # fmt: skip
-    loss = sum(getattr(weights, f"{name}_weight") * value for name, value in terms.items() if name != "psnr")
-    loss.backward()
-    optimizer.step(schedule, step)
-    return {name: float(value.detach()) for name, value in terms.items()}, (len(batch.view), samples)
+def _optimizer(field: Field, pose: nn.Parameter) -> torch.optim.Optimizer:
+    """Adam, with a group each for the hash grid, the networks and the poses: each has its own rate."""
+    networks = [parameter for name, parameter in field.named_parameters() if name != "table"]
+    groups = [{"params": [field.table]}, {"params": networks}, {"params": [pose]}]
+    return torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPSILON, fused=True)
 
 
-def _loss_terms(field, occupancy, photos, batch, schedule, weights, pose, count, rng):  # type: ignore[no-untyped-def]
-    device = field.table.device
-    rotation, center = photos.rotation.to(device)[batch.view], photos.center.to(device)[batch.view]
-    if pose is not None:
-        rotation, center = refined(rotation, center, pose[batch.view])
-    origin, direction, length = camera_rays(photos.intrinsics.to(device)[batch.view], rotation, center, batch.uv)
-    has_prior = (batch.depth > 0) & batch.inside
-    confidence = batch.confidence * has_prior
-    prior_distance = batch.depth * length.detach()
-    prior = Prior(prior_distance, torch.full_like(length, 0.04).detach(), 0.6 * confidence)
-    jitter = torch.rand(len(origin), count, generator=rng).to(device)
-    background = torch.rand(len(origin), 3, generator=rng).to(device)
-    drawn = march(origin.detach().contiguous(), direction.detach().contiguous(), occupancy, jitter, 0.25, prior)
-    ray = drawn.ray
-    x = origin[ray, None] + drawn.t[..., None] * direction[ray, None]
-    boost = (1 + schedule.edge_boost * batch.edge[ray])[:, None].expand(drawn.t.shape).reshape(-1)
-    fine_from = field.settings.levels // 2
-    sigma, features = field.geometry(x.view(-1, 3), boost if schedule.edge_boost > 0 else None, fine_from)
-    sigma = sigma.view(drawn.t.shape)
-    rgb = field.color(features, direction[ray])
-    color, opacity, moment, spread, _ = composite(sigma, rgb, drawn.t, drawn.delta)
-    inside, matte, shown = batch.inside[ray], batch.matte[ray, None], background[ray]
-    composed = color + (1 - opacity)[:, None] * shown
-    target = matte * batch.color[ray] + (1 - matte) * shown
-    distance = moment / opacity.clamp(min=1e-3)
-    terms = {"color": losses.color_loss(composed, target, inside)}
-    if weights.depth_weight > 0:
-        terms["depth"] = losses.depth_loss(distance, opacity, prior_distance[ray], confidence[ray], DEPTH_DELTA)
-    if weights.rank_weight > 0:
-        spread_out = (torch.zeros_like(length).index_put((ray,), a) for a in (distance, opacity))
-        every_distance, every_opacity = spread_out
-        terms["rank"] = losses.rank_loss(
-            every_distance, every_opacity, prior_distance, confidence, batch.uv, schedule.images_per_batch,
-            0.02 * photos.images.shape[2], 0.02,
-        )  # fmt: skip
-    if weights.mask_weight > 0:
-        terms["mask"] = losses.mask_loss(opacity, matte[:, 0])
-    if weights.sparsity_weight > 0:
-        terms["sparsity"] = losses.sparsity_loss(sigma, drawn.delta, inside)
-    if weights.distortion_weight > 0:
-        terms["distortion"] = losses.distortion_loss(spread)
-    error = ((composed.detach() - target) ** 2)[inside].mean().clamp(min=1e-10)
-    terms["psnr"] = -10 * torch.log10(error)
+def _prepare(nerf: Nerf, training: Training, step: int) -> None:
+    """Open levels of the grid and bring the occupancy up to date, as far as the step is due for it."""
+    progress = step / training.steps
+    if not training.warm:
+        coarse_to_fine(nerf.field, progress, training.recipe.coarse_until)
+    if step % OCCUPANCY_EVERY == 0 and (step or training.warm):
+        prune = training.warm or progress > PRUNE_FROM
+        nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step, prune)
+
+
+def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) -> RayBatch:
+    recipe = training.recipe
+    batch = draw_batch(training.photos, pool, training.seed, step, recipe.images_per_batch, recipe.rays_per_image)
+    return batch.to(device)
+
+
+def _descend(optimizer: torch.optim.Optimizer, training: Training, terms: dict[str, Tensor], step: int) -> None:
+    """One step of Adam on the weighted sum of the losses, at this step's rates; gradients are cleared."""
+    training.weights.total({name: term for name, term in terms.items() if name != "psnr"}).backward()
+    factor = learning_rate_factor(step, training.steps, training.warmup_steps, LOWEST_RATE)
+    recipe = training.recipe
+    rates = recipe.grid_learning_rate, recipe.learning_rate, recipe.pose_learning_rate
+    for group, rate in zip(optimizer.param_groups, rates):
+        group["lr"] = rate * factor
+    optimizer.step()
+    optimizer.zero_grad(set_to_none=True)
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """R rays of a batch: origin (R, 3), unit direction (R, 3), the prior on them, and its confidence (R,) in 0..1."""
+
+    origin: Tensor
+    direction: Tensor
+    prior: RayPrior
+    confidence: Tensor
+
+
+def _loss_terms(
+    nerf: Nerf, training: Training, batch: RayBatch, pose: Tensor, step: int
+) -> tuple[dict[str, Tensor], int]:
+    """Loss terms of a batch and `psnr` in dB inside the masks, by name, each a scalar; and the number of samples."""
+    progress = step / training.steps
+    refine = training.recipe.pose_learning_rate > 0 and progress > POSES_FROM
+    rays = _rays(training.photos, batch, pose if refine else None)
+    device = rays.origin.device
+    count = _samples_per_ray(training.recipe, progress)
+    rng = torch.Generator().manual_seed(training.seed * SEED_STRIDE + step)
+    jitter = torch.rand(len(rays.origin), count, generator=rng).to(device)
+    background = torch.rand(len(rays.origin), 3, generator=rng).to(device)
+    origin, direction = rays.origin.detach().contiguous(), rays.direction.detach().contiguous()
+    drawn = march(origin, direction, nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior)
+    sigma, seen = _render(nerf.field, rays, drawn, batch, training.recipe.edge_boost)
+    color, psnr = _photometric(seen, batch, drawn.ray, background)
+    terms = {"color": color, **_geometric(training, rays, batch, drawn, sigma, seen), "psnr": psnr}
     return terms, drawn.t.numel()
 
 
-def refined(rotation: Tensor, center: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply corrections (R, 6) in SO(3) x R3 to rotations (R, 3, 3) and centres (R, 3), first order in the angle."""
-    x, y, z = pose[:, :3].unbind(1)
-    o = torch.zeros_like(x)
-    skew = torch.stack([o, -z, y, z, o, -x, -y, x, o], dim=1).view(-1, 3, 3)
-    return torch.linalg.matrix_exp(skew) @ rotation, center + pose[:, 3:]
+def _samples_per_ray(recipe: NerfRecipe, progress: float) -> int:
+    fallen = min(1, progress / SAMPLES_FALL_UNTIL)
+    return round(recipe.samples_first + (recipe.samples_last - recipe.samples_first) * fallen)
+
+
+def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None) -> _Rays:
+    """The batch's rays, through cameras corrected by `pose` (V, 6) if it is given, and where their prior lies."""
+    device = batch.view.device
+    rotation, center = photos.rotation.to(device)[batch.view], photos.center.to(device)[batch.view]
+    if pose is not None:
+        rotation, center = corrected(rotation, center, pose[batch.view])
+    origin, direction, length = camera_rays(photos.intrinsics.to(device)[batch.view], rotation, center, batch.uv)
+    confidence = batch.confidence * ((batch.depth > 0) & batch.inside)
+    width = torch.full_like(length, PRIOR_HALF_WIDTH).detach()
+    prior = RayPrior(batch.depth * length.detach(), width, PRIOR_SHARE * confidence)
+    return _Rays(origin, direction, prior, confidence)
+
+
+def _render(
+    field: Field, rays: _Rays, drawn: RaySamples, batch: RayBatch, edge_boost: float
+) -> tuple[Tensor, Composited]:
+    """Densities (H, S) of the samples, and what the H rays that have any look like."""
+    x = rays.origin[drawn.ray, None] + drawn.t[..., None] * rays.direction[drawn.ray, None]
+    boost = None
+    if edge_boost > 0:
+        boost = (1 + edge_boost * batch.edge[drawn.ray])[:, None].expand(drawn.t.shape).reshape(-1)
+    sigma, features = field.geometry(x.view(-1, 3), boost, fine_from=field.settings.levels // 2)
+    sigma = sigma.view(drawn.t.shape)
+    return sigma, composite(sigma, field.color(features, rays.direction[drawn.ray]), drawn.t, drawn.delta)
+
+
+def _photometric(seen: Composited, batch: RayBatch, ray: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Photometric loss and PSNR of the rays `ray` (H,), both on random colours (R, 3).
+
+    On a random background a field cannot pass off emptiness as colour, so colours teach opacity as well (instant-ngp's
+    training on images with alpha).
+    """
+    inside, matte, shown = batch.inside[ray], batch.matte[ray, None], background[ray]
+    composed = seen.color + (1 - seen.opacity)[:, None] * shown
+    target = matte * batch.color[ray] + (1 - matte) * shown
+    error = ((composed.detach() - target) ** 2)[inside].mean().clamp(min=1e-10)
+    return losses.color_loss(composed, target, inside), -10 * torch.log10(error)
+
+
+def _geometric(
+    training: Training, rays: _Rays, batch: RayBatch, drawn: RaySamples, sigma: Tensor, seen: Composited
+) -> dict[str, Tensor]:
+    """The losses of depth, mask and density that have a weight (method N2 to N5)."""
+    weights, ray = training.weights, drawn.ray
+    distance = seen.moment / seen.opacity.clamp(min=1e-3)
+    known, confidence = rays.prior.distance, rays.confidence
+    terms = {}
+    if weights.depth_weight > 0:
+        terms["depth"] = losses.depth_loss(distance, seen.opacity, known[ray], confidence[ray])
+    if weights.rank_weight > 0:
+        far, opaque = (torch.zeros_like(known).index_put((ray,), part) for part in (distance, seen.opacity))
+        apart_px = losses.RANK_APART * training.photos.images.shape[2]
+        images = training.recipe.images_per_batch
+        terms["rank"] = losses.rank_loss(far, opaque, known, confidence, batch.uv, images, apart_px)
+    if weights.mask_weight > 0:
+        terms["mask"] = losses.mask_loss(seen.opacity, batch.matte[ray])
+    if weights.sparsity_weight > 0:
+        terms["sparsity"] = losses.sparsity_loss(sigma, drawn.delta, batch.inside[ray])
+    if weights.distortion_weight > 0:
+        terms["distortion"] = losses.distortion_loss(seen.distortion)
+    return terms
 
 
 def keep_memory() -> None:
     """Let glibc keep freed memory instead of returning it to the kernel: large tensors come and go each step."""
     if sys.platform == "linux":
         with contextlib.suppress(OSError, AttributeError):
-            libc = ctypes.CDLL(None)
-            libc.mallopt(-3, 1 << 30)
-            libc.mallopt(-1, (1 << 31) - 1)
-
-
-class Optimizer:
-    """Adam for table, networks and poses, with linear warm-up and a cosine to 2 % of the highest rates."""
-
-    def __init__(self, table: nn.Parameter, networks: list[nn.Parameter], pose: nn.Parameter) -> None:
-        groups = [{"params": p} for p in ([table], networks, [pose])]
-        self.adam = torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
-
-    def step(self, schedule: Schedule, step: int) -> None:
-        """Apply all gradients at the rates of this step, and clear them."""
-        warmup = max(1.0, schedule.warmup_epochs / schedule.epochs * schedule.steps)
-        rise = min(1.0, (step + 1) / warmup)
-        done = max(0.0, (step - warmup) / max(1.0, schedule.steps - warmup))
-        factor = rise * (0.02 + 0.98 * 0.5 * (1 + math.cos(math.pi * done)))
-        rates = schedule.grid_learning_rate, schedule.learning_rate, schedule.pose_learning_rate
-        for group, rate in zip(self.adam.param_groups, rates):
-            group["lr"] = rate * factor
-        self.adam.step()
-        self.adam.zero_grad(set_to_none=True)
-
-
-class _Meter:
-    """Running means of the loss terms, and progress lines."""
-
-    def __init__(self, schedule: Schedule, first: int, report: Callable[[str], None]) -> None:
-        self.schedule, self.first, self.report = schedule, first, report
-        self.start = self.spoken = time.monotonic()
-        self.history: list[dict[str, float]] = []
-        self.rays = self.samples = 0
-
-    def add(self, step: int, terms: dict[str, float], counts: tuple[int, int]) -> None:
-        self.history.append(terms)
-        self.rays, self.samples = self.rays + counts[0], self.samples + counts[1]
-        now = time.monotonic()
-        if now - self.spoken > 5 or step + 1 == self.schedule.steps:
-            self.spoken = now
-            elapsed = now - self.start
-            left = elapsed / (step + 1 - self.first) * (self.schedule.steps - step - 1)
-            means = self.means(20)
-            text = " ".join(f"{k} {v:.4g}" for k, v in means.items())
-            self.report(
-                f"step {step + 1}/{self.schedule.steps} {text} | {self.rays / elapsed:.0f} rays/s "
-                f"{self.samples / elapsed:.0f} samples/s, {left:.0f} s left"
-            )
-
-    def means(self, last: int) -> dict[str, float]:
-        recent = self.history[-last:]
-        names = dict.fromkeys(name for terms in recent for name in terms)
-        return {name: float(np.mean([t[name] for t in recent if name in t])) for name in names}
-
-    def summary(self) -> dict[str, float]:
-        elapsed = max(time.monotonic() - self.start, 1e-9)
-        return self.means(max(1, self.schedule.steps // 10)) | {
-            "steps": float(self.schedule.steps),
-            "seconds": elapsed,
-            "rays_per_second": self.rays / elapsed,
-            "samples_per_second": self.samples / elapsed,
-        }
-
-
-def _save(path: Path, model: Model, optimizer: Optimizer, pose: Tensor, step: int) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    state = {"model": model.state(), "optimizer": optimizer.adam.state_dict(), "pose": pose.detach(), "step": step}
-    torch.save(state, temporary)
-    os.replace(temporary, path)
-
-
-def _resume(path: Path | None, model: Model, optimizer: Optimizer, pose: Tensor) -> int:
-    """Load a checkpoint into model, optimizer and pose; the step to go on with, 0 without one."""
-    if path is None or not path.is_file():
-        return 0
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    model.field.load_state_dict(state["model"]["field"])
-    device = model.field.table.device
-    model.occupancy = Occupancy(*(state["model"][name].to(device) for name in ("hull", "density", "occupied")))
-    optimizer.adam.load_state_dict(state["optimizer"])
-    with torch.no_grad():
-        pose.copy_(state["pose"])
-    return int(state["step"])
+            libc: Any = ctypes.CDLL(None)
+            libc.mallopt(-3, 1 << 30)  # M_MMAP_THRESHOLD: no mmap of its own below 1 GiB
+            libc.mallopt(-1, (1 << 31) - 1)  # M_TRIM_THRESHOLD: never trim

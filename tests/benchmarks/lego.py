@@ -15,19 +15,33 @@ import torch
 from scenefuse.cores import use_threads
 from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.views import load_views
-from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.quality import psnr, ssim
-from scenefuse.nerf.rays import Photos
+from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.train_object_nerf import NerfSettings, _volume, make_photos
-from scenefuse.nerf.training import Model, Schedule, new_model, train
+from scenefuse.nerf.train_object_nerf import NerfSettings, photo_tensors
+from scenefuse.nerf.training import Nerf, Training, keep_memory, new_nerf, train
+from scenefuse.nerf.volume import find_volume, silhouettes
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import run
 
 GOALS_DB = (25, 28, 30, 32)
 ROOT = Path(__file__).resolve().parents[2]
+# What the command in config/examples/lego.yaml says by flags; with alpha, masks are exact.
+FLAGS = {
+    "epochs": 120,
+    "images_per_batch": 16,
+    "rays_per_image": 128,
+    "learning_rate": 1e-2,
+    "grid_learning_rate": 4e-2,
+    "samples_last": 24,
+    "coarse_until": 0.1,
+    "edge_boost": 0,
+    "mask_weight": 0.01,
+    "distortion_weight": 0,
+    "render_samples": 48,
+    "mask_band_px": 0,
+}
 
 
 def lego(
@@ -56,33 +70,32 @@ def lego(
     use_threads(threads)
     torch.backends.cuda.matmul.fp32_precision = "tf32"
     settings = read_settings(config)["object"]
-    chosen = settings["nerf"] | settings["nerf_alone"] | {"mask_band_px": 0}
+    keep_memory()
+    chosen = build(NerfSettings, settings["nerf"] | FLAGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        places = {"cameras": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        places = {"workspace": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
             data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )
-        views = load_views(places["cameras"], places["mattes"], chosen["width_px"], 0)
+        views = load_views(places["workspace"], places["mattes"], chosen.width_px, 0)
     start = time.perf_counter()
-    training, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
-    cube, hull = _volume(views, training, build(NerfSettings, chosen), None)
-    photos = make_photos(views, cube, None, exact=True)
-    schedule = build(Schedule, chosen)
-    model = new_model(build(FieldSettings, chosen), torch.from_numpy(hull), len(training), seed, device)
-    print(
-        f"hull {hull.mean():.1%} of the cube in {time.perf_counter() - start:.1f} s, {schedule.steps} steps", flush=True
-    )
-    clock = Clock(every, model, photos.select(tested[:: max(1, len(tested) // few)]), chosen["render_samples"])
-    train(
-        model, photos.select(training), schedule, build(LossWeights, chosen), warm=False, seed=seed, threads=threads,
-        checkpoint=None, report=clock.tick, band_px=0,
-    )  # fmt: skip
+    trained, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
+    outlines = silhouettes(views.masks[trained], views.intrinsics[trained], views.object_from_cam[trained])
+    volume = find_volume(outlines, chosen.recipe.occupancy_cells, chosen.hull_tolerance)
+    photos = photo_tensors(views, volume.nerf_from_object, None, exact=True)
+    nerf = new_nerf(chosen.field, torch.from_numpy(volume.hull), len(trained), seed, device)
+    training = Training(photos.select(trained), chosen.schedule, chosen.recipe, chosen.losses, warm=False, seed=seed)
+    seconds = time.perf_counter() - start
+    print(f"hull {volume.hull.mean():.1%} of the cube in {seconds:.1f} s, {training.steps} steps", flush=True)
+    samples = chosen.maps.render_samples
+    clock = Clock(every, nerf, photos.select(tested[:: max(1, len(tested) // few)]), samples)
+    train(nerf, training, checkpoint=None, report=clock.tick)
     seconds, cpu = clock.trained()
     for goal in GOALS_DB:
         first = next((f"after {wall:.0f} s" for wall, quality in clock.history if quality >= goal), "not reached")
         print(f"{goal} dB {first}")
-    quality, structure = measure(model, photos.select(tested), chosen["render_samples"], pictures)
+    quality, structure = measure(nerf, photos.select(tested), samples, pictures)
     print(
         f"{len(tested)} test views after {seconds:.0f} s ({cpu:.0f} s CPU): PSNR {quality:.2f} dB, SSIM {structure:.4f}"
     )
@@ -91,8 +104,8 @@ def lego(
 class Clock:
     """Measures on the way, at training's own progress lines, and leaves the time out that this takes."""
 
-    def __init__(self, every: float, model: Model, photos: Photos, samples: int) -> None:
-        self.every, self.model, self.photos, self.samples = every, model, photos, samples
+    def __init__(self, every: float, nerf: Nerf, photos: PhotoTensors, samples: int) -> None:
+        self.every, self.nerf, self.photos, self.samples = every, nerf, photos, samples
         self.start, self.last = np.array([time.perf_counter(), time.process_time()]), 0.0
         self.history: list[tuple[float, float]] = []
 
@@ -107,7 +120,7 @@ class Clock:
         if wall - self.last < self.every:
             return
         self.last = wall
-        quality, _ = measure(self.model, self.photos, self.samples, None)
+        quality, _ = measure(self.nerf, self.photos, self.samples, None)
         self.history.append((wall, quality))
         self.start += np.array(self.trained()) - (wall, cpu)
         print(
@@ -115,13 +128,12 @@ class Clock:
         )
 
 
-def measure(model: Model, photos: Photos, samples: int, pictures: Path | None) -> tuple[float, float]:
+def measure(nerf: Nerf, photos: PhotoTensors, samples: int, pictures: Path | None) -> tuple[float, float]:
     """Mean PSNR and SSIM of whole pictures on white; every pixel is rendered, whatever the mask says."""
     rows = []
     for view in range(len(photos)):
         everything = torch.ones(photos.masks.shape[1:], dtype=torch.bool)
-        camera = photos.intrinsics[view], photos.rotation[view], photos.center[view]
-        rendered = render_view(model.field, model.occupancy, *camera, everything, samples, 0.25, True)
+        rendered = render_view(nerf.field, nerf.occupancy, photos.camera(view), everything, samples, colored=True)
         matte = photos.mattes[view, ..., None].float() / 255.0
         photo = photos.images[view].float() / 255.0 * matte + 1 - matte
         picture = (rendered.color + 1 - rendered.opacity[..., None]).clamp(0, 1)

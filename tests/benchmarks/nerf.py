@@ -13,7 +13,7 @@ from typing import Literal
 import cv2
 import numpy as np
 import torch
-from painted_sphere import photos_of, sphere_views, sphere_volume
+from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
 from scenefuse.cores import use_threads
 from scenefuse.io.settings import build, read_settings
@@ -24,8 +24,8 @@ from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy
-from scenefuse.nerf.render import Prior, march
-from scenefuse.nerf.training import Schedule, keep_memory, new_model, train
+from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior
+from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 from scenefuse.stage import run
 from scenefuse.workspace import View
 
@@ -54,7 +54,7 @@ def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Litera
         print("matching 16 depth hypotheses of 400 x 300 pixels in 8 photos, windows of 7:")
         compare(medians({name: lambda step=step: time_of(step) for name, step in matching().items()}, repeats), "s")
     print("training, default field, 2304 rays a step:")
-    compare(medians(by_both(lambda: training_seconds(steps, threads, device)), 3), "s a step")
+    compare(medians(by_both(lambda: training_seconds(steps, device)), 3), "s a step")
 
 
 def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
@@ -78,9 +78,9 @@ def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
     occupancy = Occupancy(shell, 50 * shell.float(), shell)
     origin = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator)) * 2
     direction = torch.nn.functional.normalize(torch.rand(rays, 3, generator=generator) - 0.5 - origin)
-    origin, none = origin + 0.5, torch.zeros(rays)
-    jitter, prior = torch.rand(rays, samples, generator=generator), Prior(none - 1, none, none)
-    return lambda: march(origin, direction, occupancy, jitter, 0.25, prior)
+    origin, prior = origin + 0.5, no_prior(rays, origin.device)
+    jitter = torch.rand(rays, samples, generator=generator)
+    return lambda: march(origin, direction, occupancy, jitter, UNIFORM_SHARE, prior)
 
 
 def matching() -> dict[str, Callable[[], None]]:
@@ -158,32 +158,17 @@ def time_of(step: Callable[[], None]) -> float:
     return time.perf_counter() - start
 
 
-def training_seconds(steps: int, threads: int, device: str) -> float:
+def training_seconds(steps: int, device: str) -> float:
     """Seconds of one training step of the default field on photos of a painted sphere, compilation left out."""
-    config = read_settings(None)["object"]
-    settings = config["nerf"]
-    views = sphere_views(24, 160)
-    cube, hull = sphere_volume(views, settings["occupancy_cells"])
+    views, recipe = sphere_views(24, 160), NerfRecipe()
+    cube, hull = sphere_volume(views, recipe.occupancy_cells)
     photos = photos_of(views, cube, prior=1.0)
-    rays = settings["images_per_batch"] * settings["rays_per_image"]
-    weights = build(LossWeights, settings)
     seconds = 0.0
     for count in (2, steps if kernels_on(device) != "torch" else max(4, steps // 10)):
-        fitted = settings | {"epochs": 2, "rays_per_epoch": count * rays // 2}
-        model = new_model(build(FieldSettings, settings), torch.from_numpy(hull), len(photos), 0, device)
-        schedule = build(Schedule, fitted)
-        result = train(
-            model,
-            photos,
-            schedule,
-            weights,
-            warm=False,
-            seed=0,
-            threads=threads,
-            checkpoint=None,
-            report=print_nothing,
-            band_px=settings["mask_band_px"],
-        )
+        nerf = new_nerf(FieldSettings(), torch.from_numpy(hull), len(photos), 0, device)
+        schedule = Schedule(epochs=2, rays_per_epoch=count * recipe.rays_per_step // 2)
+        training = Training(photos, schedule, recipe, LossWeights(), warm=False, seed=0)
+        result = train(nerf, training, checkpoint=None, report=print_nothing)
         seconds = result["seconds"] / result["steps"]
     return seconds
 

@@ -19,7 +19,7 @@ from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine
 from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import cloud_results, read_object_truth
+from scenefuse.metrics.object_truth import cloud_results, read_object_truth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -112,11 +112,11 @@ def no_sfm(
         workspace(source / "frames", source / "masks", folder)
         reconstruct(folder, own, own["hold_out_every"], seed)
         known = read_object_truth(folder / "poses", truth / "scene", truth / name, samples, seed)
-        extent = float(np.linalg.norm(np.ptp(known.orbit.centres[known.posed.true], axis=0)))
+        extent = float(np.linalg.norm(np.ptp(known.orbit.centres[[true for _, true in known.posed]], axis=0)))
         points = known.fit.truth_from_model.apply(read_cloud(folder / "object.ply").points)
         measured = {
             "photos": quantity(len(known.orbit.names), "1"),
-            "photos_with_pose": quantity(len(known.posed.names), "1"),
+            "photos_with_pose": quantity(len(known.posed), "1"),
             "trajectory_error_over_extent": quantity(float(np.sqrt(np.mean(known.fit.position**2))) / extent, "1"),
             "rotation_error_median_deg": quantity(float(np.median(known.fit.rotation_deg)), "degrees"),
             "rotation_error_max_deg": quantity(float(known.fit.rotation_deg.max()), "degrees"),

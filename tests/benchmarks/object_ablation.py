@@ -17,19 +17,15 @@ import torch
 from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
-from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.views import load_views
-from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
+from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.quality import psnr
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.stage import StageError, run, value
 
-OTHER_POSE_RATE = 5e-4
+POSE_RATE = 5e-4
 
 
 @dataclass(frozen=True)
@@ -44,21 +40,17 @@ class Variant:
     """stage 2 alone, with stage 4's epochs added"""
 
 
-def variants(settings: dict[str, Any]) -> dict[str, Variant]:
-    """All variants; that of the poses takes what the settings do not."""
-    refined = settings["nerf"]["pose_learning_rate"] > 0
-    other = 0.0 if refined else OTHER_POSE_RATE
-    return {
-        "full": Variant(),
-        "no_masks": Variant(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
-        "no_depth": Variant(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
-        "no_relative_depth": Variant(nerf={"rank_weight": 0}),
-        "prior_unrefined": Variant(nerf={"match_reach_px": 0}),
-        "no_feedback": Variant(feedback=False),
-        "poses_of_sfm" if refined else "poses_refined": Variant(nerf={"pose_learning_rate": other}),
-        "no_adaptive_grid": Variant(nerf={"edge_boost": 0}),
-        "stage2_longer": Variant(long=True),
-    }
+VARIANTS = {
+    "full": Variant(),
+    "no_masks": Variant(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
+    "no_depth": Variant(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
+    "no_relative_depth": Variant(nerf={"rank_weight": 0}),
+    "prior_unrefined": Variant(nerf={"match_reach_px": 0}),
+    "no_feedback": Variant(feedback=False),
+    "poses_refined": Variant(nerf={"pose_learning_rate": POSE_RATE}),
+    "no_adaptive_grid": Variant(nerf={"edge_boost": 0}),
+    "stage2_longer": Variant(long=True),
+}
 
 
 def one(
@@ -69,18 +61,17 @@ def one(
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         masks = folder / "masks" if variant.masks else white(folder / "masks", work / "masks")
-        inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": masks}
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
             own = settings["nerf"] | variant.nerf | {"epochs": epochs}
             train_object_nerf(
-                **inputs, **common, prior=prior if variant.prior else None, previous=previous,
-                stage=work / f"stage{stage}", report=work / f"stage{stage}.json",
-                device=own["device"], field=build(FieldSettings, own),
-                schedule=build(Schedule, own), losses=build(LossWeights, own), settings=build(NerfSettings, own),
-                refinement=build(RefinementSettings, own),
-            )  # fmt: skip
+                inputs=NerfInputs(folder / "undistorted", masks, prior if variant.prior else None, previous),
+                stage=work / f"stage{stage}",
+                report=work / f"stage{stage}.json",
+                settings=build(NerfSettings, own),
+                **common,
+            )
 
         early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
         nerf(2, folder / "stage1", None, early + late if variant.long else early)
@@ -103,8 +94,8 @@ def one(
             "within_4": value(depth, f"{last.name}_depth_within_1pct"),
             "psnr_2": held_out_psnr(folder, work / "stage2", settings),
             "psnr_4": held_out_psnr(folder, last, settings),
-            **cloud(folder, inputs, last, truth, fusing, seed),
-            **as_rendered(cloud(folder, inputs, last, truth, fusing | {"match_reach_px": 0}, seed)),
+            **cloud(folder, masks, last, truth, fusing, seed),
+            **as_rendered(cloud(folder, masks, last, truth, fusing | {"match_reach_px": 0}, seed)),
             "seconds": seconds,
         }
 
@@ -115,16 +106,15 @@ def as_rendered(measures: dict[str, Any]) -> dict[str, Any]:
 
 
 def cloud(
-    folder: Path, inputs: dict[str, Any], last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
+    folder: Path, masks: Path, last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
 ) -> dict[str, Any]:
     """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
     path = last.with_name("object.ply")
+    workspace = folder / "undistorted"
+    inputs = CloudInputs(workspace, workspace.with_suffix(".json"), masks, last, last.with_suffix(".json"))
+    wanted = build(CloudSettings, settings)
     try:
-        make_object_cloud(
-            **inputs, stage=last, stage_report=last.with_suffix(".json"), cameras_report=folder / "undistorted.json",
-            cloud=path, report=path.with_suffix(".json"), refinement=build(RefinementSettings, settings),
-            settings=build(CloudSettings, settings), seed=seed,
-        )  # fmt: skip
+        make_object_cloud(inputs=inputs, cloud=path, report=path.with_suffix(".json"), settings=wanted, seed=seed)
     except StageError as error:
         print(f"no cloud: {error}", flush=True)
         return {"accuracy_pct": np.nan, "f_05": 0.0, "f_1": 0.0, "f_1_cut": 0.0}
@@ -190,7 +180,7 @@ def object_ablation(
     out = results / "bench/object_ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
-    chosen = {name: variant for name, variant in variants(own).items() if not only or name in only}
+    chosen = {name: variant for name, variant in VARIANTS.items() if not only or name in only}
     for name in objects:
         folder, known = results / "objects" / name, results / "demo/demo/truth"
         truth = read_object_truth(

@@ -16,7 +16,7 @@ import pandas as pd
 from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals, write_depth
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.mvs.consistency import compare
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from scenefuse import checkpoints
-from scenefuse.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, save_checkpoint
+from scenefuse.checkpoints import checkpointed, key_of, learning_rate_factor, load_checkpoint, save_checkpoint
 from scenefuse.stage import StageError
 
 
@@ -104,3 +104,15 @@ def test_the_learning_rate_rises_in_a_line_and_falls_in_half_a_cosine():
     assert factors[:10] == pytest.approx([0.1 * (step + 1) for step in range(10)])
     assert factors[10] == 1.0 and factors[55] == pytest.approx(0.51) and factors[100] == pytest.approx(0.02)
     assert learning_rate_factor(0, steps=1, warmup=0.0) == 1.0
+
+
+def test_keys_change_with_any_setting_and_with_the_content_of_arrays():
+    weights = torch.arange(6.0)
+    keys = [
+        key_of("settings", weights),
+        key_of("settings ", weights),
+        key_of("settings", weights + 1),
+        key_of("settings", weights.reshape(2, 3)),
+        key_of("settings", weights.double()),
+    ]
+    assert len(set(keys)) == len(keys) and keys[0] == key_of("settings", weights.clone())

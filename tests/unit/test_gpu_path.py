@@ -3,17 +3,16 @@
 import numpy as np
 import pytest
 import torch
-from painted_sphere import photos_of, sphere_views, sphere_volume
-from pretend_gpu import OnGpu, PretendGpu, to_pretended
+from support.painted_sphere import photos_of, sphere_views, sphere_volume
+from support.pretend_gpu import OnGpu, PretendGpu, to_pretended
 from test_depth import plane_views
 
-from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.training import Schedule, new_model, train
+from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 
 
 @pytest.fixture
@@ -40,22 +39,17 @@ def test_the_pretended_gpu_notices_what_was_left_behind(gpu):
 
 
 def test_training_and_rendering_on_a_gpu(gpu, tmp_path):
-    settings = read_settings(None)["object"]["nerf"]
     views = sphere_views(6, 40)
     cube, hull = sphere_volume(views, 32)
     photos = photos_of(views, cube, prior=1.0)
-    small = {"epochs": 1, "images_per_batch": 3, "rays_per_image": 16, "rays_per_epoch": 48 * 20}
-    schedule = build(Schedule, settings | small | {"pose_learning_rate": 1e-4})
-    model = new_model(
-        build(FieldSettings, settings | {"log2_table": 12}), torch.from_numpy(hull), len(photos), 0, "cuda"
-    )
-    train(
-        model, photos, schedule, build(LossWeights, settings), warm=False, seed=0, threads=1,
-        checkpoint=tmp_path / "state.pt", report=print, band_px=2,
-    )  # fmt: skip
-    assert {model.field.table.device.type, model.occupancy.alpha.device.type, model.pose.device.type} == {"cuda"}
-    camera = photos.intrinsics[0], photos.rotation[0], photos.center[0]
-    rendered = render_view(model.field, model.occupancy, *camera, photos.masks[0], 16, 0.25, True)
+    recipe = NerfRecipe(images_per_batch=3, rays_per_image=16, pose_learning_rate=1e-4)
+    nerf = new_nerf(FieldSettings(log2_table=12), torch.from_numpy(hull), len(photos), 0, "cuda")
+    schedule = Schedule(epochs=1, rays_per_epoch=48 * 20)
+    training = Training(photos, schedule, recipe, LossWeights(), warm=False, seed=0)
+    train(nerf, training, checkpoint=tmp_path / "state.pt", report=print)
+    assert {nerf.field.table.device.type, nerf.occupancy.alpha.device.type, nerf.pose.device.type} == {"cuda"}
+    assert {tensor.device.type for tensor in nerf.state()["field"].values()} == {"cpu"}
+    rendered = render_view(nerf.field, nerf.occupancy, photos.camera(0), photos.masks[0], samples=16, colored=True)
     assert rendered.depth.device.type == "cpu" and bool((rendered.opacity > 0).any())
 
 

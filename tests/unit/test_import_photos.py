@@ -11,15 +11,18 @@ import pycolmap
 import pytest
 import torch
 import yaml
-from painted_sphere import CENTER, RADIUS, sphere_views
 from scipy.spatial.transform import Rotation
+from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.io.clouds import read_cloud
 from scenefuse.mvs.views import load_views
-from scenefuse.nerf.occupancy import visual_hull
-from scenefuse.nerf.rays import cube_from_cameras
-from scenefuse.nerf.render import Rendered
-from scenefuse.nerf.train_object_nerf import _held_out_quality, train_nerf
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.object_cloud import CloudGates
+from scenefuse.nerf.render import RenderedView
+from scenefuse.nerf.rendered_maps import MapSettings, measure_quality
+from scenefuse.nerf.train_nerf import TrainingOptions, train_nerf
+from scenefuse.nerf.training import NerfRecipe
+from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import StageError, read_json, value
@@ -140,10 +143,10 @@ def imported(data, out, images=None, masks=None):
         data=data,
         images=images,
         masks=masks,
-        cameras=out / "cameras",
+        workspace=out / "cameras",
         mattes=out / "masks",
         report=out / "photos.json",
-        settings=UndistortSettings(1600, 97),
+        settings=UndistortSettings(max_size_px=1600),
     )
     return load_views(out / "cameras", out / "masks", WIDTH, 0), read_json(out / "photos.json")
 
@@ -332,20 +335,32 @@ def test_a_perfect_render_of_a_grey_matte_scores_as_perfect(tmp_path):
     views, _ = imported(blender(tmp_path / "in"), tmp_path)
     opacity = torch.from_numpy(views.mattes).float() / 255
     colors = torch.from_numpy(views.images).float() / 255 * opacity[..., None]
-    perfect = [Rendered(c, o, o, o) for c, o in zip(colors, opacity)]
-    quality = _held_out_quality(views, perfect, np.array([0, 1]), tmp_path / "renders", exact=True)
+    perfect = [RenderedView(c, o, o, o) for c, o in zip(colors, opacity)]
+    quality = measure_quality(views, perfect, np.arange(len(perfect)) < 2, exact=True)
     assert value(quality, "psnr_held_out") > 80 and value(quality, "psnr_held_out_masked_photo") > 80
 
 
 QUICK = {
-    "nerf_alone": {"epochs": 4},
     "hold_out_every": 12,
-    "nerf": {"levels": 6, "log2_table": 12, "coarsest": 8, "finest": 64, "width": 16, "width_px": 48, "device": "cpu"}
-    | {"rays_per_epoch": 80 * 512, "images_per_batch": 8, "rays_per_image": 64, "occupancy_cells": 32}
-    | {"learning_rate": 1e-2, "grid_learning_rate": 2e-2, "warmup_epochs": 0.2, "hull_tolerance": 0, "agreement": 0.03},
-    "cloud": {"min_views": 2, "agreement": 0.05, "min_confidence": 0, "through_share": 0.5, "mask_share": 0.3}
-    | {"spacing": 0.01, "outlier_deviations": 4},
+    "nerf": {"levels": 6, "log2_table": 12, "finest": 64, "width": 16, "width_px": 48, "device": "cpu"}
+    | {"rays_per_epoch": 80 * 512, "hull_tolerance": 0},
+    "cloud": {"min_views": 2, "spacing": 0.01},
 }
+OPTIONS = TrainingOptions(
+    recipe=NerfRecipe(
+        images_per_batch=8,
+        rays_per_image=64,
+        warmup_epochs=0.2,
+        learning_rate=1e-2,
+        grid_learning_rate=2e-2,
+        occupancy_cells=32,
+    ),
+    losses=LossWeights(),
+    maps=MapSettings(map_agreement=0.03),
+    gates=CloudGates(
+        point_agreement=0.05, min_confidence=0.0, through_share=0.5, mask_share=0.3, outlier_deviations=4.0
+    ),
+)
 
 
 @pytest.fixture
@@ -381,10 +396,10 @@ def sphere_on_disk(root, form):
 def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
     data, out = sphere_on_disk(tmp_path / "in", form), tmp_path / "out"
     masks = data / "masks" if form == "colmap" else None
-    assert train_nerf(data=data, out=out, masks=masks, config=quick) == 0
+    assert train_nerf(data=data, out=out, masks=masks, config=quick, epochs=4, options=OPTIONS) == 0
     report = read_json(out / "report.json")
     assert value(report["nerf"], "photos_measured") == 2 and value(report["nerf"], "psnr_held_out") > 15
-    assert value(report, "settings").get("mask_band_px") == (0 if form == "blender" else 2)
+    assert value(report, "settings")["nerf"]["recipe"]["mask_band_px"] == (0 if form == "blender" else 2)
     distance = np.linalg.norm(read_cloud(out / "object.ply").points - CENTER, axis=1)
     assert np.median(np.abs(distance - RADIUS)) < 0.1
     assert sorted(p.name for p in out.iterdir()) == sorted(
@@ -395,10 +410,12 @@ def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
 
 def test_a_nerf_without_a_cloud_ends_with_three_and_the_reason(tmp_path, quick):
     settings = yaml.safe_load(quick.read_text())
-    settings["object"]["cloud"] |= {"min_confidence": 1, "min_views": 12}
+    settings["object"]["cloud"]["min_views"] = 24
     quick.write_text(yaml.safe_dump(settings))
     data = sphere_on_disk(tmp_path / "in", "blender")
     command = [sys.executable, ROOT / "scripts/train_nerf.py", "--data", data, "--config", quick, "--out", "out"]
+    command += ["--epochs", 4, "--warmup-epochs", 0.2, "--learning-rate", 0.01, "--grid-learning-rate", 0.02]
+    command += ["--images-per-batch", 8, "--rays-per-image", 64, "--occupancy-cells", 32, "--min-confidence", 1]
     done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert "no surface found" in value(read_json(tmp_path / "out/report.json"), "no_cloud_because")
@@ -412,14 +429,14 @@ def test_a_nerf_without_a_cloud_ends_with_three_and_the_reason(tmp_path, quick):
         ({"images": Path("images")}, "goes with a COLMAP model"),
         ({"out": Path("file.txt")}, "is a file"),
         ({"masks": Path("none")}, "--masks none is no folder"),
-        ({"config": Path("typo.yaml")}, "unknown key 'epoch'; did you mean 'epochs'"),
+        ({"config": Path("typo.yaml")}, "unknown key 'levls'; did you mean 'levels'"),
     ],
 )
 def test_wrong_flags_are_one_sentence(tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
     nerfstudio(tmp_path / "in")
     Path("file.txt").write_text("")
-    Path("typo.yaml").write_text("object: {nerf_alone: {epoch: 3}}")
+    Path("typo.yaml").write_text("object: {nerf: {levls: 3}}")
     with pytest.raises(StageError, match=words):
         train_nerf(**({"data": Path("in"), "out": Path("out")} | options))
     assert not Path("out").exists()
@@ -430,5 +447,5 @@ def test_lego_masks_agree_on_a_hull(tmp_path):
     views, _ = imported(LEGO, tmp_path)
     assert views.held_out.sum() == 25 and len(views.names) == 125
     some = np.flatnonzero(~views.held_out)[::5]
-    data = views.masks[some], views.intrinsics[some], views.object_from_cam[some]
-    assert visual_hull(*data, cube_from_cameras(*data), 64, 0.0).mean() > 0.01
+    outlines = silhouettes(views.masks[some], views.intrinsics[some], views.object_from_cam[some])
+    assert visual_hull(outlines, cube_from_cameras(outlines), 64, 0.0).mean() > 0.01

@@ -18,7 +18,7 @@ def test_depth_is_huber_where_opaque_and_known():
     distance, prior = torch.tensor([1.0, 1.005, 1.1, 2.0]), torch.ones(4)
     opacity, weight = torch.tensor([1.0, 1.0, 1.0, 0.2]), torch.tensor([0.0, 1.0, 0.5, 1.0])
     quadratic, linear = 0.5 * 0.005**2 / 0.01, 0.1 - 0.005
-    value = losses.depth_loss(distance, opacity, prior, weight, 0.01)
+    value = losses.depth_loss(distance, opacity, prior, weight)
     assert float(value) == pytest.approx((quadratic + 0.5 * linear) / 3, rel=1e-3)
 
 
@@ -28,10 +28,10 @@ def test_rank_punishes_the_wrong_order_only():
     prior = torch.tensor([1.0, 2.0])
 
     def rank(a, b, apart=10.0):
-        return float(losses.rank_loss(torch.tensor([a, b]), opacity, prior, weight, uv, 1, apart, 0.1))
+        return float(losses.rank_loss(torch.tensor([a, b]), opacity, prior, weight, uv, 1, apart))
 
     assert rank(1.0, 2.0) == 0.0
-    assert rank(2.0, 1.0) == pytest.approx((0.1 + 1.0) / 0.1, rel=1e-4)
+    assert rank(2.0, 1.0) == pytest.approx((losses.RANK_MARGIN + 1.0) / losses.RANK_MARGIN, rel=1e-4)
     assert rank(2.0, 1.0, apart=60.0) == 0.0
 
 

@@ -8,7 +8,7 @@ import torch
 from scenefuse.nerf import kernels
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import (
-    Prior,
+    RayPrior,
     composite,
     march,
     march_reference,
@@ -17,7 +17,7 @@ from scenefuse.nerf.render import (
 
 
 def _no_prior(rays):
-    return Prior(torch.full((rays,), -1.0), torch.zeros(rays), torch.zeros(rays))
+    return RayPrior(torch.full((rays,), -1.0), torch.zeros(rays), torch.zeros(rays))
 
 
 def test_composite_by_hand():
@@ -25,15 +25,15 @@ def test_composite_by_hand():
     sigma, delta = torch.tensor([[half, half, 2 * half]]), torch.ones(1, 3)
     t = torch.tensor([[1.0, 2.0, 3.0]])
     rgb = torch.eye(3)[None]
-    color, opacity, moment, distortion, weights = composite(sigma, rgb, t, delta)
+    ray = composite(sigma, rgb, t, delta)
     expected = [0.5, 0.25, 0.1875]
-    assert weights[0].tolist() == pytest.approx(expected, abs=1e-6)
-    assert color[0].tolist() == pytest.approx(expected, abs=1e-6)
-    assert float(opacity) == pytest.approx(0.9375, abs=1e-6)
-    assert float(moment) == pytest.approx(0.5 + 0.5 + 3 * 0.1875, abs=1e-6)
+    assert ray.weights[0].tolist() == pytest.approx(expected, abs=1e-6)
+    assert ray.color[0].tolist() == pytest.approx(expected, abs=1e-6)
+    assert float(ray.opacity) == pytest.approx(0.9375, abs=1e-6)
+    assert float(ray.moment) == pytest.approx(0.5 + 0.5 + 3 * 0.1875, abs=1e-6)
     pairs = 2 * (0.5 * 0.25 * 1 + 0.5 * 0.1875 * 2 + 0.25 * 0.1875 * 1)
     own = (0.25 + 0.0625 + 0.1875**2) / 3
-    assert float(distortion) == pytest.approx(pairs + own, abs=1e-6)
+    assert float(ray.distortion) == pytest.approx(pairs + own, abs=1e-6)
 
 
 def test_uniform_marching_splits_the_occupied_length_evenly():
@@ -65,7 +65,7 @@ def test_known_density_and_prior_draw_samples_to_the_surface():
     jitter = torch.full((1, 16), 0.5)
     by_density = march(origin, direction, Occupancy(occupied, density, occupied), jitter, 0.25, _no_prior(1))
     assert int(((by_density.t - 1.5).abs() < 0.05).sum()) >= 11
-    prior = Prior(torch.tensor([1.3]), torch.tensor([0.05]), torch.tensor([0.6]))
+    prior = RayPrior(torch.tensor([1.3]), torch.tensor([0.05]), torch.tensor([0.6]))
     by_prior = march(origin, direction, Occupancy(occupied, 0 * density, occupied), jitter, 0.25, prior)
     assert int(((by_prior.t - 1.3).abs() < 0.06).sum()) >= 9
 
@@ -79,7 +79,7 @@ def test_marching_matches_the_reference():
     direction = torch.rand(200, 3, generator=rng) - origin
     direction = direction / direction.norm(dim=1, keepdim=True)
     jitter = torch.rand(200, 12, generator=rng)
-    prior = Prior(torch.rand(200, generator=rng) * 2, torch.full((200,), 0.1), torch.full((200,), 0.4))
+    prior = RayPrior(torch.rand(200, generator=rng) * 2, torch.full((200,), 0.1), torch.full((200,), 0.4))
     ours = march(origin, direction, grid, jitter, 0.3, prior)
     t, delta, hit = march_reference(origin, direction, grid, jitter, 0.3, prior)
     assert ours.ray.tolist() == torch.nonzero(hit)[:, 0].tolist()

@@ -1,26 +1,64 @@
 """The NeRF stage on a tiny workspace: what it writes, and the sentences for bad input."""
 
-from dataclasses import replace
+import ast
+import re
+from dataclasses import fields, replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
-from test_nerf_train import FIELD, WEIGHTS, sphere_views
+from support.painted_sphere import sphere_views
 
 from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.rendered_maps import MapSettings
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
+from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
-MATCHING = RefinementSettings(0.0, 5, 0.6)
-SETTINGS = NerfSettings(
-    width_px=48, mask_band_px=1, occupancy_cells=32, hull_tolerance=0.0, render_samples=24, agreement=0.03
+ROOT = Path(__file__).resolve().parents[2]
+FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
+WEIGHTS = LossWeights(depth_weight=1.0)
+UNREFINED = RefinementSettings(match_reach_px=0.0)
+RECIPE = NerfRecipe(
+    images_per_batch=8,
+    rays_per_image=64,
+    warmup_epochs=0.2,
+    learning_rate=1e-2,
+    grid_learning_rate=2e-2,
+    samples_first=24,
+    samples_last=12,
+    pose_learning_rate=1e-5,
+    mask_band_px=1,
+    occupancy_cells=32,
 )
-SCHEDULE = Schedule(2, 200 * 256, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, 1e-5)
+SETTINGS = NerfSettings(
+    device="cpu",
+    width_px=48,
+    hull_tolerance=0.0,
+    field=FIELD,
+    schedule=Schedule(epochs=2, rays_per_epoch=200 * 256),
+    recipe=RECIPE,
+    losses=WEIGHTS,
+    maps=MapSettings(render_samples=24, map_agreement=0.03),
+    refinement=UNREFINED,
+)
+
+
+GATES = CloudGates(
+    point_agreement=0.05,
+    min_confidence=0.0,
+    through_share=0.5,
+    mask_share=0.3,
+    outlier_deviations=4.0,
+    min_component=0.02,
+)
 
 
 @pytest.fixture(scope="module")
@@ -45,25 +83,16 @@ def workspace(tmp_path_factory):
     return root
 
 
-def _run(root, stage, previous=None, **changes):
-    arguments = dict(
-        cameras=root / "cameras",
-        masks=root / "masks",
-        prior=root / "stage1",
-        previous=previous,
+def _run(root, stage, previous=None, masks=None, settings=SETTINGS):
+    train_object_nerf(
+        inputs=NerfInputs(root / "cameras", masks or root / "masks", prior=root / "stage1", previous=previous),
         stage=root / stage,
         report=root / f"{stage}.json",
         checkpoints=root / "checkpoints",
-        field=FIELD,
-        schedule=SCHEDULE,
-        losses=WEIGHTS,
-        refinement=MATCHING,
-        settings=SETTINGS,
+        settings=settings,
         hold_out_every=6,
-        device="cpu",
         seed=0,
     )
-    train_object_nerf(**(arguments | changes))
 
 
 def test_two_stages_and_the_cloud(workspace):
@@ -82,15 +111,16 @@ def test_two_stages_and_the_cloud(workspace):
     assert len(saved["names"]) == 12 and saved["nerf_from_object"].shape == (4, 4)
     assert not list((workspace / "checkpoints").rglob("*.pt"))
     make_object_cloud(
-        cameras=workspace / "cameras",
-        masks=workspace / "masks",
-        stage=workspace / "stage4",
-        stage_report=workspace / "stage4.json",
-        cameras_report=workspace / "cameras.json",
+        inputs=CloudInputs(
+            workspace=workspace / "cameras",
+            workspace_json=workspace / "cameras.json",
+            masks=workspace / "masks",
+            stage=workspace / "stage4",
+            stage_json=workspace / "stage4.json",
+        ),
         cloud=workspace / "object.ply",
         report=workspace / "object.json",
-        refinement=MATCHING,
-        settings=CloudSettings(2, 0.05, 0.0, 0.5, 0.3, 0.01, 4.0, 0.02),
+        settings=CloudSettings(min_views=2, spacing=0.01, gates=GATES, refinement=UNREFINED),
         seed=0,
     )
     cloud = read_json(workspace / "object.json")
@@ -100,15 +130,23 @@ def test_two_stages_and_the_cloud(workspace):
 
 def test_a_later_stage_starts_from_the_poses_of_the_earlier_one(workspace):
     _run(workspace, "moved")
-    _run(workspace, "later", previous=workspace / "moved", schedule=replace(SCHEDULE, pose_learning_rate=0.0))
+    still = replace(SETTINGS, recipe=replace(RECIPE, pose_learning_rate=0.0))
+    _run(workspace, "later", previous=workspace / "moved", settings=still)
     moved, later = (torch.load(workspace / stage / "model.pt", weights_only=True) for stage in ("moved", "later"))
     assert torch.equal(moved["object_from_cam"], later["object_from_cam"])
     assert not torch.equal(moved["object_from_cam"], torch.from_numpy(sphere_views()[3]))
 
 
 def test_a_missing_earlier_stage_is_named(workspace):
-    with pytest.raises(StageError, match="model.pt does not exist; run the earlier NeRF stage first"):
+    with pytest.raises(StageError, match="model.pt does not exist; run the NeRF stage first"):
         _run(workspace, "other", previous=workspace / "nowhere")
+    assert not (workspace / "other").exists()
+
+
+def test_a_damaged_earlier_stage_is_named(workspace, tmp_path):
+    (tmp_path / "model.pt").write_bytes(b"PK cut off")
+    with pytest.raises(StageError, match="model.pt is damaged; delete"):
+        _run(workspace, "other", previous=tmp_path)
     assert not (workspace / "other").exists()
 
 
@@ -122,4 +160,15 @@ def test_empty_masks_are_named(workspace, tmp_path):
 @pytest.mark.skipif(torch.cuda.is_available(), reason="only where there is no CUDA")
 def test_missing_cuda_is_named(workspace):
     with pytest.raises(StageError, match="no CUDA device; set it to auto or cpu"):
-        _run(workspace, "other", device="cuda")
+        _run(workspace, "other", settings=replace(SETTINGS, device="cuda"))
+
+
+def test_the_lego_example_and_its_benchmark_train_alike():
+    example = (ROOT / "config/examples/lego.yaml").read_text()
+    words = re.sub(r"[#\\\n]+", " ", example.split("--out lego")[1].split("object:")[0]).split()
+    said = {words[i].removeprefix("--").replace("-", "_"): float(words[i + 1]) for i in range(0, len(words), 2)}
+    benchmark = (ROOT / "tests/benchmarks/lego.py").read_text()
+    flags = ast.literal_eval(re.search(r"^FLAGS = (\{.*?^\})", benchmark, re.M | re.S).group(1))
+    assert said | {"mask_band_px": 0} == flags
+    known = {field.name for part in (NerfRecipe, LossWeights, MapSettings, Schedule) for field in fields(part)}
+    assert set(flags) <= known

@@ -1,18 +1,30 @@
 """A small sphere with a painted surface: geometry, training, resuming, determinism."""
 
+import ast
+import os
+import signal
+import sys
+from dataclasses import replace
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
-from painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
+from support.painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
+import scenefuse.nerf
+import scenefuse.nerf.training as training_module
+from scenefuse import checkpoints
+from scenefuse.cores import use_threads
 from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.occupancy import visual_hull
 from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
-from scenefuse.nerf.rays import cube_from_cameras, dilate, draw_batch, pixel_pool
+from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
-from scenefuse.nerf.training import Schedule, new_model, train
+from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
+from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
+from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 
 
@@ -22,31 +34,30 @@ def sphere():
 
 
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
-WEIGHTS = LossWeights(1.0, 1.0, 0.02, 0.1, 0.05, 0.01)
+WEIGHTS = LossWeights(depth_weight=1.0)
 
 
-def _schedule(steps, pose=0.0):
-    return Schedule(2, steps * 512 // 2, 8, 64, 0.2, 1e-2, 2e-2, 24, 12, 0.3, 1.0, pose)
+RECIPE = NerfRecipe(
+    images_per_batch=8,
+    rays_per_image=64,
+    warmup_epochs=0.2,
+    learning_rate=1e-2,
+    grid_learning_rate=2e-2,
+    samples_first=24,
+    samples_last=12,
+    mask_band_px=1,
+)
 
 
 def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0):
+    use_threads(1)
     cube, hull = sphere_volume(sphere)
     photos = photos_of(sphere, cube, prior=1.0)
-    model = new_model(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
-    schedule = _schedule(steps, pose)
-    result = train(
-        model,
-        photos,
-        schedule,
-        WEIGHTS,
-        warm=False,
-        seed=seed,
-        threads=1,
-        checkpoint=checkpoint,
-        report=report,
-        band_px=1,
-    )
-    return model, photos, cube, result
+    nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
+    schedule = Schedule(epochs=2, rays_per_epoch=steps * 512 // 2)
+    recipe = replace(RECIPE, pose_learning_rate=pose)
+    training = Training(photos, schedule, recipe, WEIGHTS, warm=False, seed=seed)
+    return nerf, photos, cube, train(nerf, training, checkpoint=checkpoint, report=report)
 
 
 def test_hull_holds_the_sphere_and_little_more(sphere):
@@ -61,19 +72,20 @@ def test_hull_holds_the_sphere_and_little_more(sphere):
 
 def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
     _, masks, k, poses, _ = sphere
-    assert not visual_hull(masks & False, k, poses, Sim3.identity(), 32, 0.0).any()
+    empty = silhouettes(masks & False, k, poses)
+    assert not visual_hull(empty, Sim3.identity(), 32, 0.0).any()
     with pytest.raises(ValueError, match="fewer than two photos"):
-        cube_from_cameras(masks & False, k, poses)
+        cube_from_cameras(empty)
 
 
 def test_batches_repeat_and_keep_off_the_band(sphere):
     cube, _ = sphere_volume(sphere)
     photos = photos_of(sphere, cube)
-    pool = pixel_pool(photos, band_px=2, ring_px=6, edge_px=2)
-    batch, again = (draw_batch(photos, pool, 5, 9, 8, 64, 0.25) for _ in range(2))
+    pool = pixel_pool(photos, band_px=2)
+    batch, again = (draw_batch(photos, pool, 5, 9, 8, 60) for _ in range(2))
     assert torch.equal(batch.uv, again.uv) and torch.equal(batch.view, again.view)
-    assert not torch.equal(batch.uv, draw_batch(photos, pool, 5, 10, 8, 64, 0.25).uv)
-    assert int((~batch.inside).sum()) == 8 * 16
+    assert not torch.equal(batch.uv, draw_batch(photos, pool, 5, 10, 8, 60).uv)
+    assert int((~batch.inside).sum()) == 8 * 6
     column, row = batch.uv.long().unbind(1)
     inner, outer = dilate(photos.masks, -2), dilate(photos.masks, 2)
     assert torch.equal(inner[batch.view, row, column], batch.inside)
@@ -85,7 +97,7 @@ def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
     photos = photos_of(sphere, cube)
     rim = dilate(photos.masks, 1) & ~photos.masks
     photos.mattes[rim] = 100
-    batch = draw_batch(photos, pixel_pool(photos, band_px=0, ring_px=6, edge_px=2), 5, 9, 8, 256, 0.25)
+    batch = draw_batch(photos, pixel_pool(photos, band_px=0), 5, 9, 8, 256)
     column, row = batch.uv.long().unbind(1)
     grey = rim[batch.view, row, column]
     assert grey.any() and batch.inside[grey].all()
@@ -96,12 +108,12 @@ def test_exact_mattes_draw_their_grey_pixels_as_they_are(sphere):
 
 
 def test_training_finds_the_sphere(sphere):
-    model, photos, cube, result = _train(sphere, steps=400)
+    nerf, photos, cube, result = _train(sphere, steps=400)
     depths, masks = sphere[4], sphere[1]
-    view = photos.intrinsics[0], photos.rotation[0], photos.center[0], photos.masks[0]
-    rendered = render_view(model.field, model.occupancy, *view, samples=32, uniform=0.25, colored=True)
+    view = photos.camera(0), photos.masks[0]
+    rendered = render_view(nerf.field, nerf.occupancy, *view, samples=32, colored=True)
     assert float(rendered.color[photos.masks[0]].mean()) > 0.2
-    plain = render_view(model.field, model.occupancy, *view, samples=32, uniform=0.25, colored=False)
+    plain = render_view(nerf.field, nerf.occupancy, *view, samples=32, colored=False)
     assert torch.equal(plain.depth, rendered.depth) and not plain.color.any()
     error = np.abs(rendered.depth.numpy() / cube.scale - depths[0])[masks[0]]
     assert np.median(error) < 0.01 * 2 * RADIUS
@@ -116,24 +128,17 @@ def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, mon
     assert torch.equal(whole.field.table, _train(sphere, steps=24)[0].field.table)
     assert not torch.equal(whole.field.table, _train(sphere, steps=24, seed=1)[0].field.table)
 
-    from scenefuse.nerf import train as module
-
-    step = module._step
-
-    def stop_at_ten(*arguments):
-        if arguments[-1] == 10:
-            import os
-            import signal
-
+    def draw_and_end_at_ten(*arguments):
+        if arguments[3] == 10:
             os.kill(os.getpid(), signal.SIGTERM)
-        return step(*arguments)
+        return draw_batch(*arguments)
 
-    monkeypatch.setattr(module, "_step", stop_at_ten)
+    monkeypatch.setattr(training_module, "draw_batch", draw_and_end_at_ten)
     checkpoint = tmp_path / "state.pt"
     with pytest.raises(SystemExit):
         _train(sphere, steps=24, checkpoint=checkpoint)
     assert torch.load(checkpoint, weights_only=True)["step"] == 11
-    monkeypatch.setattr(module, "_step", step)
+    monkeypatch.setattr(training_module, "draw_batch", draw_batch)
     lines = []
     resumed = _train(sphere, steps=24, checkpoint=checkpoint, report=lines.append)[0]
     assert "resumed at step 11 of 24" in lines[0]
@@ -141,7 +146,23 @@ def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, mon
     assert torch.equal(whole.occupancy.density, resumed.occupancy.density)
 
 
-def test_poses_move_only_when_asked(sphere):
+def test_a_truncated_checkpoint_starts_the_training_afresh(sphere, tmp_path, capsys):
+    checkpoint = tmp_path / "state.pt"
+    checkpoint.write_bytes(b"PK cut off")
+    again = _train(sphere, steps=6, checkpoint=checkpoint)[0]
+    assert "cannot be read" in capsys.readouterr().out
+    assert torch.equal(again.field.table, _train(sphere, steps=6)[0].field.table)
+
+
+def test_a_training_that_diverges_is_one_sentence_and_leaves_no_checkpoint(sphere, tmp_path, monkeypatch):
+    monkeypatch.setattr(training_module.losses, "mask_loss", lambda opacity, matte: opacity.mean() * torch.nan)
+    monkeypatch.setattr(checkpoints, "SAVE_EVERY_SECONDS", 0.0)
+    with pytest.raises(StageError, match="the training diverged"):
+        _train(sphere, steps=3, checkpoint=tmp_path / "state.pt")
+    assert not list(tmp_path.iterdir())
+
+
+def test_poses_move_with_a_learning_rate_only(sphere):
     assert not _train(sphere, steps=12)[0].pose.any()
     assert _train(sphere, steps=12, pose=1e-4)[0].pose.any()
 
@@ -197,3 +218,25 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_asked():
     away = np.abs((asked - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
+
+
+CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
+CORE += ("quality", "progress", "pose_refinement")
+ALLOWED = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
+ALLOWED_HERE = {f"scenefuse.{name}" for name in ("stage", "transforms", "cores", "checkpoints")}
+
+
+@pytest.mark.parametrize("name", CORE)
+def test_the_core_imports_numpy_and_pytorch_only(name):
+    tree = ast.parse((Path(scenefuse.nerf.__file__).parent / f"{name}.py").read_text())
+    found = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module == "scenefuse.nerf":
+            found |= {f"scenefuse.nerf.{alias.name}" for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            found.add(str(node.module))
+    ours = {module for module in found if module.startswith("scenefuse")}
+    assert {module.split(".")[0] for module in found - ours} <= ALLOWED
+    assert ours <= ALLOWED_HERE | {f"scenefuse.nerf.{part}" for part in CORE}

@@ -2,15 +2,23 @@
 
 import numpy as np
 import pytest
-from test_nerf_train import CENTER, RADIUS, sphere_views
+from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.io.clouds import Cloud
-from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.views import Views
-from scenefuse.nerf.object_cloud import CloudSettings, clean, fuse_depths, make_object_cloud, with_plane_normals
+from scenefuse.nerf.object_cloud import (
+    CloudGates,
+    CloudInputs,
+    CloudSettings,
+    SurfaceMaps,
+    clean,
+    fuse_depths,
+    make_object_cloud,
+    with_plane_normals,
+)
 from scenefuse.stage import StageError
 
-SETTINGS = CloudSettings(3, 0.02, 0.3, 0.3, 0.1, 0.01, 3.0, 0.02)
+SETTINGS = CloudSettings(min_views=3, spacing=0.01, gates=CloudGates(point_agreement=0.02, min_component=0.02))
 
 
 def _views():
@@ -31,7 +39,8 @@ def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
     damaged = depths.copy()
     damaged[0, rows[spoiled], columns[spoiled]] *= 0.8
     normals = np.zeros((*depths.shape, 3), np.float32)
-    cloud, diagonal = fuse_depths(views, views.object_from_cam, damaged, (depths > 0) * 0.8, normals, SETTINGS)
+    maps = SurfaceMaps(damaged, ((depths > 0) * 0.8).astype(np.float32), normals)
+    cloud, diagonal = fuse_depths(views, views.object_from_cam, maps, SETTINGS)
     distance = np.abs(np.linalg.norm(cloud.points - CENTER, axis=1) - RADIUS)
     assert len(cloud) > 1000
     assert distance.max() < 0.02 * diagonal
@@ -39,29 +48,30 @@ def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
     assert cloud.fields["views"].min() >= 3 and cloud.fields["views"].dtype == np.int32
     assert cloud.colors is not None and cloud.normals is not None
     outward = (cloud.points - CENTER) / RADIUS
-    planes = with_plane_normals(cloud, 16).normals
+    planes = with_plane_normals(cloud).normals
     assert np.median((planes * outward).sum(1)) > 0.98
 
 
 def test_cleaning_drops_a_small_group_and_far_points():
     grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     island = grid[:4] + [100.0, 0.0, 0.0]
-    lonely = np.array([[10.0, 10.0, 60.0]])
-    cleaned = clean(Cloud(np.concatenate([grid, island, lonely])), 3.0, 0.02, 1.0)
+    far_off = np.array([[10.0, 10.0, 60.0]])
+    cleaned = clean(Cloud(np.concatenate([grid, island, far_off])), 3.0, 0.02, 1.0)
     assert len(cleaned) == len(grid) and cleaned.points[:, 2].max() == 0 and cleaned.points[:, 0].max() < 20
 
 
 def test_a_missing_model_is_named(tmp_path):
     with pytest.raises(StageError, match="model.pt does not exist; run the NeRF stage first"):
         make_object_cloud(
-            cameras=tmp_path,
-            masks=tmp_path,
-            stage=tmp_path / "stage4",
-            stage_report=tmp_path / "stage4.json",
-            cameras_report=tmp_path / "cameras.json",
+            inputs=CloudInputs(
+                workspace=tmp_path,
+                workspace_json=tmp_path / "cameras.json",
+                masks=tmp_path,
+                stage=tmp_path / "stage4",
+                stage_json=tmp_path / "stage4.json",
+            ),
             cloud=tmp_path / "object.ply",
             report=tmp_path / "object.json",
-            refinement=RefinementSettings(0.0, 5, 0.6),
             settings=SETTINGS,
             seed=0,
         )

@@ -5,6 +5,9 @@
 #           results/weights/                                                SAM 2's, for masks by it
 
 
+include: "../functions/masks.smk"
+
+
 rule fetch_sam2_weights:
     """SAM 2's weights for ONNX Runtime; needed only by masks that use them."""
     output:
@@ -54,6 +57,7 @@ rule make_masks:
         options=mask_options,
         seed=config["seed"],
         script=script("masks/make_masks.py"),
+        files=state_of(mask_inputs),
         code=code("masks/make_masks.py"),
     message:
         "{wildcards.object}: masks"

@@ -11,12 +11,12 @@ NERF = config["object"]["nerf"]
 rule train_object_nerf:
     """Depth-guided NeRF (stage 2)."""
     input:
-        cameras=POSED,
-        cameras_json=f"{POSED}.json",
+        workspace=POSED,
+        workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
-        depth="results/objects/{object}/stage1",
-        depth_json="results/objects/{object}/stage1.json",
+        prior="results/objects/{object}/stage1",
+        prior_json="results/objects/{object}/stage1.json",
     output:
         stage=directory("results/objects/{object}/stage2"),
         report="results/objects/{object}/stage2.json",
@@ -33,6 +33,7 @@ rule train_object_nerf:
         gpu=config["gpu"],
     params:
         options=flags(NERF | config["object"]["stage2"] | HELD_OUT),
+        previous="",
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
         script=script("nerf/train_object_nerf.py"),
@@ -40,22 +41,22 @@ rule train_object_nerf:
     message:
         "{wildcards.object}: stage 2, depth-guided NeRF"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous None"
+        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --prior {input.prior} {params.previous}"
         " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}/{params.code}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
-rule retrain_object_nerf:
+use rule train_object_nerf as retrain_object_nerf with:
     """The NeRF again, guided by the refined depth (stage 4)."""
     input:
-        cameras=POSED,
-        cameras_json=f"{POSED}.json",
+        workspace=POSED,
+        workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
-        depth="results/objects/{object}/stage3",
-        depth_json="results/objects/{object}/stage3.json",
-        nerf="results/objects/{object}/stage2",
-        nerf_json="results/objects/{object}/stage2.json",
+        prior="results/objects/{object}/stage3",
+        prior_json="results/objects/{object}/stage3.json",
+        previous="results/objects/{object}/stage2",
+        previous_json="results/objects/{object}/stage2.json",
     output:
         stage=directory("results/objects/{object}/stage4"),
         report="results/objects/{object}/stage4.json",
@@ -63,32 +64,22 @@ rule retrain_object_nerf:
         "results/logs/retrain_object_nerf/{object}.log",
     benchmark:
         "results/benchmarks/retrain_object_nerf/{object}.tsv"
-    conda:
-        "../../envs/training.yaml"
-    threads: 1
-    resources:
-        mem_mb=lambda wildcards, attempt: 8000 * attempt,
-        runtime=lambda wildcards, attempt: 480 * attempt,
-        gpu=config["gpu"],
     params:
         options=flags(NERF | config["object"]["stage4"] | HELD_OUT),
+        previous="--previous results/objects/{object}/stage2",
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
         script=script("nerf/train_object_nerf.py"),
         code=code("nerf/train_object_nerf.py"),
     message:
         "{wildcards.object}: stage 4, final NeRF"
-    shell:
-        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --prior {input.depth} --previous {input.nerf}"
-        " --stage {output.stage} --report {output.report} --checkpoints {params.checkpoints}/{params.code}"
-        " --seed {params.seed} {params.options} &> {log}"
 
 
 rule make_object_cloud:
     """Fuse the NeRF's depth maps into the object's cloud."""
     input:
-        cameras=POSED,
-        cameras_json=f"{POSED}.json",
+        workspace=POSED,
+        workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         stage="results/objects/{object}/stage4",
@@ -114,6 +105,6 @@ rule make_object_cloud:
     message:
         "{wildcards.object}: cloud"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --cameras-report {input.cameras_json} --masks {input.masks}"
-        " --stage {input.stage} --stage-report {input.stage_json} --cloud {output.cloud} --report {output.report}"
+        "exec python {params.script} --workspace {input.workspace} --workspace-json {input.workspace_json} --masks {input.masks}"
+        " --stage {input.stage} --stage-json {input.stage_json} --cloud {output.cloud} --report {output.report}"
         " --seed {params.seed} {params.options} &> {log}"

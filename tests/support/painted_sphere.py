@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from scenefuse.nerf.occupancy import tight_cube, visual_hull
-from scenefuse.nerf.rays import Photos, cube_from_cameras
+from scenefuse.nerf.rays import PhotoTensors
+from scenefuse.nerf.volume import cube_from_cameras, silhouettes, tight_cube, visual_hull
 
 RADIUS, CENTER = 1.5, np.array([4.0, -2.0, 1.0])
 
@@ -40,16 +40,17 @@ def sphere_views(count=12, size=48):
 def sphere_volume(sphere, cells=32):
     """The cube around the sphere and its visual hull, (cells, cells, cells)."""
     _, masks, k, poses, _ = sphere
-    first = cube_from_cameras(masks, k, poses)
-    cube = tight_cube(visual_hull(masks, k, poses, first, 32, 0.0), first, 0.05)
-    return cube, visual_hull(masks, k, poses, cube, cells, 0.0)
+    views = silhouettes(masks, k, poses)
+    first = cube_from_cameras(views)
+    cube = tight_cube(visual_hull(views, first, 32, 0.0), first, 0.05)
+    return cube, visual_hull(views, cube, cells, 0.0)
 
 
 def photos_of(sphere, cube, prior=0.0):
     """The photos as training takes them, with true depths as prior or none."""
     images, masks, k, poses, depths = sphere
     known = depths * cube.scale * (1.0 if prior else 0.0)
-    return Photos(
+    return PhotoTensors(
         torch.from_numpy(images),
         torch.from_numpy(masks),
         torch.from_numpy(masks.astype(np.uint8) * 255),

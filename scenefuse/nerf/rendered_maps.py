@@ -1,0 +1,186 @@
+"""What a trained NeRF shows of its photos: depth, confidence and normal maps, renders, and how good they are."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scenefuse.io.maps import write_depth, write_normals
+from scenefuse.io.pictures import write_picture
+from scenefuse.mvs.consistency import compare, extent, normals_from_depth, surface_points
+from scenefuse.mvs.views import Views
+from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
+from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.render import RenderedView, render_view
+from scenefuse.nerf.training import Nerf
+from scenefuse.stage import StageError, quantity
+from scenefuse.transforms import Sim3
+
+Maps = NDArray[np.float32]
+
+# Views are rendered so far beyond their masks: what the object shows beyond them counts against it.
+BEYOND_MASK_PX = 4
+# A rendered depth counts where the ray is opaque and its weights lie within a few hundredths of the cube (method N13).
+LEAST_OPACITY, LARGEST_DEVIATION = 0.9, 0.05
+# Normals come from depths two pixels apart, unless these jump by more than 3 %.
+NORMAL_STEP_PX, NORMAL_JUMP = 2, 0.03
+# Structural similarity looks at windows of 11 pixels: these reach 5 beyond the mask.
+SSIM_REACH_PX = 5
+
+
+@dataclass(frozen=True)
+class MapSettings:
+    """How depth maps are rendered and compared."""
+
+    render_samples: int = 32
+    """Samples per ray when views are rendered."""
+    map_agreement: float = 0.005
+    """Two depths of one place agree within this share of the object's diagonal."""
+
+
+@dataclass(frozen=True)
+class RenderedMaps:
+    """All V photos as the NeRF shows them, in the object's frame and unit.
+
+    Attributes:
+        views: photos, masks and cameras.
+        poses: (V, 4, 4) object_from_cam of the maps.
+        depths: (V, H, W) along z, 0 for none.
+        confidence: (V, H, W) in 0..1.
+        rendered: V renders in nerf units; those of photos that do not measure quality have no colours.
+        measured: (V,) bool, photos that measure quality: the held-out ones, or all.
+        diagonal: of the object, in its unit.
+    """
+
+    views: Views
+    poses: NDArray[np.float64]
+    depths: Maps
+    confidence: Maps
+    rendered: list[RenderedView]
+    measured: NDArray[np.bool_]
+    diagonal: float
+
+
+def render_maps(
+    nerf: Nerf, photos: PhotoTensors, views: Views, poses: NDArray[np.float64], scale: float, settings: MapSettings
+) -> RenderedMaps:
+    """Render every photo.
+
+    Args:
+        nerf: trained.
+        photos: as tensors in the unit cube's frame.
+        views: the same photos.
+        poses: (V, 4, 4) object_from_cam, those of `photos`.
+        scale: nerf units per object unit.
+        settings: samples, and what agrees.
+
+    Raises:
+        StageError: no ray met a surface.
+    """
+    measured = views.held_out if views.held_out.any() else np.ones(len(views.names), bool)
+    where = dilate(photos.masks, BEYOND_MASK_PX)
+    rendered = [
+        render_view(nerf.field, nerf.occupancy, photos.camera(view), where[view], settings.render_samples, colored)
+        for view, colored in enumerate(measured)
+    ]
+    depths: Any = np.stack([_solid_depth(view).numpy() for view in rendered]) / scale
+    if not (depths > 0).any():
+        raise StageError(
+            f"the NeRF found no surface: no ray reached an opacity of {LEAST_OPACITY}; check the masks and the cameras"
+        )
+    diagonal = extent(np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, poses)]))
+    confidence = _confidence(depths, rendered, views, poses, settings.map_agreement * diagonal)
+    return RenderedMaps(views, poses, depths, confidence, rendered, measured, diagonal)
+
+
+def write_maps(maps: RenderedMaps, folder: Path) -> None:
+    """Write depth_maps/, confidence_maps/, normal_maps/ of all photos, and renders/ of those that measure quality."""
+    for index, name in enumerate(maps.views.names):
+        write_depth(folder / "depth_maps" / f"{name}.bin", maps.depths[index])
+        write_depth(folder / "confidence_maps" / f"{name}.bin", maps.confidence[index])
+        normals = normals_from_depth(maps.depths[index], maps.views.intrinsics[index], NORMAL_STEP_PX, NORMAL_JUMP)
+        write_normals(folder / "normal_maps" / f"{name}.bin", normals)
+    (folder / "renders").mkdir()
+    for row in np.flatnonzero(maps.measured):
+        picture = (maps.rendered[row].color.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
+        write_picture(folder / "renders" / f"{Path(maps.views.names[row]).stem}.png", picture)
+
+
+def write_nerf(path: Path, nerf: Nerf, nerf_from_object: Sim3, maps: RenderedMaps) -> None:
+    """Write what a later stage goes on from: the field, its cube, and the poses of the photos."""
+    saved = {
+        "model": nerf.state(),
+        "nerf_from_object": torch.from_numpy(nerf_from_object.matrix),
+        "names": maps.views.names,
+        "object_from_cam": torch.from_numpy(maps.poses),
+    }
+    try:
+        torch.save(saved, path)
+    except (OSError, RuntimeError) as error:  # PyTorch turns a failed write into a RuntimeError
+        why = " ".join(str(error).split())
+        raise StageError(f"{path.name} could not be written ({why}); check that the disk has room") from None
+
+
+def read_nerf(stage: Path) -> dict[str, Any]:
+    """What `write_nerf` wrote into a stage's folder, on the CPU wherever it was trained.
+
+    Raises:
+        StageError: there is none, or it is damaged.
+    """
+    path = stage / "model.pt"
+    if not path.is_file():
+        raise StageError(f"{path} does not exist; run the NeRF stage first")
+    try:
+        return torch.load(path, map_location="cpu", weights_only=True)
+    except Exception:  # a truncated file raises any of half a dozen
+        raise StageError(f"{path} is damaged; delete {stage} and run the NeRF stage again") from None
+
+
+def measure_quality(
+    views: Views, rendered: list[RenderedView], measured: NDArray[np.bool_], exact: bool
+) -> dict[str, Any]:
+    """Mean quality on the photos `measured` (V,), for the report.
+
+    Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background.
+    """
+    rows = []
+    for index in np.flatnonzero(measured):
+        mask = torch.from_numpy(views.masks[index])
+        photo = torch.from_numpy(views.images[index]).float() / 255.0
+        picture, everything = rendered[index].color.clamp(0, 1), torch.ones_like(mask)
+        masked = photo * (torch.from_numpy(views.mattes[index]) / 255.0 if exact else mask)[..., None]
+        near = dilate(mask[None], SSIM_REACH_PX)[0]
+        signal = psnr(picture, masked, mask), psnr(picture, masked, everything)
+        rows.append((*signal, ssim(picture, masked, near), silhouette_iou(rendered[index].opacity, mask)))
+    inside, whole, structure, outline = np.mean(rows, axis=0)
+    return {
+        "psnr_held_out": quantity(float(inside), "dB"),
+        "psnr_held_out_masked_photo": quantity(float(whole), "dB"),
+        "ssim": quantity(float(structure), "1"),
+        "silhouette_iou": quantity(float(outline), "1"),
+        "measured_on": quantity("held-out photos" if views.held_out.any() else "training photos", ""),
+        "photos_measured": quantity(int(measured.sum()), "1"),
+    }
+
+
+def _solid_depth(rendered: RenderedView) -> Tensor:
+    """(H, W) median depth, 0 where the ray is not opaque or its weights are spread."""
+    keep = (rendered.opacity > LEAST_OPACITY) & (rendered.deviation < LARGEST_DEVIATION)
+    return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth))
+
+
+def _confidence(
+    depths: Maps, rendered: list[RenderedView], views: Views, poses: NDArray[np.float64], tolerance: float
+) -> Maps:
+    """Opacity times the share of the views that should see a point and agree; of two views at least."""
+    confidence = np.zeros_like(depths)
+    for index in range(len(depths)):
+        points, rows, columns = surface_points(depths[index], views.intrinsics[index], poses[index])
+        found = compare(points, index, depths, views.masks, views.intrinsics, poses, tolerance)
+        share = found.agree / np.maximum(found.agree + found.through, 2)
+        confidence[index, rows, columns] = share * rendered[index].opacity.numpy()[rows, columns].clip(0, 1)
+    return confidence

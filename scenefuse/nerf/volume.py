@@ -1,0 +1,151 @@
+"""Where an object is: the unit cube around it that its NeRF is trained in, and its visual hull in that cube."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from scenefuse.mvs.visual_hull import count_silhouettes
+from scenefuse.nerf.rays import dilate
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import View
+
+# Cells per side of the hull that the cube is fitted to: the margin is wider than one of them.
+FIRST_CELLS = 64
+# Share of the cube's side left free on each side of the hull, for what the masks cut off.
+MARGIN = 0.02
+# The first, rough cube is half as wide again as the masks' extents ask for.
+ROUGH_FACTOR = 1.5
+# A mask of fewer pixels says nothing about where the object is.
+LEAST_PIXELS = 16
+# Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
+HALF_DIAGONAL = 0.87
+# A cell counts only where so large a share of the photos has it in the frame; an orbit has the object in all of them.
+LEAST_SHARE, LEAST_PHOTOS = 0.3, 2
+
+
+@dataclass(frozen=True)
+class Volume:
+    """nerf_from_object maps the cube around the object to the unit cube; `hull` (G, G, G) bool are its cells inside."""
+
+    nerf_from_object: Sim3
+    hull: NDArray[np.bool_]
+
+
+def find_volume(outlines: list[View], cells: int, tolerance: float, cube: Sim3 | None = None) -> Volume:
+    """The unit cube and the visual hull in it.
+
+    Args:
+        outlines: views of the training photos, with their mask as pixels.
+        cells: per side of the hull, a multiple of 4 times a power of 2.
+        tolerance: share of the photos that may have a cell of the hull outside their mask.
+        cube: nerf_from_object of an earlier stage, which is kept, or None.
+
+    Raises:
+        StageError: fewer than two photos have a mask, or no cell is left.
+    """
+    try:
+        if cube is None:
+            rough = cube_from_cameras(outlines)
+            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance), rough, MARGIN)
+        hull = visual_hull(outlines, cube, cells, tolerance)
+    except ValueError as error:
+        raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
+    if not hull.any():
+        raise StageError("the visual hull of the masks is empty: masks and cameras contradict each other; check both")
+    return Volume(cube, hull)
+
+
+def silhouettes(masks: NDArray[np.bool_], intrinsics: Array, object_from_cam: Array) -> list[View]:
+    """V views with their mask as pixels, from (V, H, W) masks, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
+    height, width = masks.shape[1:]
+    cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
+    cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
+    cam_from_object[:, :3, 3] = -np.einsum("vij,vi->vj", object_from_cam[:, :3, :3], object_from_cam[:, :3, 3])
+    return [View("", k, pose, width, height, mask) for k, pose, mask in zip(intrinsics, cam_from_object, masks)]
+
+
+def cube_from_cameras(views: list[View]) -> Sim3:
+    """A generous cube around the object from masks and cameras alone: unit_from_object.
+
+    Its centre is the point nearest to the viewing rays of the masks' centres; its size follows from their extents.
+
+    Raises:
+        ValueError: fewer than two photos have a mask.
+    """
+    normal, right, centres, angles = np.zeros((3, 3)), np.zeros(3), [], []
+    for view in views:
+        rows, columns = np.nonzero(view.pixels)
+        if len(rows) < LEAST_PIXELS:
+            continue
+        # A few stray pixels of a mask do not count.
+        box = np.percentile(columns, [0.5, 99.5]), np.percentile(rows, [0.5, 99.5])
+        middle = np.array([box[0].mean() + 0.5, box[1].mean() + 0.5, 1.0])
+        direction = view.cam_from_world[:3, :3].T @ np.linalg.solve(view.intrinsics, middle)
+        direction /= np.linalg.norm(direction)
+        project = np.eye(3) - np.outer(direction, direction)
+        normal, right = normal + project, right + project @ view.centre
+        centres.append(view.centre)
+        angles.append(0.5 * np.hypot(np.ptp(box[0]) / view.intrinsics[0, 0], np.ptp(box[1]) / view.intrinsics[1, 1]))
+    if len(centres) < 2:
+        raise ValueError("fewer than two photos have a mask of the object")
+    center = np.linalg.solve(normal, right)
+    radius = max(np.percentile(np.linalg.norm(np.array(centres) - center, axis=1) * np.array(angles), 90), 1e-9)
+    scale = 0.5 / (ROUGH_FACTOR * radius)
+    return Sim3(scale, np.eye(3), 0.5 - scale * center)
+
+
+def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -> Sim3:
+    """The cube around a hull's cells, `margin` (share of its side) wider on each side: nerf_from_object.
+
+    Raises:
+        ValueError: the hull is empty.
+    """
+    cells = np.argwhere(hull)
+    if len(cells) == 0:
+        raise ValueError("the visual hull of the masks is empty")
+    low, high = cells.min(0) / len(hull), (cells.max(0) + 1) / len(hull)
+    object_from_unit = unit_from_object.inverse()
+    center = object_from_unit.apply((low + high) / 2)
+    scale = 1.0 / (object_from_unit.scale * float((high - low).max()) * (1 + 2 * margin))
+    return Sim3(scale, np.eye(3), 0.5 - scale * center)
+
+
+def visual_hull(views: list[View], unit_from_object: Sim3, size: int, tolerance: float) -> NDArray[np.bool_]:
+    """Cells (size, size, size) of the unit cube that project into (nearly) every mask that has them in the frame.
+
+    From coarse to fine: a coarse cell is kept where it touches the masks, and split into eight.
+
+    Args:
+        views: with their mask as pixels.
+        unit_from_object: the cube.
+        size: cells per side, a multiple of 4 times a power of 2.
+        tolerance: share of the photos that may have a cell outside their mask.
+    """
+    object_from_unit = unit_from_object.inverse()
+    count = size // 4
+    cells, children = _corners(count), _corners(2)
+    while True:
+        points = object_from_unit.apply((cells + 0.5) / count)
+        reach = object_from_unit.scale * HALF_DIAGONAL / count
+        shown, missed = count_silhouettes(points, (_grown(view, points, reach) for view in views))
+        cells = cells[(missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(views)))]
+        if count == size or len(cells) == 0:
+            hull = np.zeros((size, size, size), dtype=bool)
+            hull[tuple(cells.T)] = True
+            return hull
+        cells, count = (2 * cells[:, None] + children).reshape(-1, 3), 2 * count
+
+
+def _corners(count: int) -> NDArray[np.int64]:
+    """(count^3, 3) indices of the cells of a grid."""
+    return np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)
+
+
+def _grown(view: View, points: Array, reach: float) -> View:
+    """The view with its mask grown by a length `reach` at the points' median depth."""
+    depth = np.maximum(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3], 1e-9)
+    radius = int(np.ceil(reach * view.intrinsics[0, 0] / max(float(np.median(depth)), 1e-9)))
+    return replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy())
