@@ -14,6 +14,14 @@ Array = NDArray[np.floating]
 
 # Difference between views at which agreement falls to 60 %, share of the object's diagonal.
 TOLERANCE = 0.01
+# Beyond so many tolerances, or standard deviations of two maps' difference, depths are of different surfaces.
+FAR_OFF = 3.0
+# Where two maps differ, one is kept if its variance is smaller by this factor.
+VARIANCE_RATIO = 4.0
+# RANSAC of the alignment: draws, the least distance of two points as a share of their range, and the largest factor
+# between a draw's scale and the median ratio.
+DRAWS, LEAST_DISTANCE, LARGEST_FACTOR = 200, 0.1, 5.0
+MIN_POINTS = 5
 
 
 @dataclass(frozen=True)
@@ -54,10 +62,10 @@ def consistency_between_views(depth: Tensor, photos: PhotoTensors, tolerance: fl
             photos.intrinsics[view : view + 1],
             photos.intrinsics[sources],
         )
-        counted = seen & (difference > -3.0 * tolerance)
+        counted = seen & (difference > -FAR_OFF * tolerance)
         votes = torch.exp(-0.5 * (difference / tolerance) ** 2) * counted
         confidence[view, 0] = votes.sum(0) / counted.sum(0).clamp_min(2)
-        close = counted & (difference.abs() < 3.0 * tolerance)
+        close = counted & (difference.abs() < FAR_OFF * tolerance)
         number = close.sum(0)
         mean_square = (difference**2 * close).sum(0) / number.clamp_min(1)
         variance[view, 0] = torch.where(number > 0, mean_square, torch.full_like(mean_square, torch.inf))
@@ -77,7 +85,7 @@ def align_to_points(predicted: Array, measured: Array, seed: int = 0) -> tuple[f
         seed: of the RANSAC pairs.
     """
     predicted, measured = np.asarray(predicted, float), np.asarray(measured, float)
-    if len(predicted) < 5:
+    if len(predicted) < MIN_POINTS:
         return 1.0, 0.0
     rng = np.random.default_rng(seed)
 
@@ -87,13 +95,13 @@ def align_to_points(predicted: Array, measured: Array, seed: int = 0) -> tuple[f
 
     scale = float(np.median(measured / predicted))
     best = (scale, 0.0)
-    for _ in range(200):
+    for _ in range(DRAWS):
         i, j = rng.choice(len(predicted), 2, replace=False)
-        if abs(predicted[i] - predicted[j]) < 0.1 * np.ptp(predicted):
+        if abs(predicted[i] - predicted[j]) < LEAST_DISTANCE * np.ptp(predicted):
             continue
         slope = (measured[i] - measured[j]) / (predicted[i] - predicted[j])
         candidate = (slope, measured[i] - slope * predicted[i])
-        if 0.2 * scale < slope < 5.0 * scale and cost(*candidate, 0) < cost(*best, 0):
+        if scale / LARGEST_FACTOR < slope < LARGEST_FACTOR * scale and cost(*candidate, 0) < cost(*best, 0):
             best = candidate
     best = _tukey_line(predicted, measured, *best)
     options = [(cost(1.0, 0.0, 0), (1.0, 0.0)), (cost(scale, 0.0, 1), (scale, 0.0)), (cost(*best, 2), best)]
@@ -131,11 +139,14 @@ def fuse_by_inverse_variance(
     a = torch.where(first > 0, first_variance + floor**2, torch.inf)
     b = torch.where(second > 0, second_variance + floor**2, torch.inf)
     both = torch.isfinite(a) & torch.isfinite(b)
-    blended = both & ((first - second) ** 2 < 9.0 * (a + b))
+    blended = both & ((first - second) ** 2 < FAR_OFF**2 * (a + b))
     weight_a, weight_b = 1.0 / a, 1.0 / b
     total = (weight_a + weight_b).clamp_min(1e-30)
     mean = (first * weight_a + second * weight_b) / total
-    only_a, only_b = ~blended & (4.0 * a <= b) & torch.isfinite(a), ~blended & (4.0 * b <= a) & torch.isfinite(b)
+    only_a, only_b = (
+        ~blended & (VARIANCE_RATIO * a <= b) & torch.isfinite(a),
+        ~blended & (VARIANCE_RATIO * b <= a) & torch.isfinite(b),
+    )
     nothing = torch.zeros_like(first)
     depth = torch.where(blended, mean, torch.where(only_a, first, torch.where(only_b, second, nothing)))
     infinite = torch.full_like(first, torch.inf)

@@ -8,7 +8,16 @@ from numpy.typing import NDArray
 
 from scenefuse.mvs.views import Views
 
+# Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
 MARGIN = 0.06
+# The canvas fits the boxes of this percentage of the photos; larger ones are shrunk.
+FITTING_PERCENT, SPARE_PX = 90, 8
+MIN_CANVAS_PX = 32
+# Sides of the canvas relative to each other: no more elongated than this.
+MAX_ASPECT = 2.0
+# A pixel of a moved map has a depth when at least this share of what it is made of has one; it is interpolated unless
+# that differs from the nearest depth by more than this share, as at an edge.
+MIN_KNOWN, EDGE = 0.3, 0.02
 Map = NDArray[np.float32]
 
 
@@ -48,10 +57,10 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     height, width = views.masks.shape[1:]
     boxes = np.array([_box(mask) for mask in views.masks])
     extent = (boxes[:, 2:] - boxes[:, :2]) * (1 + 2 * MARGIN)
-    aspect = float(np.clip(np.median(extent[:, 0] / extent[:, 1]), 0.5, 2.0))
+    aspect = float(np.clip(np.median(extent[:, 0] / extent[:, 1]), 1 / MAX_ASPECT, MAX_ASPECT))
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
-    largest = np.minimum(np.minimum(ideal, np.percentile(extent, 90, axis=0) + 8), [width, height])
-    canvas = np.maximum(np.round(largest / 4) * 4, 32).astype(int)
+    largest = np.minimum(np.minimum(ideal, np.percentile(extent, FITTING_PERCENT, axis=0) + SPARE_PX), [width, height])
+    canvas = np.maximum(np.round(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
     images, mattes, intrinsics, moves = [], [], [], []
     for index, box in enumerate(boxes):
         shrink = min(1.0, *(canvas / extent[index]))
@@ -95,8 +104,8 @@ def _moved(source: Map, target_from_source: NDArray[np.float64], size: tuple[int
     share = _remap(valid, x, y, cv2.INTER_LINEAR)
     smooth = _remap(source, x, y, cv2.INTER_LINEAR) / np.maximum(share, 1e-6)
     nearest = _remap(source, x, y, cv2.INTER_NEAREST)
-    edge = (nearest > 0) & (np.abs(smooth - nearest) > 0.02 * nearest)
-    return np.where(share > 0.3, np.where(edge, nearest, smooth), 0.0).astype(np.float32)
+    edge = (nearest > 0) & (np.abs(smooth - nearest) > EDGE * nearest)
+    return np.where(share > MIN_KNOWN, np.where(edge, nearest, smooth), 0.0).astype(np.float32)
 
 
 def _remap(source: Map, x: Map, y: Map, interpolation: int) -> Map:

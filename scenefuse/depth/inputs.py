@@ -17,6 +17,10 @@ BEST_ANGLE_DEG = 15.0
 CHECK_EVERY = 10
 # A point belongs to the object when this share of the photos that observe it have it in their mask.
 SHARE_IN_MASKS = 0.7
+# The depth range spans these percentiles of the points' depths, widened at both ends by shares of the range and of the
+# farthest depth; the box around the object spans the percentiles of BOX.
+RANGE, BOX = (1, 99), (2, 98)
+WIDER, WIDER_FAR = 0.15, 1e-3
 # Points nearer than this, in object units, are behind the camera or in it.
 MIN_DEPTH = 1e-6
 
@@ -74,10 +78,10 @@ def photo_tensors(views: Views, sources: int, device: torch.device) -> PhotoTens
             f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    low, high = np.percentile(views.sparse[on_object], [2, 98], axis=0)
+    low, high = np.percentile(views.sparse[on_object], BOX, axis=0)
     depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
-    closest, farthest = np.percentile(depths, [1, 99])
-    margin = 0.15 * (farthest - closest) + 1e-3 * farthest
+    closest, farthest = np.percentile(depths, RANGE)
+    margin = WIDER * (farthest - closest) + WIDER_FAR * farthest
 
     def as_tensor(array: NDArray[np.generic]) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=device)

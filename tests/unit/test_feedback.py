@@ -97,6 +97,10 @@ def test_missing_rendered_depth_or_networks_is_one_sentence(tmp_path, stage1):
     torch.save({"weights": torch.zeros(1)}, tmp_path / "stage1" / "networks.pt")
     with pytest.raises(StageError, match="holds no networks of stage 1"):
         _refine(tmp_path)
-    (tmp_path / "stage1" / "networks.pt").unlink()
+    networks = tmp_path / "stage1" / "networks.pt"
+    networks.write_bytes(networks.read_bytes()[:200])
+    with pytest.raises(StageError, match="networks.pt cannot be read .* run stage 1 again"):
+        _refine(tmp_path)
+    networks.unlink()
     with pytest.raises(StageError, match="run stage 1 first"):
         _refine(tmp_path)
