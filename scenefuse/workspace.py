@@ -5,6 +5,7 @@ undistortion writes, and what dense stereo, masks and training read. Axes are Op
 pixel centres lie at +0.5.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -109,6 +110,11 @@ class Workspace:
     seen: list[Rows]
     seen_at: list[Array]
 
+    def subset(self, rows: Sequence[int]) -> "Workspace":
+        """The same workspace with only these of its views, and all sparse points."""
+        views, seen = [self.views[k] for k in rows], [self.seen[k] for k in rows]
+        return replace(self, views=views, seen=seen, seen_at=[self.seen_at[k] for k in rows])
+
     def rgb(self, view: View) -> View:
         """A view with its photo, (H, W, 3) uint8 RGB."""
         return self._with(view, read_rgb(self.folder / "images" / view.name))
@@ -152,6 +158,12 @@ def read_workspace(folder: Path) -> Workspace:
     )
 
 
+def read_views(folder: Path) -> list[View]:
+    """The posed photos of a COLMAP model in name order; a lens's distortion is left out."""
+    model = read_model(folder)
+    return [view_of(model, image) for image in posed_images(model)]
+
+
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); StageError that names the folder when it cannot be read."""
     try:
@@ -171,3 +183,25 @@ def view_of(model: pycolmap.Reconstruction, image: pycolmap.Image) -> View:
     camera, pose = model.cameras[image.camera_id], np.eye(4)
     pose[:3] = image.cam_from_world().matrix()
     return View(image.name, camera.calibration_matrix(), pose, camera.width, camera.height)
+
+
+def write_model(folder: Path, views: list[View]) -> None:
+    """Write a COLMAP model of PINHOLE cameras and poses into an existing folder, without points.
+
+    Views with the same lens and size share a camera.
+    """
+    model = pycolmap.Reconstruction()
+    known: dict[tuple[float, ...], int] = {}
+    for number, view in enumerate(views, start=1):
+        k = view.intrinsics
+        lens = view.width, view.height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2])
+        if lens not in known:
+            known[lens] = len(known) + 1
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(
+                    camera_id=known[lens], model="PINHOLE", width=view.width, height=view.height, params=lens[2:]
+                )
+            )
+        image = pycolmap.Image(name=view.name, camera_id=known[lens], image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
+    model.write(folder)

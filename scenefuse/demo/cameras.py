@@ -9,6 +9,7 @@ import open3d as o3d
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError, quantity, read_json, threads, value
+from scenefuse.workspace import View
 
 
 @dataclass(frozen=True)
@@ -31,12 +32,17 @@ class Cameras:
     cam_from_world: NDArray[np.float64]
     centres: NDArray[np.float64]
 
+    def view(self, photo: int) -> View:
+        """One photo's camera."""
+        pose = np.eye(4)
+        pose[:3, :3] = self.cam_from_world[photo]
+        pose[:3, 3] = -self.cam_from_world[photo] @ self.centres[photo]
+        return View(self.names[photo], self.intrinsics, pose, self.width, self.height)
+
     def project(self, photo: int, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """(M, 2) pixels of (M, 3) points of the world in one photo, and which of them fall inside it."""
-        x, y, z = ((points - self.centres[photo]) @ self.cam_from_world[photo].T @ self.intrinsics.T).T
-        pixels = np.stack([x, y], axis=1) / np.where(np.abs(z) < 1e-9, 1e-9, z)[:, None]
-        inside = (z > 0.01) & (pixels >= 0).all(1) & (pixels < [self.width, self.height]).all(1)
-        return pixels, inside
+        pixels, depth = self.view(photo).project(points)
+        return pixels, (depth > 0) & (pixels >= 0).all(1) & (pixels < [self.width, self.height]).all(1)
 
 
 def pinhole(focal_px: float, width: int, height: int) -> NDArray[np.float64]:

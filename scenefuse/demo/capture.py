@@ -28,19 +28,19 @@ class FlightSettings:
     obliques: int = setting(11, least=0)
     """Photos that look obliquely, from the south and from the east."""
     altitude: float = setting(40, unit="m", least=0)
-    """Height above the ground, metres."""
+    """Height above the ground."""
     width_px: int = setting(800, unit="px", least=0)
     """Columns of a photo."""
     height_px: int = setting(600, unit="px", least=0)
     """Rows of a photo."""
     focal_px: float = setting(700, unit="px", least=0)
-    """Focal length in pixels."""
+    """Focal length."""
     supersampling: int = setting(2, least=0)
     """Samples along each side of a pixel."""
     gps_noise_horizontal: float = setting(0.5, unit="m", least=0)
-    """Standard deviation of the EXIF position, east and north, metres."""
+    """Standard deviation of the EXIF position, east and north."""
     gps_noise_vertical: float = setting(1.0, unit="m", least=0)
-    """Standard deviation of the EXIF height, metres."""
+    """Standard deviation of the EXIF height."""
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,16 @@ class OrbitSettings:
 
     views: int = setting(40, least=0)
     """Number of photos, shared out among the rings."""
-    elevations_deg: tuple[float, ...] = setting((5, 34), unit="degree")
-    """One ring of photos for each: how high the camera stands above the object's middle, degrees."""
+    elevations_deg: tuple[float, ...] = setting((5, 34), unit="deg")
+    """One ring of photos for each: how high the camera stands above the object's middle."""
     fill: float = setting(0.65, least=0)
-    """Share of the photo's height that the object fills, 0..1."""
+    """Share of the photo's height that the object fills."""
     width_px: int = setting(640, unit="px", least=0)
     """Columns of a photo."""
     height_px: int = setting(480, unit="px", least=0)
     """Rows of a photo."""
     focal_px: float = setting(560, unit="px", least=0)
-    """Focal length in pixels."""
+    """Focal length."""
     supersampling: int = setting(2, least=0)
     """Samples along each side of a pixel."""
 

@@ -1,5 +1,6 @@
 """Points clicked in photos of the demo, as a person would: corners and tips that are visible, a pixel off."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -7,20 +8,25 @@ from numpy.typing import NDArray
 
 from scenefuse.demo.cameras import read_cameras, visible
 from scenefuse.demo.world import build_world
-from scenefuse.stage import StageError, atomic_file
+from scenefuse.stage import StageError, atomic_file, setting
+
+# A point counts as hidden when something lies this far before it, in metres.
+HIDDEN_M = 0.06
 
 
-def click_points(
-    *,
-    name: str,
-    cameras: Path,
-    clicks: Path,
-    photos: int,
-    separation_deg: float,
-    noise_px: float,
-    seed: int,
-    click_seed: int,
-) -> None:
+@dataclass(frozen=True)
+class ClickSettings:
+    """Clicks of the demo."""
+
+    photos: int = setting(6, least=0)
+    """Photos used at most."""
+    separation_deg: float = setting(12, unit="deg", least=0)
+    """Smallest angle at the object between the views of two photos used."""
+    noise_px: float = setting(1, unit="px", least=0)
+    """Standard deviation of a click."""
+
+
+def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSettings, seed: int) -> None:
     """Click an object's landmarks in a few photos of one capture: the flight (fiducials) or its orbit (prompts).
 
     Writes a tab-separated table with the columns point, photo, x_px, y_px (pixel centres at +0.5); each point
@@ -30,11 +36,8 @@ def click_points(
         name: house, balloon or sculpture.
         cameras: the capture's cameras.json.
         clicks: output table, .tsv.
-        photos: photos used at most.
-        separation_deg: smallest angle at the object between the views of two photos used, degrees.
-        noise_px: standard deviation of a click, pixels.
-        seed: of the world, as for rendering.
-        click_seed: of the clicks' noise.
+        settings: how they are clicked.
+        seed: of the world, as for rendering, and of the clicks' noise.
 
     Raises:
         StageError: an unknown object, or fewer than four points that two photos see.
@@ -43,19 +46,19 @@ def click_points(
     landmarks = world.landmarks(name)
     capture = read_cameras(cameras)
     points = np.array(list(landmarks.values()))
-    pixels, seen = visible(world.scene, capture, points, 0.06)
-    used = _choose(seen, capture.centres - world.bounds(name).mean(0), photos, separation_deg)
+    pixels, seen = visible(world.scene, capture, points, HIDDEN_M)
+    used = _choose(seen, capture.centres - world.bounds(name).mean(0), settings)
     names = [n for n, count in zip(landmarks, seen[used].sum(0)) if count >= 2]
     if len(names) < 4:
         raise StageError(
             f"only {len(names)} points of {name} are visible in two of the {len(used)} photos used from {cameras}; "
             "render more photos, or allow more photos or a smaller separation for the clicks"
         )
-    rng = np.random.default_rng(click_seed)
+    rng = np.random.default_rng(seed)
     lines = ["point\tphoto\tx_px\ty_px"]
     for k, point in enumerate(landmarks):
         for photo in used:
-            noise = rng.normal(0.0, noise_px, 2)
+            noise = rng.normal(0.0, settings.noise_px, 2)
             if point in names and seen[photo, k]:
                 x, y = np.clip(pixels[photo, k] + noise, 0, [capture.width, capture.height])
                 lines.append(f"{point}\t{capture.names[photo]}\t{x:.2f}\t{y:.2f}")
@@ -64,16 +67,16 @@ def click_points(
     print(f"{name}: {len(names)} points in {len(used)} photos", flush=True)
 
 
-def _choose(seen: NDArray[np.bool_], towards: NDArray[np.float64], photos: int, separation_deg: float) -> list[int]:
+def _choose(seen: NDArray[np.bool_], towards: NDArray[np.float64], settings: ClickSettings) -> list[int]:
     """Photos, one by one the one that adds most to points seen by fewer than two of those chosen."""
     directions = towards / np.linalg.norm(towards, axis=1, keepdims=True)
     chosen: list[int] = []
-    while len(chosen) < photos:
+    while len(chosen) < settings.photos:
         need = np.maximum(2 - seen[chosen].sum(0), 0) if chosen else np.full(seen.shape[1], 2)
         gain = (seen * (1 + 8 * need)).sum(1).astype(np.float64)
         if chosen:
             closest = np.degrees(np.arccos(np.clip(directions @ directions[chosen].T, -1, 1))).min(1)
-            gain[closest < separation_deg] = 0
+            gain[closest < settings.separation_deg] = 0
         if gain.max() <= 0:
             break
         chosen.append(int(gain.argmax()))

@@ -62,7 +62,7 @@ def _noise(x, y, z, seed):
 
 
 @njit(cache=True, fastmath=True)
-def _fbm(x, y, z, wavelength, octaves, gain, footprint, seed):
+def fractal_noise(x, y, z, wavelength, octaves, gain, footprint, seed):
     """Octaves of noise from `wavelength` metres down, each half as long; about -1 .. 1."""
     total, norm, weight = 0.0, 0.0, 1.0
     for octave in range(octaves):
@@ -83,7 +83,7 @@ def noise_at(points: NDArray[np.float64], octaves: int, gain: float, seed: int) 
     """Noise about -1 .. 1 at (N, 3) points, longest wavelength 1."""
     out = np.empty(len(points))
     for n in range(len(points)):
-        out[n] = _fbm(points[n, 0], points[n, 1], points[n, 2], 1.0, octaves, gain, 1e-6, seed)
+        out[n] = fractal_noise(points[n, 0], points[n, 1], points[n, 2], 1.0, octaves, gain, 1e-6, seed)
     return out
 
 
@@ -132,10 +132,10 @@ def path_distance(x, y):
 
 @njit(cache=True, fastmath=True)
 def _terrain(x, y, z, fp):
-    fine = _fbm(x, y, z, 0.9, 7, 1.12, fp, 11)
-    broad = _fbm(x, y, 0.0, 14.0, 4, 0.6, fp, 31)
+    fine = fractal_noise(x, y, z, 0.9, 7, 1.12, fp, 11)
+    broad = fractal_noise(x, y, 0.0, 14.0, 4, 0.6, fp, 31)
     colour = _mix((0.068, 0.115, 0.03), (0.19, 0.18, 0.07), _step(-0.5, 0.8, broad + 0.3 * fine))
-    soil = _fbm(x + 50, y, 0.0, 9.0, 4, 0.7, fp, 47) + 0.25 * fine
+    soil = fractal_noise(x + 50, y, 0.0, 9.0, 4, 0.7, fp, 47) + 0.25 * fine
     colour = _mix(colour, (0.19, 0.125, 0.07), 0.9 * _step(0.35, 0.75, soil))
     if x > 22 and y < -8 and x < 44 and y > -36:
         furrow = 0.5 + 0.5 * np.sin((0.94 * x + 0.34 * y) * 7.0 + 1.2 * soil)
@@ -150,8 +150,8 @@ def _terrain(x, y, z, fp):
         colour = _mix(colour, tint, petal * min(1.0, 0.08 / fp))
     d = path_distance(x, y)
     if d < 2.6:
-        d += 0.5 * _fbm(x, y, 0.0, 2.5, 4, 0.7, fp, 71)
-        gravel = _mix((0.17, 0.13, 0.095), (0.34, 0.3, 0.245), 0.5 + 0.7 * _fbm(x, y, z, 0.4, 5, 1.0, fp, 83))
+        d += 0.5 * fractal_noise(x, y, 0.0, 2.5, 4, 0.7, fp, 71)
+        gravel = _mix((0.17, 0.13, 0.095), (0.34, 0.3, 0.245), 0.5 + 0.7 * fractal_noise(x, y, z, 0.4, 5, 1.0, fp, 83))
         colour = _mix(gravel, colour, _step(1.1, 1.6, d))
     return _times(colour, max(0.2, 1.0 + 0.85 * fine))
 
@@ -175,15 +175,15 @@ def _fabric(x, y, z, fp):
     band = abs(z / 0.75 - np.floor(z / 0.75 + 0.5)) * 0.75
     stitch = 1 - 0.45 * (1 - _step(0.02, 0.03 + fp, min(seam, band))) * min(1.0, 0.06 / fp)
     cell = _hash(gore, row, 1, 9)
-    weave = _fbm(x, y, z, 0.7, 6, 1.1, fp, 101)
+    weave = fractal_noise(x, y, z, 0.7, 6, 1.1, fp, 101)
     return _times(c, stitch * (0.85 + 0.3 * cell) * max(0.3, 1.0 + 0.5 * weave))
 
 
 @njit(cache=True, fastmath=True)
 def _albedo(material, x, y, z, u, v, fp):
     """Linear RGB. x, y, z: the object's frame; u, v: metres on the surface's dominant plane (v upwards on walls)."""
-    fine = _fbm(x, y, z, 0.6, 6, 1.15, fp, 200 + 10 * material)
-    broad = _fbm(x, y, z, 3.0, 3, 0.6, fp, 205 + 10 * material)
+    fine = fractal_noise(x, y, z, 0.6, 6, 1.15, fp, 200 + 10 * material)
+    broad = fractal_noise(x, y, z, 3.0, 3, 0.6, fp, 205 + 10 * material)
     c = (0.5, 0.5, 0.5)
     if material in (BRICK, STONE):
         w, h = (0.46, 0.16) if material == BRICK else (0.85, 0.42)
@@ -194,7 +194,7 @@ def _albedo(material, x, y, z, u, v, fp):
         c = _mix(c, (0.42, 0.39, 0.34), mortar * 0.85)
     elif material == PLASTER:
         c = _mix((0.6, 0.49, 0.31), (0.48, 0.4, 0.29), 0.5 + 0.6 * broad)
-        streak = _fbm(u * 3.0, v * 0.4, 0.0, 1.0, 5, 0.8, 3 * fp, 301)
+        streak = fractal_noise(u * 3.0, v * 0.4, 0.0, 1.0, 5, 0.8, 3 * fp, 301)
         c = _times(c, 1.0 + 0.5 * fine + 0.16 * streak)
         beam = min(abs(v - 1.95), abs(u - 1.25 * np.floor(u / 1.25 + 0.5)))
         if v < 1.95 or v > 3.2:
@@ -215,7 +215,7 @@ def _albedo(material, x, y, z, u, v, fp):
     elif material in (WOOD, TRIM):
         plank = np.floor(u / 0.22)
         r = _hash(int(plank), 3, 5, 41)
-        grain = _fbm(u * 5.0, v * 0.5, r * 30.0, 0.7, 6, 0.85, 3 * fp, 43)
+        grain = fractal_noise(u * 5.0, v * 0.5, r * 30.0, 0.7, 6, 0.85, 3 * fp, 43)
         gap = min(u - plank * 0.22, 0.22 - u + plank * 0.22)
         c = _mix((0.27, 0.15, 0.07), (0.4, 0.26, 0.14), r)
         if material == TRIM:
@@ -237,30 +237,32 @@ def _albedo(material, x, y, z, u, v, fp):
     elif material == BRONZE:
         patina = _step(-0.15, 0.35, broad + 0.5 * fine)
         c = _mix((0.26, 0.13, 0.05), (0.14, 0.33, 0.26), patina)
-        c = _times(c, 1.0 + 0.55 * _fbm(x, y, z, 0.35, 5, 1.1, fp, 401))
+        c = _times(c, 1.0 + 0.55 * fractal_noise(x, y, z, 0.35, 5, 1.1, fp, 401))
     elif material == TERRAZZO:
         c = _times((0.58, 0.52, 0.44), 1.0 + 0.3 * fine)
-        chip = _fbm(x, y, z, 0.22, 3, 0.9, fp, 411)
+        chip = fractal_noise(x, y, z, 0.22, 3, 0.9, fp, 411)
         c = _mix(c, (0.1, 0.13, 0.3), _step(0.3, 0.42, chip))
         c = _mix(c, (0.5, 0.1, 0.05), _step(0.3, 0.42, -chip))
     elif material == RUST:
         c = _mix((0.16, 0.075, 0.045), (0.45, 0.18, 0.05), _step(-0.6, 0.6, fine + 0.5 * broad))
         plate = min(abs(u - 0.9 * np.floor(u / 0.9 + 0.5)), abs(v - 0.9 * np.floor(v / 0.9 + 0.5)))
         c = _times(c, 0.55 + 0.45 * _step(0.012, 0.012 + fp, plate))
-        c = _times(c, 1.0 + 0.4 * _fbm(x, y, z, 0.3, 5, 0.95, fp, 421))
+        c = _times(c, 1.0 + 0.4 * fractal_noise(x, y, z, 0.3, 5, 0.95, fp, 421))
     elif material in (LEAVES, BUSH):
-        leaf = _fbm(x, y, z, 0.55, 5, 0.95, fp, 431)
+        leaf = fractal_noise(x, y, z, 0.55, 5, 0.95, fp, 431)
         c = _mix((0.035, 0.085, 0.02), (0.16, 0.24, 0.05), _step(-0.9, 0.9, leaf + 0.3 * broad))
         if material == BUSH:
             c = _mix(c, (0.3, 0.21, 0.06), 0.45 * _step(-0.2, 0.7, broad))
         c = _times(c, 1.0 + 0.35 * fine)
     elif material == BARK:
-        c = _times((0.17, 0.115, 0.075), 1.0 + 0.55 * _fbm(x * 2.5, y * 2.5, z * 0.6, 0.5, 5, 0.85, 2 * fp, 441))
+        c = _times(
+            (0.17, 0.115, 0.075), 1.0 + 0.55 * fractal_noise(x * 2.5, y * 2.5, z * 0.6, 0.5, 5, 0.85, 2 * fp, 441)
+        )
     elif material == ROCK:
         c = _mix((0.24, 0.23, 0.21), (0.42, 0.4, 0.36), 0.5 + 0.6 * fine)
         c = _mix(c, (0.2, 0.22, 0.09), 0.7 * _step(0.25, 0.6, broad))
     elif material == HAY:
-        straw = _fbm(x * 1.5, y * 3.0, z * 3.0, 0.5, 6, 0.9, 2 * fp, 451)
+        straw = fractal_noise(x * 1.5, y * 3.0, z * 3.0, 0.5, 6, 0.9, 2 * fp, 451)
         c = _times((0.5, 0.37, 0.13), 1.0 + 0.5 * straw)
     elif material == LOGS:
         row = np.floor(v / 0.2)

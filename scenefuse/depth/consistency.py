@@ -1,4 +1,4 @@
-"""What depth maps are worth, measured without truth: agreement between views and with SfM points; fusing two sets."""
+"""Quality of depth maps without truth: consistency between views and with SfM points; fusing two sets of maps."""
 
 from dataclasses import dataclass
 
@@ -7,15 +7,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.depth.inputs import Frames
+from scenefuse.depth.inputs import PhotoTensors
 from scenefuse.depth.self_supervision import reprojection_differences, sample
 
 Array = NDArray[np.floating]
 
+# Difference between views at which agreement falls to 60 %, share of the object's diagonal.
+TOLERANCE = 0.01
+
 
 @dataclass(frozen=True)
-class Agreement:
-    """How a set of depth maps agrees with itself across views.
+class ViewConsistency:
+    """How well a set of depth maps agrees with itself across views.
 
     Attributes:
         confidence: (V, 1, H, W) 0..1, 0 off the object.
@@ -27,38 +30,38 @@ class Agreement:
 
 
 @torch.no_grad()
-def agreement_between_views(depth: Tensor, frames: Frames, tolerance: float) -> Agreement:
-    """Compare each depth map with those of its source views, forward and backward.
+def consistency_between_views(depth: Tensor, photos: PhotoTensors, tolerance: float) -> ViewConsistency:
+    """Forward-backward consistency of each depth map with those of its source views.
 
-    A source agrees by exp(-(e / tolerance)^2 / 2), e the depth that came back minus the depth. A source that sees
-    something nearer hides the point and has no vote; one that sees through it votes against. The confidence is the
-    mean vote, over at least two voters.
+    A source view agrees by exp(-(e / tolerance)^2 / 2), where e is the depth that came back minus the depth. A view
+    that sees something nearer does not count, because the point is occluded there; one that sees past the point counts
+    with 0. The confidence is the mean over the views that count, at least two.
 
     Args:
         depth: (V, 1, H, W), 0 where there is none.
-        frames: the photos; their sources are the voters.
-        tolerance: object units.
+        photos: the photos; their sources are the views compared with.
+        tolerance: object units; see TOLERANCE.
     """
-    depth = depth * frames.masks
+    depth = depth * photos.masks
     confidence, variance = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
     for view in range(len(depth)):
-        sources = frames.sources[view]
-        moves = frames.source_from_target(torch.full_like(sources, view), sources)
+        sources = photos.sources[view]
+        moves = photos.source_from_target(torch.full_like(sources, view), sources)
         difference, _, seen = reprojection_differences(
             depth[view : view + 1],
             depth[sources],
             moves,
-            frames.intrinsics[view : view + 1],
-            frames.intrinsics[sources],
+            photos.intrinsics[view : view + 1],
+            photos.intrinsics[sources],
         )
-        voters = seen & (difference > -3.0 * tolerance)
-        votes = torch.exp(-0.5 * (difference / tolerance) ** 2) * voters
-        confidence[view, 0] = votes.sum(0) / voters.sum(0).clamp_min(2)
-        close = voters & (difference.abs() < 3.0 * tolerance)
+        counted = seen & (difference > -3.0 * tolerance)
+        votes = torch.exp(-0.5 * (difference / tolerance) ** 2) * counted
+        confidence[view, 0] = votes.sum(0) / counted.sum(0).clamp_min(2)
+        close = counted & (difference.abs() < 3.0 * tolerance)
         number = close.sum(0)
         mean_square = (difference**2 * close).sum(0) / number.clamp_min(1)
         variance[view, 0] = torch.where(number > 0, mean_square, torch.full_like(mean_square, torch.inf))
-    return Agreement(confidence * (depth > 0), variance)
+    return ViewConsistency(confidence * (depth > 0), variance)
 
 
 def align_to_points(predicted: Array, measured: Array, seed: int = 0) -> tuple[float, float]:
@@ -109,11 +112,11 @@ def residuals_at_points(depth: Tensor, points: list[NDArray[np.float32]]) -> lis
 def fuse_by_inverse_variance(
     first: Tensor, second: Tensor, first_variance: Tensor, second_variance: Tensor, floor: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Blend two depth maps of the same view where the views vouch for them (AltNeRF's idea, method N12).
+    """Blend two depth maps of the same view by inverse variance (after AltNeRF; method N12).
 
     Where both have a finite variance and differ by less than three standard deviations of their difference, the
-    result is their mean weighted by 1 / variance. Where they differ by more, or where one alone has a variance, the
-    pixel keeps the map with the smaller variance if that is at least four times smaller; else it keeps none.
+    result is their mean weighted by 1 / variance. Where they differ by more, or only one has a variance, the pixel
+    keeps the map with the smaller variance if that is at least four times smaller; otherwise it keeps none.
 
     Args:
         first: (V, 1, H, W) depth, 0 where there is none.

@@ -1,8 +1,8 @@
-"""Two small networks after Monodepth2 (Godard et al., ICCV 2019): depth from one photo, relative pose from two.
+"""A small depth network after Monodepth2 (Godard et al., ICCV 2019), and its measure of depth, normalised disparity.
 
-They are trained from scratch on the photos of one object, so they are far smaller than the original's ResNet-18, and
-the depth network corrects a first disparity (from SfM points and a plane sweep) instead of inventing one from colour
-alone, much as ManyDepth (Watson et al., CVPR 2021) gives its network a cost volume.
+It is trained from scratch on the photos of one object, so it is far smaller than the original's ResNet-18, and it
+corrects a first disparity (from SfM points and a plane sweep) instead of inventing one from colour alone, much as
+ManyDepth (Watson et al., CVPR 2021) gives its network a cost volume.
 """
 
 import torch
@@ -24,10 +24,10 @@ class DepthNetwork(nn.Module):
         super().__init__()
         sizes = [width, width * 2, width * 3, width * 4]
         self.encoder = nn.ModuleList(
-            _convolutions(before, after, 2) for before, after in zip([channels + 1, *sizes[:-1]], sizes)
+            convolutions(before, after, 2) for before, after in zip([channels + 1, *sizes[:-1]], sizes)
         )
         self.decoder = nn.ModuleList(
-            _convolutions(deep + skip, skip, 1) for deep, skip in zip(sizes[:0:-1], sizes[-2::-1])
+            convolutions(deep + skip, skip, 1) for deep, skip in zip(sizes[:0:-1], sizes[-2::-1])
         )
         self.head = nn.Conv2d(width + channels + 1, 16, 3, padding=1, padding_mode="replicate")
         self.last = nn.Conv2d(16, 1, 3, padding=1, padding_mode="replicate")
@@ -54,39 +54,6 @@ class DepthNetwork(nn.Module):
         return torch.sigmoid(logit + self.last(x))
 
 
-class PoseNetwork(nn.Module):
-    """Strided convolutions over two stacked photos, averaged into one motion.
-
-    Args:
-        width: channels of the first layer.
-        unit: length that an output of one stands for, in object units (the typical distance camera to object).
-    """
-
-    def __init__(self, unit: float, width: int = 16) -> None:
-        super().__init__()
-        self.unit = unit
-        sizes = [6, width, width * 2, width * 4, width * 6]
-        self.encoder = nn.Sequential(*(_convolutions(before, after, 2) for before, after in zip(sizes, sizes[1:])))
-        self.last = nn.Conv2d(sizes[-1], 6, 1)
-        nn.init.normal_(self.last.weight, std=1e-3)
-        nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
-
-    def forward(self, target: Tensor, source: Tensor) -> Tensor:
-        """(B, 3, H, W) target and source photos in 0..1 -> (B, 4, 4) source_from_target."""
-        motion = self.last(self.encoder(torch.cat([target, source], 1) - 0.5)).mean((2, 3))
-        return rigid(motion[:, :3], motion[:, 3:] * self.unit)
-
-
-def rigid(axis_angle: Tensor, translation: Tensor) -> Tensor:
-    """(B, 3) rotation vectors in radians and (B, 3) translations -> (B, 4, 4) transforms (Rodrigues' formula)."""
-    x, y, z = axis_angle.unbind(1)
-    zero = torch.zeros_like(x)
-    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], 1).view(-1, 3, 3)
-    top = torch.cat([torch.matrix_exp(cross), translation[:, :, None]], 2)
-    bottom = top.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(top), 1, 4)
-    return torch.cat([top, bottom], 1)
-
-
 def depth_from_disparity(disparity: Tensor, near: float, far: float) -> Tensor:
     """Normalised disparity 0..1 -> depth: 0 is `far`, 1 is `near` (Monodepth2, section 3.1, in its depth range)."""
     return 1.0 / (1.0 / far + (1.0 / near - 1.0 / far) * disparity)
@@ -102,7 +69,8 @@ def parameters(*networks: nn.Module) -> int:
     return sum(p.numel() for network in networks for p in network.parameters())
 
 
-def _convolutions(before: int, after: int, stride: int) -> nn.Sequential:
+def convolutions(before: int, after: int, stride: int) -> nn.Sequential:
+    """Two 3x3 convolutions from `before` to `after` channels, the first one strided."""
     return nn.Sequential(
         nn.Conv2d(before, after, 3, stride, 1),
         nn.ELU(),

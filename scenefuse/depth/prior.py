@@ -12,6 +12,7 @@ from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.views import Views
 
+# Other views that have to have the same surface: one may agree by chance.
 AGREEING_VIEWS = 2
 
 
@@ -33,7 +34,8 @@ class DepthPrior:
 
 
 def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreement: float) -> DepthPrior:
-    """Read a stage's depth maps, move them by photos, and keep what photos do not deny and two other maps confirm.
+    """Read a stage's depth maps, move them to where photos match, and keep what photos do not contradict and two other
+    maps confirm.
 
     Held-out photos take no part: neither their maps nor their pixels.
 
@@ -53,10 +55,10 @@ def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreeme
     depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
-    asked = refine_by_photos(seen, seen.object_from_cam, depths, settings)
-    refined = float(asked.moved.sum() / max(int((depths > 0).sum()), 1))
-    depths = np.where(asked.denied, 0, asked.depths)
-    confidence = np.where(asked.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
+    matched = refine_by_photos(seen, seen.object_from_cam, depths, settings)
+    refined = float(matched.moved.sum() / max(int((depths > 0).sum()), 1))
+    depths = np.where(matched.inconsistent, 0, matched.depths)
+    confidence = np.where(matched.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
     depths = np.where(confidence > 0, depths, 0)
     shape = views.masks.shape
     whole = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
@@ -78,6 +80,6 @@ def _confirmed(views: Views, depths: NDArray[np.float32], agreement: float) -> N
     tolerance = agreement * extent(np.concatenate([points for points, _, _ in known]))
     confirmed = np.zeros(depths.shape, bool)
     for index, (points, rows, columns) in enumerate(known):
-        said = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
-        confirmed[index, rows, columns] = said.agree >= AGREEING_VIEWS
+        others = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
+        confirmed[index, rows, columns] = others.agree >= AGREEING_VIEWS
     return confirmed

@@ -17,6 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+# alpha of equation (2), as in Monodepth2.
+SSIM_WEIGHT = 0.85
+
 
 def points_in_cam(depth: Tensor, intrinsics: Tensor) -> Tensor:
     """(B, 1, H, W) depth and (B, 3, 3) intrinsics -> (B, 3, H*W) points in the camera's frame."""
@@ -56,7 +59,7 @@ def warp(
     """Draw the source as the target camera would see it.
 
     Args:
-        source: (B, C, H, W) photo or map of the source.
+        source: (B, C, h, w) photo or map of the source.
         depth: (B, 1, H, W) depth of the target.
         source_from_target: (B, 4, 4) rigid transforms.
         of_target: (B, 3, 3) intrinsics of the target.
@@ -67,7 +70,7 @@ def warp(
     """
     height, width = depth.shape[2:]
     pixels, z = project(points_in_cam(depth, of_target), source_from_target, of_source)
-    valid = inside(pixels, z, height, width)
+    valid = inside(pixels, z, *source.shape[2:])
     return sample(source, pixels.view(len(depth), height, width, 2)), valid.view(-1, 1, height, width)
 
 
@@ -80,11 +83,11 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
     return (2 * mean_a * mean_b + c1) * (2 * covariance + c2) / ((mean_a**2 + mean_b**2 + c1) * (spread + c2))
 
 
-def photometric_error(a: Tensor, b: Tensor, ssim_weight: float) -> Tensor:
+def photometric_error(a: Tensor, b: Tensor) -> Tensor:
     """Equation (2), averaged over colours: (B, 1, H, W)."""
     absolute = (a - b).abs()
     structure = (1.0 - ssim(a, b)).div(2.0).clamp(0.0, 1.0)
-    return (ssim_weight * structure + (1.0 - ssim_weight) * absolute).mean(1, keepdim=True)
+    return (SSIM_WEIGHT * structure + (1.0 - SSIM_WEIGHT) * absolute).mean(1, keepdim=True)
 
 
 def minimum_reprojection(errors: Tensor, valid: Tensor, unmoved: Tensor | None) -> tuple[Tensor, Tensor]:
@@ -161,55 +164,3 @@ def reprojection_differences(
         (back - start).norm(dim=2).view(shape),
         seen.view(shape),
     )
-
-
-def plane_sweep(
-    image: Tensor,
-    sources: Tensor,
-    depths: Tensor,
-    source_from_target: Tensor,
-    of_target: Tensor,
-    of_sources: Tensor,
-    silhouettes: Tensor,
-    window: int,
-) -> Tensor:
-    """Score every depth hypothesis of one photo by normalised cross-correlation with its sources (Collins 1996).
-
-    The score is the mean over the better half of the sources, which ignores those where the point is hidden. A
-    hypothesis that leaves the silhouettes of two sources (one may be wrong) is outside the visual hull and scores -1.
-
-    Args:
-        image: (1, 1, H, W) grey photo, possibly cut out of a larger one.
-        sources: (S, 1, h, w) grey source photos.
-        depths: (D, H, W) hypotheses.
-        source_from_target: (S, 4, 4).
-        of_target: (1, 3, 3) intrinsics of the (cut) photo.
-        of_sources: (S, 3, 3) intrinsics.
-        silhouettes: (S, 1, h, w) 1 where a source may see the object.
-        window: side of the correlation window in pixels, odd.
-
-    Returns:
-        (D, H, W) scores in -1..1.
-    """
-    count, (height, width) = len(sources), image.shape[2:]
-    stacked = torch.cat([sources, silhouettes], 1)
-
-    def mean(x: Tensor) -> Tensor:
-        return functional.avg_pool2d(functional.pad(x, (window // 2,) * 4, mode="replicate"), window, 1)
-
-    mean_t = mean(image)
-    spread_t = (mean(image * image) - mean_t**2).clamp_min(1e-6)
-    scores = []
-    for depth in depths:
-        pixels, z = project(
-            points_in_cam(depth[None, None], of_target).expand(count, -1, -1), source_from_target, of_sources
-        )
-        seen = inside(pixels, z, *sources.shape[2:]).view(count, 1, height, width)
-        values, hull = sample(stacked, pixels.view(count, height, width, 2)).split(1, 1)
-        mean_s, squares, products = mean(torch.cat([values, values**2, values * image], 1)).split(1, 1)
-        spread_s = (squares - mean_s**2).clamp_min(1e-6)
-        score = (products - mean_t * mean_s) / torch.sqrt(spread_t * spread_s)
-        best = torch.where(seen, score, torch.full_like(score, -1.0)).topk(max(1, (count + 1) // 2), 0).values.mean(0)
-        outside = (seen & (hull < 0.5)).sum(0) >= min(2, count)
-        scores.append(torch.where(outside, torch.full_like(best, -1.0), best)[0])
-    return torch.stack(scores)

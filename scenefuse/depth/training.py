@@ -1,18 +1,21 @@
-"""Training the depth and pose networks on the photos of one object, with checkpoints that survive a kill."""
+"""Training the depth and pose networks on the photos of one object; a killed training resumes where it stopped."""
 
 import hashlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from scenefuse.depth.inputs import Frames
-from scenefuse.depth.networks import DepthNetwork, PoseNetwork, depth_from_disparity
+from scenefuse.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, require_finite
+from scenefuse.cores import use_threads
+from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.networks import DepthNetwork, depth_from_disparity
+from scenefuse.depth.pose_network import PoseNetwork, pose_error, small_photos
 from scenefuse.depth.self_supervision import (
     masked_mean,
     minimum_reprojection,
@@ -21,38 +24,56 @@ from scenefuse.depth.self_supervision import (
     smoothness,
     warp,
 )
-from scenefuse.stage import atomic_file
+from scenefuse.stage import StageError, quantity, threads
 
+# Highest rate of Adam. Gradients are clipped, since single photos can be off by much.
+LEARNING_RATE = 1e-3
+MAX_GRADIENT = 1.0
 SOURCES_PER_STEP = 3
-CHECKPOINT_EVERY = 10
+# Weights of equation (5) as in Monodepth2, and of relative depth errors at SfM points and against a target map.
+SMOOTHNESS_WEIGHT = 1e-3
+ANCHOR_WEIGHT = 1.0
+TARGET_WEIGHT = 1.0
+# Relative depth errors count in full from here, and no more beyond: only an outlier can be so far off.
+SMALL_ERROR, LARGE_ERROR = 0.005, 0.1
+# Share of a half-size pixel that is object, for it to count.
+SHARE_OF_PIXEL = 0.75
+PRINT_EVERY = 10
+# Photos that go through the network at once when nothing is trained.
+PHOTOS_AT_ONCE = 8
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The two networks that are trained together."""
+
+    depth: DepthNetwork
+    pose: PoseNetwork
+
+    def state(self) -> dict[str, Any]:
+        """Weights of both."""
+        return {"depth": self.depth.state_dict(), "pose": self.pose.state_dict()}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take the weights of `state`."""
+        self.depth.load_state_dict(state["depth"])
+        self.pose.load_state_dict(state["pose"])
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How the networks are trained; the stages fill it from their own settings.
+    """How long the networks are trained; the stages fill it from their own settings.
 
     Attributes:
-        epochs: passes of the schedule.
-        passes_per_epoch: how often an epoch shows every photo.
-        batch_frames: target photos per step.
-        learning_rate: the schedule's maximum.
-        warmup_epochs: epochs of linear rise before the cosine.
-        ssim_weight: alpha of equation (2).
-        smoothness_weight: weight of equation (5).
-        anchor_weight: weight of the relative depth error at SfM points.
-        target_weight: weight of the relative depth error against a target map.
-        coarse_share: share of the steps that compare photos at half size.
+        epochs: each shows every photo once.
+        warmup_epochs: epochs of linear rise of the learning rate before the cosine.
+        batch_photos: target photos per step.
+        coarse_share: share of the steps, the first ones, that compare photos at half size.
     """
 
     epochs: int
-    passes_per_epoch: int
-    batch_frames: int
-    learning_rate: float
     warmup_epochs: int
-    ssim_weight: float
-    smoothness_weight: float
-    anchor_weight: float
-    target_weight: float
+    batch_photos: int
     coarse_share: float
 
 
@@ -73,94 +94,143 @@ class Supervision:
     target_weight: Tensor | None = None
 
 
+def prepare_torch(seed: int) -> torch.device:
+    """Set this stage's threads and the seed of the weights; the device to train on, CUDA where it is."""
+    use_threads(threads())
+    torch.manual_seed(seed)
+    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+
+
+def new_networks(channels: int, photos: PhotoTensors) -> Networks:
+    """Untrained networks on the photos' device; the pose network counts in typical distances to the object."""
+    device = photos.images.device
+    return Networks(DepthNetwork(channels).to(device), PoseNetwork((photos.near * photos.far) ** 0.5).to(device))
+
+
 def train_networks(
-    depth_network: DepthNetwork,
-    pose_network: PoseNetwork,
-    frames: Frames,
-    supervision: Supervision,
-    recipe: Recipe,
-    checkpoint: Path,
-    seed: int,
+    networks: Networks, photos: PhotoTensors, supervision: Supervision, recipe: Recipe, checkpoint: Path, seed: int
 ) -> list[dict[str, float]]:
     """Train both networks in place and return one row of mean losses per epoch.
 
     Batches and sources depend on the seed and the step only, so a resumed run equals an uninterrupted one.
+
+    Raises:
+        StageError: the training diverged.
     """
-    batches = _batches(np.flatnonzero(frames.trained), recipe, seed)
-    optimizer = torch.optim.Adam([*depth_network.parameters(), *pose_network.parameters()], lr=recipe.learning_rate)
-    steps = len(batches)
-    warmup = steps * recipe.warmup_epochs / max(recipe.epochs, 1)
-    points, weights = _padded(frames)
-    scales = [_Scale(frames, recipe.ssim_weight, shrink) for shrink in (2, 1)]
+    batches = _batches(np.flatnonzero(photos.trained), recipe, seed)
+    steps, warmup = len(batches), len(batches) * recipe.warmup_epochs / max(recipe.epochs, 1)
+    parameters = [*networks.depth.parameters(), *networks.pose.parameters()]
+    optimizer = torch.optim.Adam(parameters, lr=LEARNING_RATE)
+    points, weights = _padded(photos)
+    scales = [_Scale(photos, shrink) for shrink in (2, 1)]
     losses: list[dict[str, float]] = []
-    start = _resume(checkpoint, depth_network, pose_network, optimizer, losses)
-    with _saved_on_exit(checkpoint, depth_network, pose_network, optimizer, losses) as guard:
-        for step in range(start, steps):
+
+    def state() -> dict[str, Any]:
+        return networks.state() | {"optimizer": optimizer.state_dict(), "losses": losses}
+
+    saved = load_checkpoint(checkpoint, like=state())
+    if saved is not None:
+        networks.load(saved)
+        optimizer.load_state_dict(saved["optimizer"])
+        losses.extend(saved["losses"])
+        print(f"resuming at step {len(losses)} from {checkpoint}", flush=True)
+    with checkpointed(checkpoint, state) as step_done:
+        for step in range(len(losses), steps):
             for group in optimizer.param_groups:
-                group["lr"] = recipe.learning_rate * warmup_then_cosine(step, steps, warmup)
+                group["lr"] = LEARNING_RATE * learning_rate_factor(step, steps, warmup)
             scale = scales[0] if step < recipe.coarse_share * steps else scales[1]
             chosen = torch.as_tensor(batches[step])
             generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-            parts = _losses(depth_network, pose_network, frames, supervision, recipe, scale, chosen, generator)
+            parts = _losses(networks, photos, supervision, scale, chosen, generator)
             parts["anchor"] = _anchor(parts.pop("depth"), points[chosen], weights[chosen])
-            total = (
-                parts["photometric"]
-                + recipe.smoothness_weight * parts["smoothness"]
-                + recipe.anchor_weight * parts["anchor"]
-                + recipe.target_weight * parts["target"]
-                + parts["pose"]
-            )
+            losses.append({name: float(value.detach()) for name, value in parts.items()})
+            require_finite(losses[-1])  # the gradient of sampling at a NaN would end the process without a word
             optimizer.zero_grad(set_to_none=True)
-            total.backward()
-            torch.nn.utils.clip_grad_norm_(depth_network.parameters(), 1.0)
-            torch.nn.utils.clip_grad_norm_(pose_network.parameters(), 1.0)
-            with guard(step + 1):
-                optimizer.step()
-                losses.append({name: float(value.detach()) for name, value in parts.items()})
+            _total(parts).backward()
+            for network in (networks.depth, networks.pose):
+                torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT)
+            optimizer.step()
+            if (step + 1) % PRINT_EVERY == 0:
+                print(f"step {step + 1}: {' '.join(f'{k} {v:.4f}' for k, v in losses[-1].items())}", flush=True)
+            step_done(step + 1)
     return _by_epoch(losses, recipe.epochs)
 
 
 @torch.no_grad()
-def predict(network: DepthNetwork, frames: Frames, inputs: Tensor, first: Tensor) -> Tensor:
+def predict(network: DepthNetwork, photos: PhotoTensors, supervision: Supervision) -> Tensor:
     """(V, 1, H, W) depth of all photos, held-out ones too."""
-    disparity = torch.cat([network(x, d) for x, d in zip(inputs.split(8), first.split(8))])
-    return depth_from_disparity(disparity, frames.near, frames.far)
+    parts = zip(supervision.inputs.split(PHOTOS_AT_ONCE), supervision.first.split(PHOTOS_AT_ONCE))
+    return depth_from_disparity(torch.cat([network(x, d) for x, d in parts]), photos.near, photos.far)
 
 
-def small_photos(frames: Frames) -> Tensor:
-    """What the pose network sees: the photos at half size, unless they are tiny."""
-    return functional.avg_pool2d(frames.images, 2) if min(frames.images.shape[2:]) > 64 else frames.images
+def loss_quantities(losses: list[dict[str, float]]) -> dict[str, Any]:
+    """First and last epoch's mean of each loss."""
+    return {
+        f"{name}_loss_{when}": quantity(row[name], "1")
+        for name in (losses[0] if losses else {})
+        for when, row in (("first", losses[0]), ("last", losses[-1]))
+    }
 
 
-def warmup_then_cosine(step: int, steps: int, warmup: float) -> float:
-    """Share of the maximum learning rate: a linear rise over `warmup` steps, then half a cosine down to zero."""
-    if step < warmup:
-        return (step + 1) / (warmup + 1)
-    return 0.5 * (1.0 + float(np.cos(np.pi * (step - warmup) / max(steps - warmup, 1))))
+def save_networks(path: Path, networks: Networks, settings: dict[str, Any]) -> None:
+    """What stage 3 continues from."""
+    torch.save(networks.state() | {"settings": settings}, path)
 
 
-def key_of(*parts: object) -> str:
-    """Sixteen hex digits that change when any part changes: arrays and tensors by content, others by their repr."""
-    digest = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, Tensor):
-            part = part.detach().cpu().numpy()
-        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+def load_networks(path: Path) -> dict[str, Any]:
+    """What `save_networks` wrote: `depth` and `pose` for `Networks.load`, and `settings`.
+
+    Raises:
+        StageError: the file is missing or holds something else.
+    """
+    if not path.is_file():
+        raise StageError(f"{path} does not exist; run stage 1 first")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a truncated file raises any of half a dozen
+        why = " ".join(str(error).split())[:200]
+        raise StageError(f"{path} cannot be read ({why}); delete it and run stage 1 again") from None
+    if not {"depth", "pose", "settings"} <= set(state):
+        raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
+    return state
+
+
+def key_of(*parts: Any) -> str:
+    """Sixteen hex digits that change when any part or PyTorch's version does.
+
+    Arrays and tensors count by content, dataclasses, lists and dictionaries by what they hold, others by their repr.
+    """
+    digest = hashlib.sha256(torch.__version__.encode())
+
+    def add(part: Any) -> None:
+        if is_dataclass(part) and not isinstance(part, type):
+            add({field.name: getattr(part, field.name) for field in fields(part)})
+        elif isinstance(part, dict):
+            add([item for pair in part.items() for item in pair])
+        elif isinstance(part, list | tuple):
+            digest.update(f"{len(part)} parts".encode())
+            for item in part:
+                add(item)
+        elif isinstance(part, Tensor | np.ndarray):
+            array = np.ascontiguousarray(part.detach().cpu().numpy() if isinstance(part, Tensor) else part)
+            digest.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
+        else:
+            digest.update(repr(part).encode())
+
+    add(parts)
     return digest.hexdigest()[:16]
 
 
 class _Scale:
     """The photos at one size, and the error of every pair of photos as they are (for the auto-mask)."""
 
-    def __init__(self, frames: Frames, ssim_weight: float, shrink: int) -> None:
+    def __init__(self, photos: PhotoTensors, shrink: int) -> None:
         self.shrink = shrink
-        self.images = self.pool(frames.images)
-        self.masks = (self.pool(frames.masks) > 0.75).to(frames.masks.dtype)
-        self.intrinsics = frames.intrinsics.clone()
+        self.images = self.pool(photos.images)
+        self.masks = (self.pool(photos.masks) > SHARE_OF_PIXEL).to(photos.masks.dtype)
+        self.intrinsics = photos.intrinsics.clone()
         self.intrinsics[:, :2] /= shrink
-        self.unmoved = torch.cat(
-            [photometric_error(self.images, self.images[of], ssim_weight) for of in frames.sources.T], 1
-        )
+        self.unmoved = torch.cat([photometric_error(self.images, self.images[of]) for of in photos.sources.T], 1)
 
     def pool(self, maps: Tensor) -> Tensor:
         """Maps at this size."""
@@ -168,77 +238,71 @@ class _Scale:
 
 
 def _losses(
-    depth_network: DepthNetwork,
-    pose_network: PoseNetwork,
-    frames: Frames,
+    networks: Networks,
+    photos: PhotoTensors,
     supervision: Supervision,
-    recipe: Recipe,
     scale: _Scale,
     chosen: Tensor,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
-    disparity = depth_network(supervision.inputs[chosen], supervision.first[chosen])
-    depth = depth_from_disparity(disparity, frames.near, frames.far)
-    available = frames.sources.shape[1]
+    """All losses of (B,) chosen photos but the one at SfM points, and their (B, 1, H, W) depth."""
+    disparity = networks.depth(supervision.inputs[chosen], supervision.first[chosen])
+    depth = depth_from_disparity(disparity, photos.near, photos.far)
+    available = photos.sources.shape[1]
     columns = torch.randperm(available, generator=generator)[: min(SOURCES_PER_STEP, available)].sort().values
-    sources = frames.sources[chosen][:, columns]
-    small = small_photos(frames)
-    first_pair = frames.sources[chosen, int(columns[0])]
-    moves = frames.source_from_target(chosen[:, None], sources)
-    photometric, counts = _reprojection(frames, recipe, scale, chosen, sources, columns, depth, moves)
-    guess = pose_network(small[chosen], small[first_pair])[:, None]
-    error, seen = _reprojection(
-        frames, recipe, scale, chosen, first_pair[:, None], columns[:1], depth.detach(), guess, auto_mask=False
-    )
-    pose_loss = masked_mean(error, seen) + _pose_error(guess[:, 0], moves[:, 0], pose_network.unit)
-    mask = frames.masks[chosen]
-    parts = {
+    sources = photos.sources[chosen][:, columns]
+    moves = photos.source_from_target(chosen[:, None], sources)
+    unmoved = scale.unmoved[chosen][:, columns]
+    photometric, counts = _reprojection(scale, chosen, sources, depth, moves, unmoved)
+    small, one = small_photos(photos), sources[:, :1]
+    found = networks.pose(small[chosen], small[one[:, 0]])[:, None]
+    error, seen = _reprojection(scale, chosen, one, depth.detach(), found, None)
+    return {
         "photometric": masked_mean(photometric, counts),
-        "smoothness": smoothness(disparity, frames.images[chosen], mask),
-        "target": depth.new_zeros(()),
-        "pose": pose_loss,
+        "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
+        "target": _against_target(depth, supervision, chosen, photos.near),
+        "pose": masked_mean(error, seen) + pose_error(found[:, 0], moves[:, 0], networks.pose.unit),
         "depth": depth,
     }
-    if supervision.target is not None and supervision.target_weight is not None:
-        relative = depth / supervision.target[chosen].clamp_min(frames.near) - 1.0
-        weight = supervision.target_weight[chosen]
-        parts["target"] = (_huber(relative) * weight).sum() / weight.sum().clamp_min(1.0)
-    return parts
+
+
+def _total(parts: dict[str, Tensor]) -> Tensor:
+    """The loss that is minimised."""
+    return (
+        parts["photometric"]
+        + SMOOTHNESS_WEIGHT * parts["smoothness"]
+        + ANCHOR_WEIGHT * parts["anchor"]
+        + TARGET_WEIGHT * parts["target"]
+        + parts["pose"]
+    )
 
 
 def _reprojection(
-    frames: Frames,
-    recipe: Recipe,
-    scale: _Scale,
-    chosen: Tensor,
-    sources: Tensor,
-    columns: Tensor,
-    depth: Tensor,
-    moves: Tensor,
-    auto_mask: bool = True,
+    scale: _Scale, chosen: Tensor, sources: Tensor, depth: Tensor, moves: Tensor, unmoved: Tensor | None
 ) -> tuple[Tensor, Tensor]:
-    """Minimum reprojection error of (B,) targets over (B, S) sources, and where it counts."""
+    """Minimum reprojection error of (B,) targets over (B, S) sources, and where it counts.
+
+    `unmoved` is the (B, S, H, W) error of the sources as they are, for the auto-mask; None for no auto-mask.
+    """
     count = sources.shape[1]
     depth = scale.pool(depth).repeat_interleave(count, 0)
     targets, others = chosen.repeat_interleave(count), sources.reshape(-1)
     warped, valid = warp(
         scale.images[others], depth, moves.reshape(-1, 4, 4), scale.intrinsics[targets], scale.intrinsics[others]
     )
-    errors = photometric_error(scale.images[targets], warped, recipe.ssim_weight)
+    errors = photometric_error(scale.images[targets], warped)
     shape = (len(chosen), count, *errors.shape[2:])
-    unmoved = scale.unmoved[chosen][:, columns] if auto_mask else None
     smallest, counts = minimum_reprojection(errors.view(shape), valid.view(shape), unmoved)
     return smallest, counts & (scale.masks[chosen] > 0)
 
 
-def _pose_error(found: Tensor, known: Tensor, unit: float) -> Tensor:
-    """How far (B, 4, 4) relative poses are from SfM's.
-
-    Photometric error alone is flat between views as far apart as an orbit's photos, and teaches the network nothing.
-    """
-    rotation = (found[:, :3, :3] - known[:, :3, :3]).abs().sum((1, 2))
-    translation = (found[:, :3, 3] - known[:, :3, 3]).abs().sum(1) / unit
-    return (rotation + translation).mean()
+def _against_target(depth: Tensor, supervision: Supervision, chosen: Tensor, near: float) -> Tensor:
+    """Huber loss on the relative depth error against the target maps; zero without them."""
+    if supervision.target is None or supervision.target_weight is None:
+        return depth.new_zeros(())
+    relative = depth / supervision.target[chosen].clamp_min(near) - 1.0
+    weight = supervision.target_weight[chosen]
+    return (_huber(relative) * weight).sum() / weight.sum().clamp_min(1.0)
 
 
 def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
@@ -248,78 +312,28 @@ def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
 
 
 def _huber(relative: Tensor) -> Tensor:
-    """Absolute error, rounded below 0.5 % and flat-tailed above 10 %, where only an outlier can be the reason."""
-    size = relative.abs().clamp_max(0.1)
-    return torch.where(size < 0.005, size**2 / 0.01, size - 0.0025)
+    """Absolute error, rounded below SMALL_ERROR and flat above LARGE_ERROR."""
+    size = relative.abs().clamp_max(LARGE_ERROR)
+    return torch.where(size < SMALL_ERROR, size**2 / (2 * SMALL_ERROR), size - SMALL_ERROR / 2)
 
 
-def _padded(frames: Frames) -> tuple[Tensor, Tensor]:
+def _padded(photos: PhotoTensors) -> tuple[Tensor, Tensor]:
     """(V, N, 3) SfM points of all photos and (V, N) weights, zero for padding."""
-    most = max(1, *(len(p) for p in frames.points))
-    points, weights = (
-        np.ones((len(frames.points), most, 3), np.float32),
-        np.zeros((len(frames.points), most), np.float32),
-    )
-    for index, p in enumerate(frames.points):
+    count, most = len(photos.points), max(1, *(len(p) for p in photos.points))
+    points, weights = np.ones((count, most, 3), np.float32), np.zeros((count, most), np.float32)
+    for index, p in enumerate(photos.points):
         points[index, : len(p)], weights[index, : len(p)] = p, 1.0
-    device = frames.images.device
+    device = photos.images.device
     return torch.from_numpy(points).to(device), torch.from_numpy(weights).to(device)
 
 
-def _batches(photos: np.ndarray, recipe: Recipe, seed: int) -> list[np.ndarray]:
+def _batches(photos: NDArray[np.int64], recipe: Recipe, seed: int) -> list[NDArray[np.int64]]:
+    """Indices of the photos of each step: every epoch shows all of them in a new order."""
     rng = np.random.default_rng(seed)
-    batches = []
-    for _ in range(recipe.epochs):
-        order = np.concatenate([rng.permutation(photos) for _ in range(recipe.passes_per_epoch)])
-        batches += np.array_split(order, -(-len(order) // recipe.batch_frames))
-    return batches
+    number = -(-len(photos) // recipe.batch_photos)
+    return [batch for _ in range(recipe.epochs) for batch in np.array_split(rng.permutation(photos), number)]
 
 
 def _by_epoch(losses: list[dict[str, float]], epochs: int) -> list[dict[str, float]]:
     groups = [g for g in np.array_split(np.arange(len(losses)), max(epochs, 1)) if len(g)]
     return [{name: float(np.mean([losses[i][name] for i in group])) for name in losses[0]} for group in groups]
-
-
-def _resume(
-    checkpoint: Path, depth: DepthNetwork, pose: PoseNetwork, optimizer: torch.optim.Optimizer, losses: list
-) -> int:
-    if not checkpoint.is_file():
-        return 0
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    depth.load_state_dict(state["depth"])
-    pose.load_state_dict(state["pose"])
-    optimizer.load_state_dict(state["optimizer"])
-    losses.extend(state["losses"])
-    print(f"resuming at step {len(losses)} from {checkpoint}", flush=True)
-    return len(losses)
-
-
-@contextmanager
-def _saved_on_exit(
-    checkpoint: Path, depth: DepthNetwork, pose: PoseNetwork, optimizer: torch.optim.Optimizer, losses: list
-) -> Iterator:
-    """Save every few steps, and when the process is told to stop; never in the middle of an update."""
-    whole = True
-
-    def save() -> None:
-        with atomic_file(checkpoint) as temporary:
-            state = {"depth": depth.state_dict(), "pose": pose.state_dict(), "optimizer": optimizer.state_dict()}
-            torch.save({**state, "losses": losses}, temporary)
-
-    @contextmanager
-    def update(step: int) -> Iterator[None]:
-        nonlocal whole
-        whole = False
-        yield
-        whole = True
-        if step % CHECKPOINT_EVERY == 0:
-            save()
-            latest = " ".join(f"{name} {value:.4f}" for name, value in losses[-1].items())
-            print(f"step {step}: {latest}", flush=True)
-
-    try:
-        yield update
-    except (SystemExit, KeyboardInterrupt):
-        if whole and losses:
-            save()
-        raise

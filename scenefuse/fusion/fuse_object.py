@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
 from scenefuse.io.units import length_unit
+from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -19,21 +20,42 @@ FROM_SCENE, FROM_OBJECT = 0, 1
 
 @dataclass(frozen=True)
 class FusionSettings:
-    """Settings of the fusion. Spacing is the median distance between neighbours in the scene crop."""
+    """How the object is added. Spacing is the median distance between neighbours in the scene crop."""
 
+    mode: Literal["fill", "append", "replace"] = setting("fill")
+    """`fill` adds the object points that the scene lacks, `append` all of them; `replace` puts the object in the place
+    of the scene's points on it."""
     fill_spacings: float = setting(1.5, least=0)
     """Object points farther than this many spacings from every scene point are new."""
-    fill_residuals: float = setting(1.5, least=0)
-    """The same distance is at least this many times the median distance between the clouds where both exist, so
-    that noise does not add a second layer."""
     density: float = setting(1, least=0)
     """Spacing of the added points over the scene's; 0 keeps every object point."""
-    feather_spacings: float = setting(4, least=0)
-    """Width of the seam in spacings: colours, and in `replace` positions too, blend over it."""
     match_colors: bool = setting(True)
     """Whether the object's colours get a gain and bias per channel from the overlap."""
-    min_confidence: float = setting(0, least=0)
-    """Object points with a lower confidence are not used."""
+    fill_residuals: float = 1.5
+    """Points are new at no less than this many median distances between the clouds where both exist, so that noise
+    does not add a second layer."""
+    feather_spacings: float = 4
+    """Width of the seam in spacings: colours, and in `replace` positions too, blend over it."""
+    min_confidence: float = 0
+    """Object points with a lower confidence are not used; the object's cloud has a limit of its own."""
+
+
+@dataclass(frozen=True)
+class FusionInputs:
+    """What the fusion of one object reads."""
+
+    object: Path
+    """Object cloud (PLY) in its own frame."""
+    scene: Path
+    """Dense scene cloud (PLY)."""
+    crop: Path
+    """The scene's points on the object (PLY)."""
+    crop_json: Path
+    """JSON of the crop stage, for the box."""
+    fine_json: Path
+    """JSON of the fine registration."""
+    georeference_json: Path | None = None
+    """JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -56,19 +78,7 @@ class Fusion:
 
 
 def fuse_object(
-    *,
-    object: Path,
-    scene: Path,
-    crop: Path,
-    crop_report: Path,
-    fine: Path,
-    georeference: Path | None = None,
-    fused: Path,
-    fused_scene: Path,
-    fused_laz: Path,
-    report: Path,
-    mode: Literal["fill", "append", "replace"],
-    settings: FusionSettings,
+    *, inputs: FusionInputs, fused: Path, fused_scene: Path, fused_laz: Path, report: Path, settings: FusionSettings
 ) -> None:
     """Add a registered object to the scene (method F1, F2); an unregistered one leaves the scene as it is.
 
@@ -76,81 +86,88 @@ def fuse_object(
     away and puts the object in their place, with a feathered seam.
 
     Args:
-        object: object cloud (PLY) in its own frame.
-        scene: dense scene cloud (PLY).
-        crop: the scene's points on the object (PLY).
-        crop_report: JSON of the crop stage, for the box.
-        fine: JSON of the fine registration.
-        georeference: JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing.
+        inputs: see FusionInputs.
         fused: output PLY, the object's surroundings: the scene in the crop's box and what was added.
         fused_scene: output PLY, the whole scene with what was added.
         fused_laz: output LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one.
         report: output JSON: counts, distances, gain, status.
-        mode: fill, append or replace.
         settings: see FusionSettings.
     """
     start = time.perf_counter()
-    whole = with_provenance(read_cloud(scene), FROM_SCENE)
-    box = read_json(crop_report)
-    registration = read_json(fine)
-    status, reason = value(registration, "status"), value(registration, "reason")
-    part, obj = read_cloud(crop), read_cloud(object)
-    step = spacing(part.points)
-    fusion = fuse_registered(obj, whole, part, registration, mode, settings)
-    if status != "registered":
-        print(f"the object is not fused: {reason}", flush=True)
-    kept, added = whole[fusion.kept], fusion.added
-    level = np.array(value(box, "level_from_scene"))
-    low, high = np.array(value(box, "box_low")), np.array(value(box, "box_high"))
-    levelled = kept.points @ level.T
-    around = kept[((levelled >= low) & (levelled <= high)).all(1)]
-    write_cloud(fused, concatenate([around, added]) if len(added) else around)
-    crs = write_scene(fused_scene, fused_laz, concatenate([kept, added]) if len(added) else kept, georeference)
-    unit = length_unit(georeference)
-    write_json(
-        report,
-        {
-            "status": quantity("fused" if status == "registered" else "unregistered", ""),
-            "reason": quantity(reason, ""),
-            "mode": quantity(mode, ""),
-            "scene_points": quantity(len(whole), "points"),
-            "removed_points": quantity(int((~fusion.kept).sum()), "points"),
-            "added_points": quantity(len(added), "points"),
-            "object_points": quantity(len(obj), "points"),
-            "surroundings_points": quantity(len(around) + len(added), "points"),
-            "scene_spacing": quantity(step, unit),
-            "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
-            "fill_distance": quantity(fusion.fill_distance, unit),
-            "color_gain": quantity(fusion.gain, "1"),
-            "color_bias": quantity(fusion.bias, "of 255"),
-            "crs": quantity(crs, ""),
-            "seconds": quantity(time.perf_counter() - start, "s"),
-        },
-    )
+    whole = with_provenance(read_cloud(inputs.scene), FROM_SCENE)
+    registration = read_json(inputs.fine_json)
+    part, obj = read_cloud(inputs.crop), read_cloud(inputs.object)
+    fusion = fuse_registered(obj, whole, part, registration, settings)
+    if not is_placed(registration):
+        print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
+    kept = whole[fusion.kept]
+    around = _in_box(kept, read_json(inputs.crop_json))
+    write_cloud(fused, _together(around, fusion.added))
+    crs = write_scene(fused_scene, fused_laz, _together(kept, fusion.added), inputs.georeference_json)
+    unit = length_unit(inputs.georeference_json)
+    content = _report(fusion, registration, spacing(part.points), unit) | {
+        "mode": quantity(settings.mode, ""),
+        "object_points": quantity(len(obj), "points"),
+        "surroundings_points": quantity(len(around) + len(fusion.added), "points"),
+        "crs": quantity(crs, ""),
+        "seconds": quantity(time.perf_counter() - start, "s"),
+    }
+    write_json(report, content)
+
+
+def _report(fusion: Fusion, registration: dict[str, Any], scene_spacing: float, unit: str) -> dict[str, Any]:
+    """What was added and taken away, with units."""
+    added = fusion.added
+    return {
+        "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
+        "registration": quantity(value(registration, "status"), ""),
+        "reason": quantity(value(registration, "reason"), ""),
+        "scene_points": quantity(len(fusion.kept), "points"),
+        "removed_points": quantity(int((~fusion.kept).sum()), "points"),
+        "added_points": quantity(len(added), "points"),
+        "scene_spacing": quantity(scene_spacing, unit),
+        "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
+        "fill_distance": quantity(fusion.fill_distance, unit),
+        "color_gain": quantity(fusion.gain, "1"),
+        "color_bias": quantity(fusion.bias, "of 255"),
+    }
+
+
+def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:
+    """The points in the box of a crop stage."""
+    low, high = np.array(value(crop_json, "box_low")), np.array(value(crop_json, "box_high"))
+    levelled = cloud.points @ np.array(value(crop_json, "level_from_scene")).T
+    return cloud[((levelled >= low) & (levelled <= high)).all(1)]
+
+
+def _together(kept: Cloud, added: Cloud) -> Cloud:
+    return concatenate([kept, added]) if len(added) else kept
+
+
+def is_placed(registration: dict[str, Any]) -> bool:
+    """Whether a fine registration's JSON puts the object into the scene: accepted, or made without any check."""
+    return value(registration, "status") in ("registered", "ungated")
 
 
 def fuse_registered(
-    obj: Cloud, scene: Cloud, part: Cloud, registration: dict[str, Any], mode: str, settings: FusionSettings
+    obj: Cloud, scene: Cloud, part: Cloud, registration: dict[str, Any], settings: FusionSettings
 ) -> Fusion:
     """`fuse_clouds` at the pose of a fine registration's JSON; an unregistered object leaves the scene as it is."""
-    if value(registration, "status") == "registered":
+    if is_placed(registration):
         pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-        return fuse_clouds(obj, scene, part, pose, mode, settings)
+        return fuse_clouds(obj, scene, part, pose, settings)
     nothing = with_provenance(obj, FROM_OBJECT)[np.zeros(len(obj), dtype=bool)]
     return Fusion(np.ones(len(scene), dtype=bool), nothing, np.ones(3), np.zeros(3), 0.0)
 
 
-def fuse_clouds(
-    obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, mode: str, settings: FusionSettings
-) -> Fusion:
-    """Decide what is added and what is taken away; see `fuse`.
+def fuse_clouds(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, settings: FusionSettings) -> Fusion:
+    """Decide what is added and what is taken away; see `fuse_object`.
 
     Args:
         obj: the object in its own frame.
         scene: the whole scene, with provenance.
         part: the scene's points on the object.
         scene_from_object: the registration.
-        mode: fill, append or replace.
         settings: see FusionSettings.
     """
     moved = with_provenance(obj, FROM_OBJECT).transformed(scene_from_object)
@@ -173,15 +190,16 @@ def fuse_clouds(
             gain, bias = match_colors(moved.colors[close], local.colors[partner[close]])
             moved = replace(moved, colors=_bytes(moved.colors * gain + bias))
     kept = np.ones(len(scene), dtype=bool)
-    if mode == "fill":
+    if settings.mode == "fill":
         moved = moved[distance > fill]
-    elif mode == "replace":
+    elif settings.mode == "replace":
         index = np.flatnonzero(near)
         to_object = cKDTree(moved.points).query(scene.points[index], workers=threads())[0]
         kept[index[to_object <= fill]] = False
     added = _thin(moved, settings.density * step) if settings.density > 0 and len(moved) > 10 else moved
-    if mode != "append" and len(added) and kept.any():
-        added = _feather(added, scene[kept & near], settings.feather_spacings * step, mode == "replace", fill)
+    if settings.mode != "append" and len(added) and kept.any():
+        width = settings.feather_spacings * step
+        added = _feather(added, scene[kept & near], width, settings.mode == "replace", fill)
     return Fusion(kept, added, gain, bias, fill)
 
 
@@ -209,10 +227,13 @@ def with_provenance(cloud: Cloud, source: int) -> Cloud:
 def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
     """Write a cloud in the scene's frame as PLY, and as LAZ in the scene's CRS; returns that CRS, None without one."""
     write_cloud(ply, cloud)
-    crs_from_scene, crs = _crs_from_scene(georeference) or (Sim3.identity(), None)
-    about_origin = replace(crs_from_scene, translation=np.zeros(3))
-    write_laz(laz, cloud.transformed(about_origin), crs_from_scene.translation, crs)
-    return crs
+    frame = None if georeference is None else scene_frame(read_json(georeference))
+    if frame is None:
+        write_laz(laz, cloud, np.zeros(3), None)
+        return None
+    origin = frame.in_crs(np.zeros((1, 3)))[0]
+    write_laz(laz, replace(cloud, points=frame.in_crs(cloud.points) - origin), origin, frame.crs)
+    return frame.crs
 
 
 def _thin(cloud: Cloud, wanted: float) -> Cloud:
@@ -250,15 +271,6 @@ def _feather(added: Cloud, kept: Cloud, width: float, move: bool, fill: float) -
         height = np.clip((offset * normal).sum(1, keepdims=True), -fill, fill)
         added = replace(added, points=added.points + share * height * normal)
     return added
-
-
-def _crs_from_scene(georeference: Path | None) -> tuple[Sim3, str] | None:
-    """The transform into a georeferenced scene's CRS and the CRS, or None."""
-    content = {} if georeference is None else read_json(georeference)
-    crs, transform = content.get("crs"), content.get("crs_from_scene")
-    if not crs or not transform or not crs["value"] or transform["value"] is None:
-        return None
-    return Sim3.from_matrix(np.array(transform["value"])), str(crs["value"])
 
 
 def _bytes(colors: Array) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 """Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
 
+import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -138,16 +139,19 @@ def read_cloud(path: Path) -> Cloud:
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
-    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are."""
+    """Write a binary PLY atomically: positions as float64, normals float32, colours uint8, fields as they are.
+
+    PLY allows no spaces in a field's name: they become underscores.
+    """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
     if cloud.colors is not None:
         columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
-    # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
-    columns |= {
-        name: v.astype(np.float64) if v.dtype in (np.int64, np.uint64) else v for name, v in cloud.fields.items()
-    }
+    names = _file_names(path, list(cloud.fields), set(columns))
+    for name, values in cloud.fields.items():
+        # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
+        columns[names[name]] = values.astype(np.float64) if values.dtype in (np.int64, np.uint64) else values
     vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         vertex[name] = values
@@ -169,11 +173,12 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
 
     header = laspy.LasHeader(point_format=7, version="1.4")
     step = 0.001 if crs is not None else max(cloud.diagonal, 1e-300) * 1e-8
-    header.scales, header.offsets = np.full(3, step), np.floor(origin)
+    # LAS counts steps from the offset in 32 bits; without a CRS the points may lie anywhere.
+    middle = (cloud.points.min(0) + cloud.points.max(0)) / 2 if crs is None and len(cloud) else 0.0
+    header.scales, header.offsets = np.full(3, step), np.floor(origin + middle)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_user_input(crs))
-    taken = set(header.point_format.dimension_names)
-    names = {name: (f"{name}_" if name in taken else name)[:32] for name in cloud.fields}  # LAS allows 32 letters
+    names = _file_names(path, list(cloud.fields), set(header.point_format.dimension_names))
     for name, values in cloud.fields.items():
         header.add_extra_dim(laspy.ExtraBytesParams(names[name], f"{values.dtype.kind}{values.dtype.itemsize}"))
     las = laspy.LasData(header)
@@ -184,3 +189,18 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
         las[names[name]] = values
     with atomic_file(path) as temporary:
         las.write(str(temporary))
+
+
+def _file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:
+    """What fields are called in a file: PLY separates by blanks, both formats know ASCII alone, LAS 32 letters."""
+    called: dict[str, str] = {}
+    for name in names:
+        plain = wanted = re.sub(r"[^!-~]+", "_", name)[:32]
+        number = 1
+        while plain in taken or plain in called.values():
+            plain, number = f"{wanted[:28]}_{'' if number == 1 else number}", number + 1
+        called[name] = plain
+    changed = [f"'{name}' is '{plain}'" for name, plain in called.items() if name != plain]
+    if changed:
+        print(f"note: in {path.name}, the column {', '.join(changed)}", flush=True)
+    return called

@@ -2,6 +2,7 @@
 
 import dataclasses
 import difflib
+import functools
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar, get_type_hints
@@ -22,6 +23,14 @@ def merge(base: Any, over: Any) -> Any:
     return base | {key: merge(base.get(key), value) for key, value in over.items()}
 
 
+@functools.cache
+def schema_of(name: str) -> dict[str, Any]:
+    """The JSON schema of `config`, or of a row of `scenes` or `objects`."""
+    return yaml.load(
+        (ROOT / f"workflow/schemas/{name}.schema.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    )
+
+
 def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
     """The first thing in `content` that a JSON schema does not allow, as one sentence that begins with its key."""
     for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
@@ -33,6 +42,8 @@ def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
             close = difflib.get_close_matches(str(unknown), known, 1)
             advice = f"did you mean '{close[0]}'?" if close else f"known keys are: {', '.join(known)}"
             message = f"unknown key '{unknown}'; {advice}"
+        elif error.validator == "pattern" and "advice" in error.schema:
+            message = f"'{error.instance}' will not do; {error.schema['advice']}"
         return f"{key}: {message}" if key else message
     return None
 
@@ -51,7 +62,7 @@ def read_settings(mine: Path | None) -> dict[str, Any]:
     Raises:
         StageError: the file is missing, is no YAML, or holds a key or value that the schema does not allow.
     """
-    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    schema = schema_of("config")
     if mine is None:
         return with_defaults({}, schema)
     try:

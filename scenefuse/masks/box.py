@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scenefuse.mvs.visual_hull import Box
-
-Array = NDArray[np.float64]
+from scenefuse.transforms import Array
 
 
 def upright_box(points: Array, up: Array, margin: float) -> Box:

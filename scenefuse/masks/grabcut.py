@@ -53,7 +53,7 @@ class Colours:
     log_ratio: NDArray[np.float32]
 
     def evidence(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """(H, W) log ratios of a (H, W, 3) BGR photo."""
+        """(H, W) log ratios of a (H, W, 3) RGB photo."""
         cells = _cells(image)
         return self.log_ratio[cells[..., 0], cells[..., 1], cells[..., 2]]
 
@@ -71,8 +71,8 @@ def learn_colours(images: list[NDArray[np.uint8]], own: list[Mask], others: list
 
 
 def _cells(image: NDArray[np.uint8]) -> NDArray[np.intp]:
-    """(H, W, 3) cell of each pixel of a BGR photo in Lab; a and b are stretched: photographs use little of them."""
-    lab = cv2.cvtColor(image, cv2.COLOR_BGR2LAB).astype(np.float32)
+    """(H, W, 3) cell of each pixel of an RGB photo in Lab; a and b are stretched: photographs use little of them."""
+    lab = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.float32)
     lab[..., 1:] = (lab[..., 1:] - 128) * 2 + 128
     return np.clip(lab * (COLOUR_BINS / 256), 0, COLOUR_BINS - 1).astype(np.intp)
 
@@ -81,7 +81,7 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     """GrabCut labels from the hull's outline and the mask so far, (H, W).
 
     Certain is only what both and the colours agree on, away from the outline; beyond two bands outside it
-    nothing is object, whatever the mask says. Elsewhere the three vote.
+    nothing is object, whatever the mask has there. Elsewhere the majority of the three decides.
 
     Args:
         outline: the hull as the photo sees it.
@@ -91,7 +91,7 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     """
     inner = ndimage.distance_transform_edt(outline)
     outer = ndimage.distance_transform_edt(~outline)
-    # One pixel's colour is noise: its neighbours within half a band have their say.
+    # One pixel's colour is noise: its neighbours within half a band count too.
     colour = cv2.GaussianBlur(np.clip(evidence, -3, 3), (0, 0), band_px / 4)
     votes = colour + np.where(outline, 1, -1) + np.where(mask, 1, -1)
     trimap = np.where(votes > 0, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
@@ -135,7 +135,7 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
     """The object's pixels, (H, W).
 
     Args:
-        image: (H, W, 3) uint8 BGR.
+        image: (H, W, 3) uint8 RGB.
         trimap: (H, W) OpenCV's labels.
         width_px: the cut runs on an image at most this wide, cropped to the object's surroundings.
         iterations: rounds of learning colours and cutting.
@@ -151,6 +151,7 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
     scale = min(1.0, width_px / width)
     size = (max(8, round((right - left) * scale)), max(8, round((bottom - top) * scale)))
     picture = cv2.resize(image[top:bottom, left:right], size, interpolation=cv2.INTER_AREA)
+    picture = cv2.cvtColor(picture, cv2.COLOR_RGB2BGR)
     labels = cv2.resize(trimap[top:bottom, left:right], size, interpolation=cv2.INTER_NEAREST)
     certain = (
         ((labels == cv2.GC_FGD) | (labels == cv2.GC_PR_FGD)).sum(),

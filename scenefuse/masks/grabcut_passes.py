@@ -2,9 +2,9 @@
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from scenefuse.masks.grabcut import (
+    Trimap,
     cleaned,
     fill_hull,
     first_trimap,
@@ -15,66 +15,75 @@ from scenefuse.masks.grabcut import (
     stamp_seeds,
 )
 from scenefuse.masks.target import Target
-from scenefuse.mvs.visual_hull import Frame, Hull, Mask, silhouette
+from scenefuse.mvs.visual_hull import Hull, Mask, silhouette
+from scenefuse.transforms import Array
+from scenefuse.workspace import Rows, View, Workspace
+
+FIRST_ROUNDS = 4
+"""Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one."""
+REFERENCE_WIDTH_PX = 640
+"""Photo width that `band_px` is meant for."""
 
 
-def first_cuts(target: Target, frames: list[Frame], width_px: int, iterations: int) -> list[Mask]:
-    """First masks, seeded by the prompts, the sparse points, and the colours of both over all photos.
+def first_cuts(target: Target, photos: Workspace, width_px: int) -> list[Mask]:
+    """First masks (H, W), seeded by the prompts, the sparse points, and the colours of both over all photos.
 
     Args:
         target: box, prompts and sparse points of the object.
-        frames: the photos.
+        photos: views with RGB pixels.
         width_px: photos are cut at most this wide.
-        iterations: rounds of learning colours and cutting.
     """
     trimaps = []
-    for frame in frames:
-        size = frame.image.shape[:2]
-        trimaps.append(first_trimap(size, target.outline(frame), frame.project(target.spanning)[0]))
-        stamp(trimaps[-1], target, frame)
-    colours = learn_colours(
-        [f.image for f in frames], [t == cv2.GC_FGD for t in trimaps], [t == cv2.GC_BGD for t in trimaps]
-    )
+    for view, seen, seen_at in zip(photos.views, photos.seen, photos.seen_at):
+        outline, spanning = target.outline(view), view.project(target.spanning)[0]
+        trimaps.append(first_trimap((view.height, view.width), outline, spanning))
+        stamp(trimaps[-1], target, view, seen, seen_at)
+    images = [view.pixels for view in photos.views]
+    colours = learn_colours(images, [t == cv2.GC_FGD for t in trimaps], [t == cv2.GC_BGD for t in trimaps])
     masks = []
-    for frame, trimap in zip(frames, trimaps):
-        prefer_colour(trimap, colours.evidence(frame.image))
-        masks.append(cleaned(grabcut(frame.image, trimap, width_px, iterations)))
+    for image, trimap in zip(images, trimaps):
+        prefer_colour(trimap, colours.evidence(image))
+        masks.append(cleaned(grabcut(image, trimap, width_px, FIRST_ROUNDS)))
     return masks
 
 
-def second_cuts(target: Target, masks: list[Mask], frames: list[Frame], hull: Hull, band_px: float) -> list[Mask]:
-    """GrabCut once more, on all that a photo's mask and the hull do not agree on.
+def second_cuts(target: Target, masks: list[Mask], photos: Workspace, hull: Hull, band_px: float) -> list[Mask]:
+    """GrabCut once more, where a photo's mask and the hull do not agree.
 
     Args:
         target: box, prompts and sparse points of the object.
         masks: (H, W) per photo.
-        frames: the photos.
+        photos: views with RGB pixels.
         hull: of these masks.
         band_px: half width of the band along its outline that is never certain, at a photo width of 640.
     """
-    outlines = [silhouette(hull, f) for f in frames]
-    colours = learn_colours(
-        [f.image for f in frames], [m & o for m, o in zip(masks, outlines)], [~m & ~o for m, o in zip(masks, outlines)]
-    )
+    outlines = [silhouette(hull, view) for view in photos.views]
+    own, others = [m & o for m, o in zip(masks, outlines)], [~m & ~o for m, o in zip(masks, outlines)]
+    colours = learn_colours([view.pixels for view in photos.views], own, others)
     cut = []
-    for frame, mask, outline in zip(frames, masks, outlines):
-        width = frame.image.shape[1]
-        trimap = second_trimap(outline, mask, colours.evidence(frame.image), band_px * width / 640)
-        stamp(trimap, target, frame)
-        cut.append(cleaned(grabcut(frame.image, trimap, width, 1)) if outline.any() else outline)
+    for k, (view, mask, outline) in enumerate(zip(photos.views, masks, outlines)):
+        band = band_px * view.width / REFERENCE_WIDTH_PX
+        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), band)
+        stamp(trimap, target, view, photos.seen[k], photos.seen_at[k])
+        cut.append(cleaned(grabcut(view.pixels, trimap, view.width, 1)) if outline.any() else outline)
     return cut
 
 
-def stamp(trimap: NDArray[np.uint8], target: Target, frame: Frame) -> None:
-    """Mark what the sparse points that a photo sees make certain, the prompts, and what close prompts enclose.
+def stamp(trimap: Trimap, target: Target, view: View, seen: Rows, seen_at: Array) -> None:
+    """Mark in place what the sparse points that a photo sees make certain, the prompts, and what close prompts enclose.
 
     A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+
+    Args:
+        trimap: (H, W) labels.
+        target: box, prompts and sparse points of the object.
+        view: the photo.
+        seen: (K,) rows of the sparse points that it observes.
+        seen_at: (K, 2) pixels where it does.
     """
-    height, width = trimap.shape
-    rows = frame.point_rows
-    radius, diagonal = 0.003 * width, target.box.diagonal
-    stamp_seeds(trimap, frame.observed, target.sparse[rows], target.kind[rows], radius, 0.06 * diagonal)
-    pixels, depth = frame.project(target.spanning)
+    radius, diagonal = 0.003 * view.width, target.box.diagonal
+    stamp_seeds(trimap, seen_at, target.sparse[seen], target.kind[seen], radius, 0.06 * diagonal)
+    pixels, depth = view.project(target.spanning)
     for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
         if (depth[part] > 0).all():
             fill_hull(trimap, pixels[part], cv2.GC_FGD)

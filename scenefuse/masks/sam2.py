@@ -11,9 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from scenefuse.masks.grabcut import cleaned
+from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
 from scenefuse.masks.target import Target
-from scenefuse.mvs.visual_hull import Frame, Mask, agreement
+from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError, sha256
+from scenefuse.transforms import Array
+from scenefuse.workspace import View
 
 SIDE_PX = 1024
 """Side of the square image the network takes."""
@@ -22,14 +25,12 @@ LOGITS_PX = 256
 BOX_GROWTH = 0.05
 """Growth of the box around the prompts, as a share of its longer side."""
 
-Array = NDArray[np.float64]
-
 
 class Sam2(Protocol):
     """The network, loaded: an encoder of photos and a decoder of prompts."""
 
     def encode(self, image: NDArray[np.uint8]) -> Any:
-        """Features of a (H, W, 3) uint8 BGR photo, for any number of prompts."""
+        """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts."""
 
     def masks(self, features: Any, size: tuple[int, int], points_px: Array, box_px: Array) -> tuple[list[Mask], Array]:
         """Three masks (H, W), a part, a larger part and the whole, and how good the network thinks they are, (3,).
@@ -123,9 +124,9 @@ class Sam2Transformers:
 
 
 def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """A BGR photo as the (1, 3, 1024, 1024) input of the encoder."""
-    rgb = cv2.cvtColor(cv2.resize(image, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB)
-    normalised = (rgb / 255.0 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
+    """An RGB photo as the (1, 3, 1024, 1024) input of the encoder."""
+    small = cv2.resize(image, (SIDE_PX, SIDE_PX), interpolation=cv2.INTER_AREA)
+    normalised = (small / 255.0 - [0.485, 0.456, 0.406]) / [0.229, 0.224, 0.225]
     return np.ascontiguousarray(normalised.transpose(2, 0, 1)[None], dtype=np.float32)
 
 
@@ -143,24 +144,24 @@ def _enlarged(logits: NDArray[np.float32], size: tuple[int, int]) -> list[Mask]:
     return [cv2.resize(m.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0 for m in logits]
 
 
-def ask(network: Sam2, target: Target, frame: Frame, outline: Mask | None) -> Mask:
-    """The object in one photo: asked for by all prompts, as this photo sees them, and the box around them.
+def segment(network: Sam2, target: Target, view: View, outline: Mask | None) -> Mask:
+    """The object in one photo, prompted by all points, as this photo sees them, and the box around them.
 
-    A prompt that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+    A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
 
     Args:
         network: SAM 2.
-        target: prompts that span the object.
-        frame: the photo.
-        outline: (H, W) what the other photos make of the object; then the box is its own, and the answer most like it
+        target: points that span the object.
+        view: the photo, with RGB pixels.
+        outline: (H, W) the visual hull of the other photos' masks; then the box is its own, and the mask most like it
             is taken. The network does not see it: it would only give it back.
 
     Returns:
-        (H, W), of the network's answers the one with most prompts in it and the best quality, or the most like the
-        outline; empty where no prompt is in the photo.
+        (H, W), of the network's masks the one with most points in it and the best quality, or the most like the
+        outline; empty where no point is in the photo.
     """
-    size = frame.image.shape[:2]
-    pixels, depth = frame.project(target.spanning)
+    size = (view.height, view.width)
+    pixels, depth = view.project(target.spanning)
     front = depth > 0
     inside = front & (pixels >= 0).all(1) & (pixels < size[::-1]).all(1)
     if not inside.any():
@@ -169,27 +170,50 @@ def ask(network: Sam2, target: Target, frame: Frame, outline: Mask | None) -> Ma
     low, high = spanned.min(0), spanned.max(0)
     grow = BOX_GROWTH * (high - low).max()
     box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
-    answers, quality = network.masks(network.encode(frame.image), size, pixels[inside], box)
+    found, quality = network.masks(network.encode(view.pixels), size, pixels[inside], box)
     u, v = pixels[inside].astype(int).T
     if outline is not None:
-        quality = np.array([agreement(m, outline) for m in answers])
-    return cleaned(answers[int(np.argmax([m[v, u].mean() * q for m, q in zip(answers, quality)]))])
+        quality = np.array([mask_iou(m, outline) for m in found])
+    return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))])
 
 
-def check_weights(path: Path, expected_sha256: str, what: str) -> Path:
-    """The path of a weight file that is there and is the right one.
+def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:
+    """SAM 2 by transformers if there is a checkpoint, else by ONNX Runtime; and which weights it has, for the report.
 
     Raises:
-        StageError: no such file, or another hash.
+        StageError: weights are missing, or those at the shipped paths are not the shipped ones.
+    """
+    if checkpoint is not None:
+        return Sam2Transformers(checkpoint), f"own checkpoint {checkpoint}, not checked"
+    about = [
+        check_weights(encoder, ENCODER_SHA256, encoder == Path(ENCODER)),
+        check_weights(decoder, DECODER_SHA256, decoder == Path(DECODER)),
+    ]
+    return Sam2Onnx(encoder, decoder, threads), "; ".join(about)
+
+
+def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
+    """What a file of weights is, for the report.
+
+    Args:
+        path: of the weights.
+        expected_sha256: of the shipped ones.
+        shipped: whether the path is the shipped one; weights at a path of the user's own may be others.
+
+    Raises:
+        StageError: no such file, or another one at the shipped path.
     """
     if not path.is_file():
         raise StageError(
-            f"the SAM 2 {what} weights {path} do not exist; fetch them (rule sam2_weights), or use grabcut"
+            f"the SAM 2 weights {path} do not exist; fetch the shipped ones (rule fetch_sam2_weights), correct the"
+            " path, or use grabcut"
         )
     found = sha256(path)
-    if found != expected_sha256:
+    if found == expected_sha256:
+        return f"{path.name} as shipped"
+    if shipped:
         raise StageError(
-            f"the SAM 2 {what} weights {path} have SHA-256 {found[:16]}..., expected {expected_sha256[:16]}...; "
-            "fetch them again (rule sam2_weights)"
+            f"the SAM 2 weights {path} have SHA-256 {found[:16]}..., expected {expected_sha256[:16]}...; "
+            "fetch them again (rule fetch_sam2_weights)"
         )
-    return path
+    return f"{path.name} own weights, not checked (SHA-256 {found[:16]}...)"

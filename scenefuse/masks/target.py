@@ -7,10 +7,18 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from scenefuse.masks.box import Ground, find_ground, in_hull, span, upright_box
-from scenefuse.mvs.visual_hull import Box, Frame, Mask
+from scenefuse.mvs.visual_hull import Box, Mask
 from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, Workspace
 
-Array = NDArray[np.float64]
+BOX_MARGIN = 0.15
+"""Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends."""
+GROUND_MARGIN = 0.02
+"""A sparse point is the object's only this much above the ground, as a share of the box's diagonal: as the ground
+scatters."""
+LEAST_OWN = 10
+"""Sparse points on the object that supplied masks have to hold: fewer say nothing of its extent."""
 
 
 @dataclass(frozen=True)
@@ -37,67 +45,56 @@ class Target:
     sparse: Array
     kind: NDArray[np.int8]
 
-    def outline(self, frame: Frame) -> Array:
+    def outline(self, view: View) -> Array:
         """Pixels (N, 2) in whose convex hull the object is; all of the photo where that ends behind the camera."""
-        pixels, depth = frame.project(span(self.spanning, self.margin))
-        height, width = frame.image.shape[:2]
-        return pixels if (depth > 0).all() else np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
+        pixels, depth = view.project(span(self.spanning, self.margin))
+        if (depth > 0).all():
+            return pixels
+        return np.array([[0, 0], [view.width, 0], [view.width, view.height], [0, view.height]], float)
 
 
-def target_from_points(
-    points: Array,
-    frames: list[Frame],
-    sparse: Array,
-    up: Array,
-    box_margin: float,
-    ground_margin: float,
-    seed: int,
-) -> Target:
+def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -> Target:
     """Box, ground and the kind of each sparse point, from (N, 3) points that span the object.
 
     A sparse point is on the object when it lies above the ground in the convex hull of the points, grown
     by a quarter of the margin; not on it when outside the hull grown by the whole margin, or below the ground; in
-    between nobody knows. Nobody knows either of a point of two photos: two rays that are mismatched along their
-    epipolar lines meet somewhere all the same.
+    between it is unknown. So is a point of two photos: two rays that are mismatched along their epipolar lines meet
+    somewhere all the same.
 
     Args:
         points: (N, 3) points on the object.
-        frames: the photos, which know the sparse points that they see.
-        sparse: (P, 3) sparse points.
+        photos: cameras, sparse points, and who observes them.
         up: (3,) the direction against gravity.
-        box_margin: growth on each side, as a share of the diagonal of the points' box.
-        ground_margin: a sparse point is on the object only this much above the ground, as a share of the box's
-            diagonal.
         seed: seed of the ground's RANSAC.
     """
-    box = upright_box(points, up, box_margin)
+    sparse, box = photos.points, upright_box(points, up, BOX_MARGIN)
     x_in_box = box.to_box(sparse)
     ground, found = find_ground(x_in_box, box, box.to_box(points), seed)
     height = ground.height_of(x_in_box)
-    above = ground_margin * box.diagonal
-    grow = box_margin * float(np.linalg.norm(np.ptp(points, axis=0)))
+    above = GROUND_MARGIN * box.diagonal
+    grow = BOX_MARGIN * float(np.linalg.norm(np.ptp(points, axis=0)))
     kind = np.zeros(len(sparse), dtype=np.int8)
     kind[~in_hull(sparse, span(points, grow))] = -1
     if found:
         kind[height < 0.5 * above] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
-    kind[np.bincount(np.concatenate([f.point_rows for f in frames]), minlength=len(sparse)) < 3] = 0
+    kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < 3] = 0
     return Target(box, ground, found, points, grow, _parts(points, 0.12 * box.diagonal), sparse, kind)
 
 
-def points_in_masks(frames: list[Frame], masks: list[Mask], sparse: Array, up: Array) -> Array:
-    """(N, 3) sparse points that lie in the (H, W) masks wherever they are seen, without the outermost: they span it.
+def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
+    """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
 
     Raises:
         StageError: there are fewer than ten of them.
     """
-    seen, hit = np.zeros(len(sparse)), np.zeros(len(sparse))
-    for frame, mask in zip(frames, masks):
-        u, v = np.clip(frame.observed.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        np.add.at(seen, frame.point_rows, 1)
-        np.add.at(hit, frame.point_rows, mask[v, u])
-    own = sparse[(seen >= 2) & (hit > 0.8 * seen)]
-    if len(own) < 10:
+    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
+    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
+        u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        np.add.at(seen, rows, 1)
+        np.add.at(hit, rows, mask[v, u])
+    own = photos.points[(seen >= 2) & (hit > 0.8 * seen)]
+    if len(own) < LEAST_OWN:
         raise StageError(
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"

@@ -1,6 +1,5 @@
 """Unsupervised quality of what was added: surface variation, uniformity of density, primitives; each with its null."""
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, spacing
 from scenefuse.metrics.primitives import primitive_fitting_score
+from scenefuse.metrics.registration import MetricSettings, plane_normals, sampled
 from scenefuse.stage import quantity, threads
 from scenefuse.transforms import Array
 
@@ -15,22 +15,8 @@ from scenefuse.transforms import Array
 WIDE_SAMPLE = 1500
 
 
-@dataclass(frozen=True)
-class CompletionSettings:
-    """What the completion metrics need; see `MetricSettings` for the meaning of each."""
-
-    variation_spacings: float
-    density_neighbours: int
-    primitive_fraction: float
-    primitive_support: float
-    primitive_most: int
-    primitive_angle_deg: float
-    normal_neighbours: int
-    sample: int
-
-
 def completion_metrics(
-    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, unit: str, settings: CompletionSettings, seed: int
+    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, unit: str, settings: MetricSettings, seed: int
 ) -> dict[str, dict[str, Any]]:
     """The completion.* numbers of the added points P_new, and the same of a random cloud in their place.
 
@@ -42,7 +28,7 @@ def completion_metrics(
         added: P_new.
         diagonal: of the full variant's crop.
         unit: of the scene's lengths.
-        settings: see CompletionSettings.
+        settings: see MetricSettings.
         seed: of samples and of the null cloud.
     """
     names = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
@@ -60,7 +46,7 @@ def completion_metrics(
         found[f"{name}_null"] = quantity(null[name], "1")
     radius = settings.variation_spacings * spacing(scene.points)
     found["surface_variation_scene"] = quantity(
-        surface_variation(scene.points, _sampled(scene.points, settings.sample, seed), radius), "1"
+        surface_variation(scene.points, sampled(scene.points, settings.sample, seed), radius), "1"
     )
     found["surface_variation_radius"] = quantity(radius, unit)
     found["added_points"] = quantity(len(added), "points")
@@ -68,13 +54,13 @@ def completion_metrics(
 
 
 def _measure(
-    around: Array, scene: Array, added: Array, diagonal: float, settings: CompletionSettings, seed: int
+    around: Array, scene: Array, added: Array, diagonal: float, settings: MetricSettings, seed: int
 ) -> dict[str, float | None]:
     """Every number for one set of added points."""
     complete = np.concatenate([around, added])
-    few = _sampled(added, settings.sample, seed)
-    fewer = _sampled(added, min(settings.sample, WIDE_SAMPLE), seed)
-    few_scene = _sampled(scene, settings.sample, seed)
+    few = sampled(added, settings.sample, seed)
+    fewer = sampled(added, min(settings.sample, WIDE_SAMPLE), seed)
+    few_scene = sampled(scene, settings.sample, seed)
     radius = settings.variation_spacings * spacing(scene)
     found: dict[str, float | None] = {"surface_variation": surface_variation(complete, few, radius)}
     for percent in (1, 2, 4):
@@ -99,7 +85,7 @@ def _measure(
 def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
     """Mean over `at` of lambda_0 / (lambda_0 + lambda_1 + lambda_2) of the cloud's points within `radius`, 0..1/3.
 
-    Neighbourhoods of fewer than four points say nothing and are left out; None when there is no other.
+    Neighbourhoods of fewer than four points have no variation and are left out; None when there is no other.
 
     Args:
         cloud: (N, 3) points that are neighbours.
@@ -130,17 +116,3 @@ def local_density(cloud: Array, at: Array, k: int) -> Array:
     distance = cKDTree(cloud).query(at, k=min(k + 1, len(cloud)), workers=threads())[0][:, -1]
     floor = max(float(np.median(distance)) * 1e-3, 1e-300)
     return k / (np.pi * np.maximum(distance, floor) ** 2)
-
-
-def plane_normals(cloud: Array, at: Array, neighbours: int) -> Array:
-    """Unit normals (M, 3) at points `at` from the planes through their nearest neighbours in the cloud."""
-    index = cKDTree(cloud).query(at, k=min(neighbours, len(cloud)), workers=threads())[1]
-    local = cloud[index]
-    local = local - local.mean(1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
-
-
-def _sampled(points: Array, most: int, seed: int) -> Array:
-    if len(points) <= most:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]

@@ -1,16 +1,14 @@
-"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score; and the metrics stage."""
+"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, read_cloud, spacing
-from scenefuse.metrics.completion import CompletionSettings, completion_metrics, plane_normals
-from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.stage import quantity, setting, threads
+from scenefuse.transforms import Array, Sim3
 
 
 @dataclass(frozen=True)
@@ -18,65 +16,23 @@ class MetricSettings:
     """Settings of all metrics. Shares are of the full variant's crop diagonal, the same for every variant."""
 
     tau_fraction: float = setting(0.016, least=0)
-    """Distance within which points correspond."""
-    normal_neighbours: int = setting(16, least=0)
-    """Neighbours that a normal is fitted to."""
-    variation_spacings: float = setting(8, least=0)
-    """Radius of the surface variation, in spacings of the scene crop."""
-    density_neighbours: int = setting(16, least=0)
-    """Neighbours k of the local density."""
-    primitive_fraction: float = setting(0.005, least=0)
-    """Distance to a primitive within which a point lies on it."""
-    primitive_support: float = setting(0.01, least=0)
-    """Smallest share of the new points that makes a primitive."""
-    primitive_most: int = setting(20, least=0)
-    """Most primitives taken."""
-    primitive_angle_deg: float = setting(25, unit="degree", least=0)
-    """Largest angle in degrees between a point's normal and the primitive's."""
+    """Distance within which points correspond, as a share of the crop's diagonal."""
     sample: int = setting(4000, least=0)
-    """Points that a completion metric looks at, chosen by the seed."""
-
-
-def compute_metrics(
-    *,
-    object: Path,
-    crop: Path,
-    reference: Path,
-    fine: Path,
-    fused: Path | None = None,
-    metrics: Path,
-    seed: int,
-    settings: MetricSettings,
-) -> None:
-    """Measure one registration and, where the object was fused, the completion (method G1 to G5, R10, R11).
-
-    Args:
-        object: object cloud (PLY) in its own frame.
-        crop: scene points on the object (PLY); the full variant's for every variant, so that variants can be compared.
-        reference: JSON of the full variant's crop stage: its diagonal sets all thresholds, and the unit of lengths.
-        fine: JSON of the fine registration of this variant.
-        fused: the object's fused surroundings (PLY, with `source`); without it completion is left out.
-        metrics: output JSON with `registration` and `completion`.
-        seed: of samples and of the random clouds that give the null values.
-        settings: see MetricSettings.
-    """
-    obj, scene = read_cloud(object), read_cloud(crop)
-    registration = read_json(fine)
-    pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-    extent = read_json(reference)["diagonal"]
-    diagonal, unit = float(extent["value"]), str(extent["unit"])
-    found = registration_metrics(obj, scene, pose, settings.tau_fraction * diagonal, diagonal, unit, settings)
-    found["status"] = quantity(value(registration, "status"), "")
-    content: dict[str, Any] = {"registration": found}
-    if fused is not None:
-        completed = read_cloud(fused)
-        added = completed.fields["source"] == 1
-        content["completion"] = completion_metrics(
-            completed[~added], scene, completed[added], diagonal, unit, _completion(settings), seed
-        )
-    for name, item in found.items():
-        print(f"{name:28s} {item['value']} {item['unit']}", flush=True)
-    write_json(metrics, content)
+    """Points at which a completion metric is measured, chosen by the seed."""
+    normal_neighbours: int = 16
+    """Neighbours that a normal is fitted to."""
+    variation_spacings: float = 8
+    """Radius of the surface variation, in spacings of the scene crop."""
+    density_neighbours: int = 16
+    """Neighbours k of the local density."""
+    primitive_fraction: float = 0.005
+    """Distance to a primitive within which a point lies on it, as a share of the crop's diagonal."""
+    primitive_support: float = 0.01
+    """Smallest share of the new points that makes a primitive."""
+    primitive_most: int = 20
+    """Most primitives taken."""
+    primitive_angle_deg: float = 25
+    """Largest angle in degrees between a point's normal and the primitive's."""
 
 
 def registration_metrics(
@@ -135,14 +91,16 @@ def registration_metrics(
     }
 
 
-def _completion(settings: MetricSettings) -> CompletionSettings:
-    return CompletionSettings(
-        settings.variation_spacings,
-        settings.density_neighbours,
-        settings.primitive_fraction,
-        settings.primitive_support,
-        settings.primitive_most,
-        settings.primitive_angle_deg,
-        settings.normal_neighbours,
-        settings.sample,
-    )
+def plane_normals(cloud: Array, at: Array, neighbours: int) -> Array:
+    """Unit normals (M, 3) at points `at` from the planes through their nearest neighbours in the cloud."""
+    index = cKDTree(cloud).query(at, k=min(neighbours, len(cloud)), workers=threads())[1]
+    local = cloud[index]
+    local = local - local.mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+
+
+def sampled(points: Array, most: int, seed: int) -> Array:
+    """At most that many of (N, 3) points, drawn evenly."""
+    if len(points) <= most:
+        return points
+    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]

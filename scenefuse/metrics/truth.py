@@ -2,16 +2,22 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import open3d as o3d
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import Cameras
-from scenefuse.stage import StageError, threads
+from scenefuse.stage import StageError, quantity, threads
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
+from scenefuse.workspace import View, read_views
+
+# The posed photos of a model that the truth knows, by name, each with the place of its true camera.
+Posed = list[tuple[View, int]]
+# A sampled point counts as hidden when a surface lies farther than this before it, metres.
+HIDDEN = 0.02
 
 
 @dataclass(frozen=True)
@@ -29,27 +35,6 @@ class Mesh:
     def caster(self) -> o3d.t.geometry.RaycastingScene:
         """Open3D's ray caster with this mesh alone."""
         return cast_together([self])
-
-
-@dataclass(frozen=True)
-class PosedModel:
-    """The posed photos of a COLMAP model that the truth knows.
-
-    Attributes:
-        names: N file names.
-        centres: (N, 3) in the model's frame.
-        cam_from_model: (N, 3, 3) rotations.
-        intrinsics: (N, 3, 3) pixels.
-        sizes: (N, 2) width and height in pixels.
-        true: (N,) index of each photo among the true cameras.
-    """
-
-    names: list[str]
-    centres: Array
-    cam_from_model: Array
-    intrinsics: Array
-    sizes: NDArray[np.int64]
-    true: NDArray[np.int64]
 
 
 @dataclass(frozen=True)
@@ -101,48 +86,47 @@ def sample_surface(mesh: Mesh, count: int, seed: int) -> Array:
     return (1 - u) * a[chosen] + u * (1 - v) * b[chosen] + u * v * c[chosen]
 
 
-def read_posed(model: Path, truth: Cameras) -> PosedModel:
+def read_posed(model: Path, truth: Cameras) -> Posed:
     """The posed photos of a COLMAP model whose names the truth knows; StageError when fewer than three are."""
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except Exception as error:
-        raise StageError(f"{model} is not a readable COLMAP model ({error}); rerun the stage that writes it") from None
     place = {Path(name).stem: k for k, name in enumerate(truth.names)}
-    images = [i for i in reconstruction.images.values() if i.has_pose and Path(i.name).stem in place]
-    images.sort(key=lambda i: i.name)
-    if len(images) < 3:
+    posed = [(view, place[Path(view.name).stem]) for view in read_views(model) if Path(view.name).stem in place]
+    if len(posed) < 3:
         raise StageError(
-            f"only {len(images)} posed photos of {model} are known to the truth, three are needed; "
+            f"only {len(posed)} posed photos of {model} are known to the truth, three are needed; "
             "give the truth of the capture that the model was made from"
         )
-    cameras = [reconstruction.cameras[i.camera_id] for i in images]
-    return PosedModel(
-        [i.name for i in images],
-        np.array([i.projection_center() for i in images]),
-        np.array([i.cam_from_world().rotation.matrix() for i in images]),
-        np.array([c.calibration_matrix() for c in cameras]),
-        np.array([(c.width, c.height) for c in cameras]),
-        np.array([place[Path(i.name).stem] for i in images]),
-    )
+    return posed
 
 
-def fit_cameras(posed: PosedModel, truth: Cameras) -> CameraFit:
+def fit_cameras(posed: Posed, truth: Cameras) -> CameraFit:
     """Fit the similarity from the model to the truth by camera centres, and measure what is left.
 
     The fit starts from the triple of cameras with the least median error (Rousseeuw 1984); cameras farther off than
     four times the median are left out of it, not of the errors.
     """
-    target = truth.centres[posed.true]
+    centres, true = np.array([view.centre for view, _ in posed]), [k for _, k in posed]
+    target = truth.centres[true]
     rng = np.random.default_rng(0)
     triples = [rng.choice(len(target), 3, replace=False) for _ in range(300)]
-    error = min((_errors(posed.centres, target, triple) for triple in triples), key=lambda e: float(np.median(e)))
+    error = min((_errors(centres, target, triple) for triple in triples), key=lambda e: float(np.median(e)))
     for _ in range(4):
         within = error <= max(4.0 * float(np.median(error)), 1e-9)
-        fitted = fit_sim3(posed.centres[within], target[within])
-        error = np.linalg.norm(fitted.apply(posed.centres) - target, axis=1)
-    turned = posed.cam_from_model @ fitted.rotation.T
-    angles = [rotation_angle_deg(a @ b.T) for a, b in zip(turned, truth.cam_from_world[posed.true])]
+        fitted = fit_sim3(centres[within], target[within])
+        error = np.linalg.norm(fitted.apply(centres) - target, axis=1)
+    turned = [view.cam_from_world[:3, :3] @ fitted.rotation.T for view, _ in posed]
+    angles = [rotation_angle_deg(a @ b.T) for a, b in zip(turned, truth.cam_from_world[true])]
     return CameraFit(fitted, error, np.array(angles))
+
+
+def camera_results(fit: CameraFit, total: int) -> dict[str, Any]:
+    """Errors of the cameras left after the fit, and the share of a capture's photos that have one."""
+    return {
+        "registered_share": quantity(len(fit.position) / total, "1"),
+        "camera_position_median": quantity(float(np.median(fit.position)), "m"),
+        "camera_position_max": quantity(float(fit.position.max()), "m"),
+        "camera_rotation_median_deg": quantity(float(np.median(fit.rotation_deg)), "deg"),
+        "camera_rotation_max_deg": quantity(float(fit.rotation_deg.max()), "deg"),
+    }
 
 
 def _errors(centres: Array, target: Array, chosen: NDArray[np.int64]) -> Array:
@@ -160,7 +144,7 @@ def mask_iou(mask: NDArray[np.bool_], true_mask: NDArray[np.bool_]) -> float:
 
 
 def true_depth(
-    scene: o3d.t.geometry.RaycastingScene, posed: PosedModel, photo: int, truth_from_model: Sim3, size: tuple[int, int]
+    scene: o3d.t.geometry.RaycastingScene, view: View, truth_from_model: Sim3, size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
     """What a map of a photo should hold, cast from the model's own camera brought into the truth's frame.
 
@@ -170,13 +154,12 @@ def true_depth(
         (H, W) depth along z in metres, infinite for the sky, and (H, W) number of the mesh hit, -1 for none.
     """
     width, height = size
-    shrink = np.diag([width / posed.sizes[photo, 0], height / posed.sizes[photo, 1], 1.0])
     x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
     # With z = 1 in the camera, the length along the ray is the depth.
-    in_cam = pixels @ np.linalg.inv(shrink @ posed.intrinsics[photo]).T
-    directions = in_cam @ (posed.cam_from_model[photo] @ truth_from_model.rotation.T)
-    centre = np.broadcast_to(truth_from_model.apply(posed.centres[photo]), directions.shape)
+    in_cam = pixels @ np.linalg.inv(view.resized(width, height).intrinsics).T
+    directions = in_cam @ (view.cam_from_world[:3, :3] @ truth_from_model.rotation.T)
+    centre = np.broadcast_to(truth_from_model.apply(view.centre), directions.shape)
     rays = np.concatenate([centre, directions], axis=-1).astype(np.float32)
     hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=threads())
     return hits["t_hit"].numpy(), hits["geometry_ids"].numpy().view(np.int32).astype(np.int64)
@@ -207,7 +190,7 @@ def belongs_to_object(
     high: Array,
     margin: float,
 ) -> NDArray[np.bool_]:
-    """(N,) points that claim to be the object: inside its box widened by `margin`, nearer to it than to the rest.
+    """(N,) points that count as the object's: inside its box widened by `margin`, nearer to it than to the rest.
 
     The ground and clutter around the object thus count neither for nor against a cloud.
     """
@@ -230,7 +213,7 @@ def registration_error(
     """Errors of a registration; the translation's is the shift of the object's middle, over its diagonal.
 
     Args:
-        estimated: scene_from_object to judge.
+        estimated: scene_from_object.
         true: the true one.
         middle_in_object: (3,) the object's middle in its own frame.
         diagonal_in_scene: the object's diagonal in the scene's unit.
@@ -241,3 +224,10 @@ def registration_error(
         rotation_angle_deg(estimated.rotation @ true.rotation.T),
         float(np.linalg.norm(shift)) / diagonal_in_scene,
     )
+
+
+def print_results(result: dict[str, Any]) -> None:
+    """One line a number, with its unit."""
+    for name, entry in result.items():
+        if isinstance(entry.get("value"), float | int):
+            print(f"{name}: {entry['value']:.5g} {entry['unit']}", flush=True)

@@ -1,49 +1,60 @@
 """Depths moved to where the photos match best: a map says where the surface is, the photos say how exactly."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.mvs.plane_sweep import DepthSettings, Photo, refine_depth
+from scenefuse.mvs.matcher import Matcher
+from scenefuse.mvs.plane_sweep import refine_depth
 from scenefuse.mvs.views import Views
-from scenefuse.stage import setting
+from scenefuse.transforms import Array
+from scenefuse.workspace import View
 
-SOURCES, BEST_SOURCES, BEST_ANGLE_DEG = 8, 3, 15.0
+SOURCES, BEST_SOURCES = 8, 3
+"""Photos that a photo is matched with, and of these the ones that count: others may not see the place."""
+BEST_ANGLE_DEG = 15.0
+"""Between two photos: enough baseline to measure, little enough to look alike."""
 
 
 @dataclass(frozen=True)
 class RefinedDepths:
-    """Depths (V, H, W) after the photos were asked, 0 for none; which of them moved; which the photos deny."""
+    """Depths after matching.
+
+    Attributes:
+        depths: (V, H, W) along z, 0 for none.
+        moved: (V, H, W), True for depths that moved.
+        inconsistent: (V, H, W), True for depths that are not photo-consistent.
+    """
 
     depths: NDArray[np.float32]
     moved: NDArray[np.bool_]
-    denied: NDArray[np.bool_]
+    inconsistent: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
 class RefinementSettings:
     """How depths are moved to where photos match."""
 
-    match_reach_px: float = setting(8, unit="px", least=0)
-    """how far a depth may move, in the other photos, to where they match best; 0 leaves depths as they are"""
-    match_window_px: int = setting(5, unit="px", least=3)
-    """side of the matching window, odd"""
-    match_min_score: float = setting(0.6, least=-1, most=1)
-    """least mean correlation of the best matches; below it photos deny a depth where there is texture"""
+    match_reach_px: float = 8
+    """How far a depth may move to where the photos match best, in their pixels; 0 leaves depths as they are."""
+    match_window_px: int = 5
+    """Side of the matching window in pixels, odd."""
+    match_min_score: float = 0.6
+    """Smallest mean NCC of the best matches, -1..1; below it a depth is not photo-consistent where there is texture."""
 
 
 def refine_by_photos(
-    views: Views, poses: NDArray[np.float64], depths: NDArray[np.float32], settings: RefinementSettings
+    views: Views, poses: Array, depths: NDArray[np.float32], settings: RefinementSettings
 ) -> RefinedDepths:
     """Depth maps (V, H, W) with every pixel moved along its ray to the best match.
 
     Windows of a photo are matched with those of the eight photos that see the object from about 15 degrees aside; the
     best three count (`scenefuse.mvs.plane_sweep`). A pixel whose match is poor, hardly better than where it was, or
     farther off than the reach, keeps its depth. Where there is texture that matches neither there nor nearby in
-    photos that have the place in view, the photos deny the depth.
+    photos that have the place in view, the depth is not photo-consistent.
 
     Args:
         views: photos and intrinsics at the maps' size.
@@ -56,8 +67,7 @@ def refine_by_photos(
         return result
     device = "cuda" if torch.cuda.is_available() else "cpu"
     window = settings.match_window_px
-    limits = DepthSettings(0, SOURCES, BEST_SOURCES, 0, 1, window, 0.0, settings.match_min_score, 0.0, False)
-    photos = [_photo(views, poses, index) for index in range(len(depths))]
+    photos = [_gray(views.view(index), poses[index]) for index in range(len(depths))]
     sources = _sources(poses, depths, views.intrinsics)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
@@ -65,24 +75,29 @@ def refine_by_photos(
             continue
         pad = 2 * window
         top, left = max(rows.min() - pad, 0), max(columns.min() - pad, 0)
-        part = np.s_[top : rows.max() + pad + 1, left : columns.max() + pad + 1]
-        whole = photos[index]
-        cut = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]]) @ whole.intrinsics
-        reference = Photo(np.ascontiguousarray(whole.gray[part]), cut, whole.cam_from_world)
+        bottom, right = rows.max() + pad + 1, columns.max() + pad + 1
+        part = np.s_[top:bottom, left:right]
         near = [photos[s] for s in sources[index]]
-        found = refine_depth(reference, near, depth[part], settings.match_reach_px, limits, device)
-        result.depths[index][part], result.moved[index][part], result.denied[index][part] = found
+        matcher = Matcher(_cut(photos[index], top, left, bottom, right), near, BEST_SOURCES, window, device)
+        found = refine_depth(matcher, depth[part], settings.match_reach_px, settings.match_min_score)
+        result.depths[index][part], result.moved[index][part], result.inconsistent[index][part] = found
     return result
 
 
-def _photo(views: Views, poses: NDArray[np.float64], index: int) -> Photo:
-    gray = cv2.cvtColor(views.images[index], cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
-    return Photo(gray, views.intrinsics[index], np.linalg.inv(poses[index])[:3])
+def _gray(view: View, pose: Array) -> View:
+    """A view with grey pixels, (H, W) float32 in 0..1, at a pose (4, 4) world_from_cam."""
+    gray = cv2.cvtColor(view.pixels, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
+    return replace(view, pixels=gray, cam_from_world=np.asarray(np.linalg.inv(pose)))
 
 
-def _sources(
-    poses: NDArray[np.float64], depths: NDArray[np.float32], intrinsics: NDArray[np.float64]
-) -> NDArray[np.int64]:
+def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
+    """The part of a view from one pixel to another."""
+    pixels = np.ascontiguousarray(view.pixels[top:bottom, left:right])
+    intrinsics = np.array([[1, 0, -left], [0, 1, -top], [0, 0, 1.0]]) @ view.intrinsics
+    return replace(view, pixels=pixels, intrinsics=intrinsics, width=pixels.shape[1], height=pixels.shape[0])
+
+
+def _sources(poses: Array, depths: NDArray[np.float32], intrinsics: Array) -> NDArray[np.int64]:
     """(V, S) the photos that look at the middle of what all see from about 15 degrees beside each photo."""
     centres, middles = poses[:, :3, 3], []
     for depth, k, pose in zip(depths, intrinsics, poses):

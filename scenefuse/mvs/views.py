@@ -1,15 +1,16 @@
 """The posed, masked photos of one object as arrays: what all four training stages work on."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
-import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
+from scenefuse.io.pictures import read_gray
 from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, read_workspace
 
 
 @dataclass(frozen=True)
@@ -30,16 +31,22 @@ class Views:
     names: list[str]
     images: NDArray[np.uint8]
     mattes: NDArray[np.uint8]
-    intrinsics: NDArray[np.float64]
-    object_from_cam: NDArray[np.float64]
+    intrinsics: Array
+    object_from_cam: Array
     held_out: NDArray[np.bool_]
-    sparse: NDArray[np.float64]
+    sparse: Array
     tracks: list[NDArray[np.int64]]
 
     @cached_property
     def masks(self) -> NDArray[np.bool_]:
         """(V, H, W), True where a pixel is mostly object."""
         return self.mattes > 127
+
+    def view(self, index: int) -> View:
+        """One photo with its camera, (H, W, 3) uint8 RGB pixels; the world is the object's SfM frame."""
+        height, width = self.mattes.shape[1:]
+        pose = np.linalg.inv(self.object_from_cam[index])
+        return View(self.names[index], self.intrinsics[index], pose, width, height, self.images[index])
 
 
 def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -> Views:
@@ -53,53 +60,52 @@ def load_views(cameras: Path, masks: Path, width_px: int, hold_out_every: int) -
             `cameras`, one name a line, says it instead.
 
     Raises:
-        StageError: no photo has a mask, or sizes differ between photos.
+        StageError: no photo has a mask, a photo or mask cannot be read, or sizes differ between photos.
     """
-    model = pycolmap.Reconstruction(cameras / "sparse")
-    images = sorted((i for i in model.images.values() if i.has_pose), key=lambda i: i.name)
-    images = [i for i in images if (masks / f"{Path(i.name).stem}.png").is_file()]
-    if not images:
+    workspace = read_workspace(cameras)
+    files = [masks / f"{Path(view.name).stem}.png" for view in workspace.views]
+    workspace = workspace.subset([k for k, file in enumerate(files) if file.is_file()])
+    files = [file for file in files if file.is_file()]
+    if not files:
         raise StageError(
             f"no photo in {cameras} has a mask in {masks}; mask files are named like their photo, with .png"
         )
-    point_ids = {point_id: index for index, point_id in enumerate(sorted(model.points3D))}
-    sparse = np.array([model.points3D[p].xyz for p in point_ids], dtype=np.float64).reshape(-1, 3)
-    pictures, mattes, intrinsics, poses, tracks = [], [], [], [], []
-    for image in images:
-        camera = model.cameras[image.camera_id]
-        scale = min(1.0, width_px / camera.width)
-        size = (round(camera.width * scale), round(camera.height * scale))
-        # COLMAP's cameras belong to the pixels as they are stored, whatever the EXIF orientation says.
-        stored = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        picture = cv2.imread(str(cameras / "images" / image.name), stored)
-        matte = cv2.imread(str(masks / f"{Path(image.name).stem}.png"), cv2.IMREAD_GRAYSCALE)
-        if picture is None or matte is None or matte.shape != picture.shape[:2]:
-            raise StageError(f"{image.name}: photo and mask cannot be read or differ in size; rerun the masks stage")
-        pictures.append(cv2.cvtColor(cv2.resize(picture, size, interpolation=cv2.INTER_AREA), cv2.COLOR_BGR2RGB))
-        mattes.append(cv2.resize(matte, size, interpolation=cv2.INTER_AREA))
-        shrink = np.diag([size[0] / camera.width, size[1] / camera.height, 1.0])
-        intrinsics.append(shrink @ camera.calibration_matrix())
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        poses.append(pose)
-        tracks.append(
-            np.array(sorted({point_ids[p.point3D_id] for p in image.get_observation_points2D()}), dtype=np.int64)
-        )
-    if len({p.shape for p in pictures}) > 1:
+    photos = [_scaled(workspace.rgb(view), width_px) for view in workspace.views]
+    mattes = [_scaled(_matte(file, view), width_px).pixels for file, view in zip(files, workspace.views)]
+    if len({(view.width, view.height) for view in photos}) > 1:
         raise StageError(f"the photos in {cameras}/images have different sizes; use photos of one camera at one size")
-    held_out = np.zeros(len(images), dtype=bool)
+    return Views(
+        [view.name for view in photos],
+        np.stack([view.pixels for view in photos]),
+        np.stack(mattes),
+        np.stack([view.intrinsics for view in photos]),
+        np.stack([view.world_from_cam for view in photos]),
+        _held_out(cameras, [view.name for view in photos], hold_out_every),
+        workspace.points,
+        [np.unique(rows) for rows in workspace.seen],
+    )
+
+
+def _scaled(view: View, width_px: int) -> View:
+    """The view at most `width_px` wide."""
+    scale = min(1.0, width_px / view.width)
+    return view.resized(round(view.width * scale), round(view.height * scale))
+
+
+def _matte(path: Path, view: View) -> View:
+    """The view with its mask's grey values, (H, W) uint8, as pixels."""
+    matte = read_gray(path)
+    if matte.shape != (view.height, view.width):
+        raise StageError(f"{path} and the photo {view.name} differ in size; rerun the masks stage")
+    return replace(view, pixels=matte)
+
+
+def _held_out(cameras: Path, names: list[str], hold_out_every: int) -> NDArray[np.bool_]:
+    """(V,) True for photos that are held out: those listed in held_out.txt, else every n-th."""
+    held_out = np.zeros(len(names), dtype=bool)
     listed = cameras / "held_out.txt"
     if listed.is_file():
-        held_out = np.isin([i.name for i in images], listed.read_text().splitlines())
+        held_out = np.isin(names, listed.read_text().splitlines())
     elif hold_out_every > 0:
         held_out[hold_out_every // 2 :: hold_out_every] = True
-    return Views(
-        [i.name for i in images],
-        np.stack(pictures),
-        np.stack(mattes),
-        np.stack(intrinsics),
-        np.stack(poses),
-        held_out,
-        sparse,
-        tracks,
-    )
+    return held_out

@@ -55,34 +55,6 @@ class Box:
 
 
 @dataclass(frozen=True)
-class Frame:
-    """One undistorted photo of the object and its camera.
-
-    Attributes:
-        name: file name.
-        image: (H, W, 3) uint8 BGR.
-        intrinsics: (3, 3), pixel centres at +0.5.
-        cam_from_object: (3, 4).
-        observed: (K, 2) pixel positions of the SfM points that it sees.
-        point_rows: (K,) their rows in the array of all SfM points.
-    """
-
-    name: str
-    image: NDArray[np.uint8]
-    intrinsics: Array
-    cam_from_object: Array
-    observed: Array
-    point_rows: NDArray[np.int64]
-
-    def project(self, points: Array) -> tuple[Array, Array]:
-        """Pixel positions (N, 2) and depths (N,) of (N, 3) points."""
-        x = points @ self.cam_from_object[:, :3].T + self.cam_from_object[:, 3]
-        depth = x[:, 2]
-        pixels = (x @ self.intrinsics.T)[:, :2] / np.where(np.abs(depth) < 1e-9, 1e-9, depth)[:, None]
-        return pixels, depth
-
-
-@dataclass(frozen=True)
 class Hull:
     """The occupied voxels of a box.
 
@@ -119,7 +91,7 @@ def count_silhouettes(points: NDArray[Any], views: Iterable[View]) -> tuple[Coun
 
 
 def carve(
-    box: Box, height_of: Callable[[Array], Array], frames: list[Frame], masks: list[Mask], voxels: int, tolerance: float
+    box: Box, height_of: Callable[[Array], Array], silhouettes: list[View], voxels: int, tolerance: float
 ) -> Hull:
     """The voxels of a box, above the ground, that all masks but a share of `tolerance` contain.
 
@@ -127,15 +99,10 @@ def carve(
         box: the space to carve from.
         height_of: heights (N,) over the ground of (N, 3) points along the box's axes; nothing below 0
             belongs to the object.
-        frames: photos; each counts for the voxels in its frame.
-        masks: (H, W) per photo.
+        silhouettes: cameras with masks as `pixels`; a photo counts for the voxels in its frame.
         voxels: number along the longest side.
         tolerance: share of the photos that show a voxel which may have it outside their mask.
     """
-    silhouettes = [
-        View(f.name, f.intrinsics, np.vstack([f.cam_from_object, [0, 0, 0, 1]]), m.shape[1], m.shape[0], m)
-        for f, m in zip(frames, masks)
-    ]
     size = (box.high - box.low).max() / voxels
     shape = np.maximum(np.ceil((box.high - box.low) / size).astype(int), 1)
     index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -157,25 +124,24 @@ def carve(
     return Hull(centres[shell.ravel()].astype(np.float64), float(size), float(grid.mean()))
 
 
-def silhouette(hull: Hull, frame: Frame) -> Mask:
+def silhouette(hull: Hull, view: View) -> Mask:
     """The hull as the photo sees it, (H, W)."""
-    height, width = frame.image.shape[:2]
-    drawn = np.zeros((height, width), dtype=np.uint8)
+    drawn = np.zeros((view.height, view.width), dtype=np.uint8)
     if len(hull.shell) == 0:
         return drawn.astype(bool)
-    pixels, depth = frame.project(hull.shell)
+    pixels, depth = view.project(hull.shell)
     front = depth > 1e-6
     u, v = np.floor(pixels[front]).astype(int).T
-    inside = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     drawn[v[inside], u[inside]] = 255
-    side = hull.voxel * frame.intrinsics[0, 0] / float(np.median(depth[front]))
+    side = hull.voxel * view.intrinsics[0, 0] / float(np.median(depth[front]))
     # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
     reach = 2 * int(np.ceil(0.75 * side)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
     return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel, borderValue=0) > 0
 
 
-def agreement(a: Mask, b: Mask) -> float:
+def mask_iou(a: Mask, b: Mask) -> float:
     """Intersection over union of two masks; 0 when both are empty."""
     union = np.count_nonzero(a | b)
     return np.count_nonzero(a & b) / union if union else 0.0

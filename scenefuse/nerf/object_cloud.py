@@ -107,7 +107,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     maps = _read_maps(inputs.stage, views, settings.gates.min_confidence)
     poses, rendered = saved["object_from_cam"].numpy(), max(int((maps.depths > 0).sum()), 1)
     refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
-    maps = replace(maps, depths=np.where(refined.denied, 0, refined.depths))
+    maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
     raw, diagonal = fuse_depths(views, poses, maps, settings)
     if len(raw) < LEAST_POINTS:
         raise StageError(
@@ -118,7 +118,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     gates = settings.gates
     cleaned = clean(thinned, gates.outlier_deviations, gates.min_component, settings.spacing * diagonal)
     cleaned = with_plane_normals(cleaned)
-    shares = float(refined.moved.sum() / rendered), float(refined.denied.sum() / rendered)
+    shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)
     write_cloud(cloud, cleaned)
     write_json(report, _report(raw, thinned, cleaned, shares, seed) | known)
     print(f"{len(cleaned)} points on a diagonal of {cleaned.diagonal:.4g}", flush=True)

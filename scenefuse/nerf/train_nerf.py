@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.io.settings import build, read_settings
+from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import MapSettings
@@ -40,6 +41,8 @@ class TrainingOptions:
     """Of the rendered maps."""
     gates: CloudGates = CloudGates()
     """Which points of the cloud are kept."""
+    refinement: RefinementSettings = RefinementSettings()
+    """Of the rendered depths by photos."""
 
 
 AS_SHIPPED = TrainingOptions()
@@ -81,7 +84,7 @@ def train_nerf(
         data=data,
         images=images,
         masks=masks,
-        cameras=workspace,
+        workspace=workspace,
         mattes=mattes,
         report=photos_json,
         settings=build(UndistortSettings, wanted["undistort"]),
@@ -98,7 +101,7 @@ def train_nerf(
     )
     shutil.rmtree(out / "checkpoints", ignore_errors=True)
     save_png(out / "renders.png", render_sheet(workspace, mattes, out / "nerf"))
-    fused = replace(build(CloudSettings, wanted["cloud"] | wanted["matching"]), gates=options.gates)
+    fused = replace(build(CloudSettings, wanted["cloud"]), gates=options.gates, refinement=options.refinement)
     inputs = CloudInputs(workspace, photos_json, mattes, out / "nerf", out / "steps/nerf.json")
     refused = _make_cloud(inputs, out, fused, seed)
     report = _report(out, {"nerf": asdict(chosen), "cloud": asdict(fused)}, refused, seed)
@@ -117,7 +120,7 @@ def _clear(out: Path) -> None:
 
 def _nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int, exact: bool) -> NerfSettings:
     """Settings and options together; where masks are exact, no band around their edges is left out."""
-    built = build(NerfSettings, wanted["nerf"] | wanted["matching"] | {"epochs": epochs})
+    built = build(NerfSettings, wanted["nerf"] | {"epochs": epochs})
     recipe = replace(options.recipe, mask_band_px=0) if exact else options.recipe
     return replace(built, recipe=recipe, losses=options.losses, maps=options.maps)
 

@@ -1,8 +1,8 @@
-"""All poses, all points and the focal length together: what is left of the chain's drift is taken out here.
+"""Bundle adjustment: all poses, all points and the focal length together, which removes the drift that is left.
 
-Matches are linked into tracks over many photos, so that an orbit's last photos meet its first ones. Least squares of
-the reprojection errors by Levenberg and Marquardt, points eliminated first (Schur complement; Triggs et al. 1999);
-errors count by a Cauchy weight, and what stays far off is dropped.
+Matches are linked into tracks over many photos, so that the last photos of an orbit share points with the first.
+Least squares of the reprojection errors by Levenberg and Marquardt, points eliminated first (Schur complement; Triggs
+et al. 1999); errors have a Cauchy weight, and observations that stay far off are dropped.
 """
 
 from dataclasses import dataclass
@@ -13,14 +13,21 @@ from scipy.sparse import bsr_matrix, coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
-from scenefuse.poses.correspondences import Features, Pair
+from scenefuse.poses.correspondences import PhotoFeatures, TwoViewPair
 
 Array = NDArray[np.float64]
 
+# Reprojection error at which an observation loses half its weight.
 ROBUST_PX = 1.0
+# After each adjustment, observations with larger errors are dropped, though none below three times the median.
 DROP_PX = (8.0, 4.0, 2.5)
 STEPS = 15
-MIN_ANGLE_DEG = 1.5
+# Points whose rays spread less have no depth to adjust.
+MIN_SPREAD_DEG = 1.5
+# Raised damping tried before a step is given up; least relative gain that is worth another step.
+MAX_TRIES, MIN_GAIN = 8, 1e-6
+# Keeps blocks invertible, and depths off zero.
+EPSILON = 1e-9
 # Standard deviation of a focal length that was not measured, as its logarithm.
 FOCAL_SPREAD = 0.1
 
@@ -53,25 +60,25 @@ class Tracks:
 
 
 @dataclass(frozen=True)
-class Refined:
-    """What the refinement found.
+class AdjustedBundle:
+    """Poses and points after bundle adjustment.
 
     Attributes:
-        object_from_cam: (V, 4, 4).
+        graph_from_cam: (V, 4, 4).
         points: (P, 3).
         tracks: the observations that agree.
         focal_scale: the photos' focal length over the one that was given.
         error_px: root mean square reprojection error.
     """
 
-    object_from_cam: Array
+    graph_from_cam: Array
     points: Array
     tracks: Tracks
     focal_scale: float
     error_px: float
 
 
-def link(features: list[Features], pairs: list[Pair]) -> Tracks:
+def link_tracks(features: list[PhotoFeatures], pairs: list[TwoViewPair]) -> Tracks:
     """Tracks of all matches; a track that has two features of one photo is wrong somewhere and is left out."""
     start = np.cumsum([0, *(len(f.pixels) for f in features)])
     nodes = [(start[p.first] + p.rows[:, 0], start[p.second] + p.rows[:, 1]) for p in pairs]
@@ -100,13 +107,13 @@ def triangulate(poses: Array, tracks: Tracks) -> Array:
     normal, right = np.zeros((count, 3, 3)), np.zeros((count, 3))
     np.add.at(normal, tracks.point, away)
     np.add.at(right, tracks.point, np.einsum("nij,nj->ni", away, poses[tracks.photo, :3, 3]))
-    return np.asarray(np.linalg.solve(normal + 1e-9 * np.eye(3), right[:, :, None])[:, :, 0], np.float64)
+    return np.asarray(np.linalg.solve(normal + EPSILON * np.eye(3), right[:, :, None])[:, :, 0], np.float64)
 
 
-def refine(poses: Array, tracks: Tracks, refine_focal: bool) -> Refined:
-    """Refine (V, 4, 4) poses object_from_cam, the tracks' points, and one focal length for all photos if asked to."""
+def adjust_bundle(poses: Array, tracks: Tracks, refine_focal: bool) -> AdjustedBundle:
+    """Adjust (V, 4, 4) poses graph_from_cam, the tracks' points and, with `refine_focal`, one focal length for all."""
     points, focal = triangulate(poses, tracks), 0.0
-    wide = _widest_angle_deg(poses, tracks, len(points))[tracks.point] > MIN_ANGLE_DEG
+    wide = _widest_angle_deg(poses, tracks, len(points))[tracks.point] > MIN_SPREAD_DEG
     tracks, points = tracks.keep(wide & (_depths(poses, points, tracks) > 0), points)
     for limit in DROP_PX:
         poses, points, focal = _minimise(poses, points, focal, tracks, refine_focal)
@@ -115,7 +122,7 @@ def refine(poses: Array, tracks: Tracks, refine_focal: bool) -> Refined:
         tracks, points = tracks.keep(good, points)
     poses, points, focal = _minimise(poses, points, focal, tracks, refine_focal)
     error = _errors(poses, points, focal, tracks)
-    return Refined(poses, points, tracks, float(np.exp(focal)), float(np.sqrt((error**2).sum(1).mean())))
+    return AdjustedBundle(poses, points, tracks, float(np.exp(focal)), float(np.sqrt((error**2).sum(1).mean())))
 
 
 def _minimise(
@@ -136,12 +143,12 @@ def _minimise(
         np.add.at(blocks, tracks.point, flat.swapaxes(1, 2) @ flat)
         right_points = of_points.T @ error
         mixed = of_poses.T @ of_points
-        for _ in range(8):
+        for _ in range(MAX_TRIES):
             diagonal = np.einsum("pii->pi", blocks)
-            inverse = np.linalg.inv(blocks + (damping * diagonal + 1e-9)[:, :, None] * np.eye(3))
+            inverse = np.linalg.inv(blocks + (damping * diagonal + EPSILON)[:, :, None] * np.eye(3))
             number = np.arange(len(points) + 1)
             inverse = bsr_matrix((inverse, number[:-1], number), shape=(3 * len(points),) * 2)
-            reduced = normal + np.diag(damping * normal.diagonal() + 1e-9) - (mixed @ inverse @ mixed.T).toarray()
+            reduced = normal + np.diag(damping * normal.diagonal() + EPSILON) - (mixed @ inverse @ mixed.T).toarray()
             step = -np.linalg.lstsq(reduced, right - mixed @ (inverse @ right_points), rcond=None)[0]
             step_points = -(inverse @ (right_points + mixed.T @ step))
             turned = _moved(poses, step)
@@ -154,8 +161,8 @@ def _minimise(
         else:
             break
         gain = 1.0 - new_cost / cost
-        poses, points, focal, cost, damping = turned, placed, zoomed, new_cost, max(damping / 10.0, 1e-9)
-        if gain < 1e-6:
+        poses, points, focal, cost, damping = turned, placed, zoomed, new_cost, max(damping / 10.0, EPSILON)
+        if gain < MIN_GAIN:
             break
     return poses, points, focal
 
@@ -164,7 +171,7 @@ def _linearise(poses: Array, points: Array, focal: float, tracks: Tracks) -> tup
     """Weighted Jacobians by poses (6 each, and the focal length's logarithm last) and points, and weighted errors."""
     count, in_cam = len(tracks.photo), _in_cam(poses, points, tracks)
     x, y, z = in_cam.T
-    z = np.where(np.abs(z) < 1e-9, 1e-9, z)
+    z = np.where(np.abs(z) < EPSILON, EPSILON, z)
     zero, scale = np.zeros(count), tracks.focal_px * np.exp(focal)
     rows_of_projection = [np.stack([1 / z, zero, -x / z**2], 1), np.stack([zero, 1 / z, -y / z**2], 1)]
     project = scale[:, None, None] * np.stack(rows_of_projection, 1)
@@ -202,7 +209,7 @@ def _moved(poses: Array, step: Array) -> Array:
 def _errors(poses: Array, points: Array, focal: float, tracks: Tracks) -> Array:
     """(N, 2) reprojection errors in pixels; a longer focal length sees each feature's ray nearer to the axis."""
     in_cam = _in_cam(poses, points, tracks)
-    z = np.where(np.abs(in_cam[:, 2]) < 1e-9, 1e-9, in_cam[:, 2])
+    z = np.where(np.abs(in_cam[:, 2]) < EPSILON, EPSILON, in_cam[:, 2])
     return tracks.focal_px[:, None] * (np.exp(focal) * in_cam[:, :2] / z[:, None] - tracks.rays)
 
 

@@ -15,9 +15,18 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+# SIFT's least contrast: half of OpenCV's shipped value, for surfaces with little texture.
+CONTRAST = 0.02
+# A match's distance over that of the next best feature (Lowe 2004).
+MAX_RATIO = 0.8
+# Largest distance of a match from its epipolar line.
+MAX_EPIPOLAR_PX = 1.0
+# Two rays that meet under a smaller angle give no depth.
+MIN_ANGLE_DEG = 1.5
+
 
 @dataclass(frozen=True)
-class Features:
+class PhotoFeatures:
     """SIFT features of one photo.
 
     Attributes:
@@ -34,7 +43,7 @@ class Features:
 
 
 @dataclass(frozen=True)
-class Pair:
+class TwoViewPair:
     """Two photos that share M points.
 
     Attributes:
@@ -54,36 +63,35 @@ class Pair:
     depths: Array
 
 
-def find_features(image: NDArray[np.uint8], intrinsics: Array, count: int) -> Features:
+def find_features(image: NDArray[np.uint8], intrinsics: Array, count: int) -> PhotoFeatures:
     """The `count` strongest SIFT features of an (H, W, 3) RGB photo."""
-    sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=0.02)
+    sift = cv2.SIFT.create(nfeatures=count, contrastThreshold=CONTRAST)
     found, descriptors = sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None)
+    focal_px = float(intrinsics[0, 0])
     if not found:
-        return Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128), np.float32), float(intrinsics[0, 0]))
+        return PhotoFeatures(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 128), np.float32), focal_px)
     pixels = np.array([feature.pt for feature in found]) + 0.5
     rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(intrinsics).T
     root = np.sqrt(descriptors / np.maximum(descriptors.sum(1, keepdims=True), 1e-9))
-    return Features(pixels, rays[:, :2] / rays[:, 2:], root.astype(np.float32), float(intrinsics[0, 0]))
+    return PhotoFeatures(pixels, rays[:, :2] / rays[:, 2:], root.astype(np.float32), focal_px)
 
 
 def find_pairs(
-    features: list[Features], max_ratio: float, tolerance_px: float, min_matches: int, min_angle_deg: float
-) -> Iterator[Pair]:
+    features: list[PhotoFeatures], min_matches: int, max_epipolar_px: float = MAX_EPIPOLAR_PX
+) -> Iterator[TwoViewPair]:
     """All pairs of photos with at least `min_matches` matches that one relative pose explains.
 
     Args:
         features: of every photo.
-        max_ratio: a match's distance over that of the next best.
-        tolerance_px: largest distance to the epipolar line.
         min_matches: fewer matches make no pair.
-        min_angle_deg: a match whose two rays meet under a smaller angle has no depth and is left out.
+        max_epipolar_px: largest distance of a match from its epipolar line.
     """
     for i, j in combinations(range(len(features)), 2):
-        rows = match(features[i].descriptors, features[j].descriptors, max_ratio)
+        rows = match(features[i].descriptors, features[j].descriptors)
         if len(rows) < min_matches:
             continue
         a, b = features[i].rays[rows[:, 0]], features[j].rays[rows[:, 1]]
-        tolerance = 2.0 * tolerance_px / (features[i].focal_px + features[j].focal_px)
+        tolerance = 2.0 * max_epipolar_px / (features[i].focal_px + features[j].focal_px)
         essential, inliers = cv2.findEssentialMat(a, b, np.eye(3), cv2.USAC_MAGSAC, 0.9999, tolerance)
         if essential is None or essential.shape != (3, 3):
             continue
@@ -94,19 +102,19 @@ def find_pairs(
         motion = cv2.recoverPose(essential, a, b, np.eye(3))
         rotation, direction = np.asarray(motion[1], np.float64), np.asarray(motion[2], np.float64)[:, 0]
         depths, angle_deg = two_view_depths(a, b, rotation, direction)
-        good = (depths > 0).all(1) & (angle_deg > min_angle_deg)
+        good = (depths > 0).all(1) & (angle_deg > MIN_ANGLE_DEG)
         if good.sum() >= min_matches:
-            yield Pair(i, j, rows[good], rotation, direction, depths[good])
+            yield TwoViewPair(i, j, rows[good], rotation, direction, depths[good])
 
 
-def match(first: NDArray[np.float32], second: NDArray[np.float32], max_ratio: float) -> NDArray[np.int64]:
+def match(first: NDArray[np.float32], second: NDArray[np.float32]) -> NDArray[np.int64]:
     """(M, 2) rows of unit descriptors that are each other's nearest, and pass the ratio test (Lowe 2004) forwards."""
     if min(len(first), len(second)) < 2:
         return np.zeros((0, 2), np.int64)
     similarity = torch.from_numpy(first) @ torch.from_numpy(second).T
     (best, next_best), (there, _) = (x.T for x in similarity.topk(2, dim=1))
     back = similarity.argmax(0)
-    squared = max_ratio**2
+    squared = MAX_RATIO**2
     good = (2 - 2 * best < squared * (2 - 2 * next_best)) & (back[there] == torch.arange(len(first)))
     rows = torch.nonzero(good)[:, 0]
     return torch.stack([rows, there[rows]], 1).numpy()

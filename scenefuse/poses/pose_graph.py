@@ -1,7 +1,8 @@
-"""From relative poses of pairs to poses of all photos: a chain along the best pairs, then closed over all pairs.
+"""From relative poses of pairs to poses of all photos: along a spanning tree of the pairs, then averaged over all.
 
-Closing is rotation averaging (Chatterjee and Govindu, ICCV 2013), then averaging of centres, both iteratively
-reweighted least squares on the graph of pairs. Centres are a linear problem because every pair knows its length.
+Rotation averaging (Chatterjee and Govindu, ICCV 2013), then averaging of centres, which spreads a loop's error over
+all its pairs: both are iteratively reweighted least squares on the graph of pairs. Centres are a linear problem
+because the length of every pair's baseline is known.
 """
 
 import numpy as np
@@ -10,23 +11,28 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial.transform import Rotation
 
-from scenefuse.poses.correspondences import Pair
+from scenefuse.poses.correspondences import TwoViewPair
 
 Array = NDArray[np.float64]
 
+# Disagreement at which a pair loses half its weight: of rotations, and of centres as a share of the baseline.
 ROTATION_SCALE_DEG = 1.0
 CENTRE_SCALE = 0.05
+# A pair agrees with the result up to this many times that.
+AGREEING = 5.0
 ROUNDS = 30
 
 
-def largest_group(count: int, pairs: list[Pair]) -> NDArray[np.int64]:
-    """Indices of the photos in the largest group that pairs join."""
+def largest_component(count: int, pairs: list[TwoViewPair]) -> NDArray[np.int64]:
+    """Indices of the photos in the largest connected component of the graph of pairs."""
     _, label = connected_components(_graph(count, pairs), directed=False)
     return np.flatnonzero(label == np.bincount(label).argmax())
 
 
-def chain(count: int, pairs: list[Pair], lengths: Array) -> Array:
-    """(V, 4, 4) poses object_from_cam along the tree of the pairs with the most matches; the first photo is the origin.
+def spanning_tree_poses(count: int, pairs: list[TwoViewPair], lengths: Array) -> Array:
+    """(V, 4, 4) poses graph_from_cam along the spanning tree of the pairs with the most matches.
+
+    The first photo is the origin of the graph's frame.
 
     Args:
         count: photos, all joined by pairs.
@@ -48,8 +54,8 @@ def chain(count: int, pairs: list[Pair], lengths: Array) -> Array:
     return poses
 
 
-def close(poses: Array, pairs: list[Pair], lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Make (V, 4, 4) poses agree with all pairs; also returns (P,) True for the pairs that agree with the result."""
+def average_poses(poses: Array, pairs: list[TwoViewPair], lengths: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Average (V, 4, 4) poses over all pairs; also returns (P,) True for the pairs that agree with the result."""
     first, second = (np.array([getattr(pair, name) for pair in pairs]) for name in ("first", "second"))
     turn = np.array([pair.rotation for pair in pairs])
     moved = lengths[:, None] * np.array([pair.direction for pair in pairs])
@@ -67,12 +73,12 @@ def close(poses: Array, pairs: list[Pair], lengths: Array) -> tuple[Array, NDArr
     for _ in range(ROUNDS):
         centres = _solve(len(poses), first, second, wanted, weights / (1.0 + (share / CENTRE_SCALE) ** 2))
         share = np.linalg.norm(centres[first] - centres[second] - wanted, axis=1) / lengths
-    closed = poses.copy()
-    closed[:, :3, :3], closed[:, :3, 3] = rotations, centres
-    return closed, (np.degrees(angle) < 5.0 * ROTATION_SCALE_DEG) & (share < 5.0 * CENTRE_SCALE)
+    averaged = poses.copy()
+    averaged[:, :3, :3], averaged[:, :3, 3] = rotations, centres
+    return averaged, (np.degrees(angle) < AGREEING * ROTATION_SCALE_DEG) & (share < AGREEING * CENTRE_SCALE)
 
 
-def _graph(count: int, pairs: list[Pair]) -> coo_matrix:
+def _graph(count: int, pairs: list[TwoViewPair]) -> coo_matrix:
     """Cost of each pair: small for many matches."""
     cost = [1.0 / len(pair.rows) for pair in pairs]
     return coo_matrix((cost, ([p.first for p in pairs], [p.second for p in pairs])), shape=(count, count))

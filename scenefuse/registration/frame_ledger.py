@@ -9,25 +9,27 @@ from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 
-def write_frame_ledger(*, object_report: Path, fine: Path, georeference: Path | None = None, frames: Path) -> None:
+def write_frame_ledger(
+    *, object_json: Path, fine_json: Path, georeference_json: Path | None = None, report: Path
+) -> None:
     """Collect the transforms between the frames of one object (docs/frames.md).
 
     Frames: `nerf` (normalised, what the field is trained in), `object` (the object's cameras), `scene`, `world`
     (easting, northing, height in the scene's CRS, where it is georeferenced).
 
     Args:
-        object_report: JSON of the object cloud, with `nerf_from_object`.
-        fine: JSON of the fine registration, with `scene_from_object`.
-        georeference: JSON of the scene, with `crs_from_scene` where it is known.
-        frames: output JSON; a transform that is not known is null.
+        object_json: JSON of the object cloud, with `nerf_from_object`.
+        fine_json: JSON of the fine registration, with `scene_from_object`.
+        georeference_json: JSON of the scene, with `crs_from_scene` where it is known.
+        report: output JSON; a transform that is not known is null.
 
     Raises:
         StageError: a stored matrix is no similarity.
     """
     known: dict[str, Sim3 | None] = {
-        "nerf_from_object": _read(object_report, "nerf_from_object"),
-        "scene_from_object": _read(fine, "scene_from_object"),
-        "world_from_scene": _read(georeference, "crs_from_scene"),
+        "nerf_from_object": _read(object_json, "nerf_from_object"),
+        "scene_from_object": _read(fine_json, "scene_from_object"),
+        "world_from_scene": _read(georeference_json, "crs_from_scene"),
     }
     scene, world, nerf = (known[n] for n in ("scene_from_object", "world_from_scene", "nerf_from_object"))
     known["world_from_object"] = world @ scene if world and scene else None
@@ -36,8 +38,8 @@ def write_frame_ledger(*, object_report: Path, fine: Path, georeference: Path | 
     for name, transform in known.items():
         content[name] = quantity(None if transform is None else transform.matrix, "")
         content[f"{name}_inverse_error"] = quantity(None if transform is None else round_trip(transform), "1")
-    content["status"] = quantity(value(read_json(fine), "status"), "")
-    write_json(frames, content)
+    content["status"] = quantity(value(read_json(fine_json), "status"), "")
+    write_json(report, content)
 
 
 def round_trip(transform: Sim3) -> float:

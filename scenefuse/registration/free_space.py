@@ -1,90 +1,62 @@
-"""Free space: what the scene's cameras saw through cannot be where the object is."""
+"""Free space: where the scene's depth maps measured surfaces behind a place, nothing stands there."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pycolmap
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
 from scenefuse.io.maps import read_depth
 from scenefuse.transforms import Array
+from scenefuse.workspace import View, posed_images, read_model, view_of
 
-
-@dataclass(frozen=True)
-class DepthView:
-    """What one photo of the scene measured.
-
-    Attributes:
-        depth: (H, W) float32 along the camera's z axis, scene units; 0 where nothing was measured.
-        intrinsics: (3, 3) pixels, pixel centres at +0.5.
-        rotation: (3, 3) cam_from_scene.
-        translation: (3,) cam_from_scene.
-    """
-
-    depth: NDArray[np.float32]
-    intrinsics: Array
-    rotation: Array
-    translation: Array
-
-    @property
-    def centre(self) -> Array:
-        """The camera's centre (3,) in the scene."""
-        return -self.rotation.T @ self.translation
-
-    def look_at(self, points: Array) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-        """Indices (K,) of the points (N, 3) that it shows, their pixels (K, 2; column, row) and depths (K,)."""
-        local = points @ self.rotation.T + self.translation
-        depth = local[:, 2]
-        index = np.flatnonzero(depth > 0)
-        pixel = local[index] @ self.intrinsics.T
-        pixel = np.floor(pixel[:, :2] / pixel[:, 2:])
-        height, width = self.depth.shape
-        inside = ((pixel >= 0) & (pixel < [width, height])).all(1)
-        index = index[inside]
-        return index, pixel[inside].astype(np.int64), depth[index]
-
-    def cautious(self) -> "DepthView":
-        """The nearest depth of the pixels around each, nothing where one of them has none: edges prove nothing."""
-        return DepthView(minimum_filter(self.depth, 3), self.intrinsics, self.rotation, self.translation)
+# Below this share of points with a measurement on their rays, depth maps tell nothing of an object.
+MIN_MEASURED = 0.1
 
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The scene's depth maps around an object, and how far beyond a point a measurement must lie to prove it absent.
+    """The scene's depth maps around an object.
 
     Attributes:
-        views: made cautious.
-        tolerance: scene units.
+        views: `pixels` are depths along the camera's z axis (H, W; float32, scene units), 0 where nothing was measured,
+            without their edges (`without_edges`).
+        tolerance: how far beyond a point a measurement must lie for the point to be in free space, scene units.
     """
 
-    views: list[DepthView]
+    views: list[View]
     tolerance: float
 
-    def blocked_share(self, points: Array) -> float | None:
-        """Share of the points (N, 3; scene frame) that stand where the cameras saw through.
+    def violation(self, points: Array) -> float | None:
+        """Share of the points (N, 3; scene frame) that lie in free space.
 
-        A point counts where any camera has a measurement on its ray. It is blocked when, of those cameras, at least
-        half measured a depth more than `tolerance` beyond it: light came through where it stands.
+        A point counts where any camera has a measurement on its ray. It lies in free space when, of those cameras, at
+        least half measured a depth more than `tolerance` beyond it.
 
         Returns:
             The share, or None when fewer than a tenth of the points have any measurement on their rays.
         """
-        judged, through = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
+        measured, beyond = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
         for view in self.views:
-            index, pixels, depth = view.look_at(points)
-            measured = view.depth[pixels[:, 1], pixels[:, 0]]
-            known = measured > 0
-            judged[index[known]] += 1
-            through[index[known]] += (measured > depth + self.tolerance)[known]
-        met = judged > 0
-        if met.mean() < 0.1:
+            rows, pixels, depth = view.visible(points)
+            found = view.pixels[pixels[:, 1], pixels[:, 0]]
+            known = found > 0
+            measured[rows[known]] += 1
+            beyond[rows[known]] += (found > depth + self.tolerance)[known]
+        seen = measured > 0
+        if seen.mean() < MIN_MEASURED:
             return None
-        return float((through[met] >= 0.5 * judged[met]).mean())
+        return float((beyond[seen] >= 0.5 * measured[seen]).mean())
 
 
-def read_free_space(workspace: Path, depth: list[Path], points: Array, most: int, tolerance: float) -> FreeSpace | None:
+def without_edges(view: View) -> View:
+    """The nearest depth of the pixels around each, nothing where one of them has none: depths at edges are unsure."""
+    return replace(view, pixels=minimum_filter(view.pixels, 3))
+
+
+def read_free_space(
+    workspace: Path, depth: tuple[Path, ...], points: Array, most: int, tolerance: float
+) -> FreeSpace | None:
     """The depth maps of the photos that see a place from the most different sides.
 
     Args:
@@ -97,31 +69,33 @@ def read_free_space(workspace: Path, depth: list[Path], points: Array, most: int
     Returns:
         None when no photo with a depth map sees half of the points.
     """
-    model = pycolmap.Reconstruction(workspace / "sparse")
-    centre = points.mean(0)
+    model = read_model(workspace / "sparse")
     sample = points[:: max(1, len(points) // 500)]
-    seeing: list[tuple[Path, DepthView]] = []
-    for image in sorted(model.images.values(), key=lambda i: i.name):
+    seeing: list[tuple[Path, View]] = []
+    for image in posed_images(model):
         path = next((p for d in depth if (p := d / "depth_maps" / f"{image.name}.bin").is_file()), None)
-        if path is None or not image.has_pose:
+        if path is None:
             continue
-        camera, pose = image.camera, image.cam_from_world()
-        empty = np.zeros((camera.height, camera.width), dtype=np.float32)
-        view = DepthView(empty, camera.calibration_matrix(), pose.rotation.matrix(), np.array(pose.translation))
-        if len(view.look_at(sample)[0]) >= 0.5 * len(sample):
+        view = view_of(model, image)
+        if len(view.visible(sample)[0]) >= 0.5 * len(sample):
             seeing.append((path, view))
     if not seeing:
         return None
-    directions = np.array([v.centre - centre for _, v in seeing])
+    views = []
+    for path, view in (seeing[k] for k in _most_different([v for _, v in seeing], points.mean(0), most)):
+        measured = read_depth(path)
+        sized = view.resized(measured.shape[1], measured.shape[0])
+        views.append(without_edges(replace(sized, pixels=measured)))
+    return FreeSpace(views, tolerance)
+
+
+def _most_different(views: list[View], place: Array, most: int) -> list[int]:
+    """Rows of at most `most` views, each next one as far as possible in direction from those before; sorted."""
+    directions = np.array([v.centre - place for v in views])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     chosen = [0]
     nearest = directions @ directions[0]
-    while len(chosen) < min(most, len(seeing)):
+    while len(chosen) < min(most, len(views)):
         chosen.append(int(nearest.argmin()))
         nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
-    views = []
-    for path, view in (seeing[k] for k in sorted(chosen)):
-        measured = read_depth(path)
-        shrink = np.diag([measured.shape[1] / view.depth.shape[1], measured.shape[0] / view.depth.shape[0], 1.0])
-        views.append(DepthView(measured, shrink @ view.intrinsics, view.rotation, view.translation).cautious())
-    return FreeSpace(views, tolerance)
+    return sorted(chosen)

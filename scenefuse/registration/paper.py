@@ -1,56 +1,132 @@
-"""The paper's registration to the letter, as method R5 to R8 read it: rigid FPFH RANSAC, then point-to-point ICP."""
+"""The paper's registration to the letter, as method R1 and R5 to R8 read it; a control that has no gate.
+
+RMS-ratio scale, rigid RANSAC on FPFH matches, then point-to-point ICP, all by Open3D.
+"""
 
 import ctypes
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from scenefuse.io.clouds import Cloud
-from scenefuse.transforms import Sim3
+from scenefuse.registration.coarse import MOST_POINTS as COARSE_POINTS
+from scenefuse.registration.coarse import coarse_quantities
+from scenefuse.registration.fine import ledger_row, pose_quantities
+from scenefuse.registration.icp import ScaleRange
+from scenefuse.registration.picture import draw_alignment
+from scenefuse.registration.problem import Evidence, Inputs, Problem
+from scenefuse.registration.refinement import MOST_POINTS
+from scenefuse.registration.scale import estimates, scale_quantities
+from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, score
+from scenefuse.registration.uncertainty import uncertainty_quantities
+from scenefuse.registration.verify import FineSettings, tilt_deg
+from scenefuse.stage import quantity, write_json
+from scenefuse.transforms import Array, Sim3
+
+# Paper, section 3.3: the voxel as a share of the scene crop's diagonal.
+VOXEL_FRACTION = 0.04
+# Neighbourhoods, in voxels, and their most points: normals, features.
+NORMAL_RADIUS, NORMAL_NEIGHBOURS = 2, 30
+FEATURE_RADIUS, FEATURE_NEIGHBOURS = 5, 100
+# RANSAC: triples, the least ratio of matched edges' lengths, the inlier distance in voxels, samples, confidence.
+RANSAC_POINTS, EDGE_LENGTH, RANSAC_DISTANCE = 3, 0.9, 1.5
+RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
+# ICP: the pairing distance and the spacing in voxels, iterations.
+ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
+# Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
+MUTUAL_SHARE = 0.1
 
 
-def paper_coarse(
-    cloud: Cloud, scene: Cloud, scale: float, voxel_fraction: float, samples: int, seed: int
-) -> tuple[Sim3, list[str]]:
-    """Rigid RANSAC on FPFH matches of the object at its rectified scale, and notes on what Open3D said.
-
-    Normals from 2 voxels / 30 neighbours, FPFH from 5 voxels / 100, triples, edge-length check 0.9, distance 1.5
-    voxels, mutual filter on, `samples` and a confidence of 0.999.
+def register_as_paper(
+    *, inputs: Inputs, scale_report: Path, coarse_report: Path, report: Path, picture: Path | None = None, seed: int
+) -> None:
+    """Register an object by the paper's recipe: scale, coarse and fine registration, nothing rejected.
 
     Args:
-        cloud: object in its own frame.
-        scene: the scene crop.
-        scale: scene units per object unit.
-        voxel_fraction: share of the scene crop's diagonal.
-        samples: RANSAC's largest number of iterations.
+        inputs: the two clouds and their reports.
+        scale_report: output JSON as of the scale stage.
+        coarse_report: output JSON as of the coarse stage.
+        report: output JSON as of the fine stage; its `status` is `ungated`, what has no gate is null.
+        picture: output PNG, the object on the scene crop from three sides.
         seed: of RANSAC.
+
+    Raises:
+        StageError: a cloud's points lie in one place or along one line.
+    """
+    start = time.perf_counter()
+    obj, scene = inputs.clouds()
+    ups = inputs.ups()
+    ledger = estimates(obj, scene, ups)
+    problem = Problem(obj, scene, ScaleRange(ledger[0].scale, 0.0), Evidence(ups), seed)
+    pose, notes = paper_coarse(problem)
+    coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
+    between = time.perf_counter()
+    fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, MOST_POINTS)
+    end = time.perf_counter()
+    if picture is not None:
+        draw_alignment(picture, obj, scene, fine.pose, seed)
+    write_json(scale_report, scale_quantities(ledger, problem.scales, "rms"))
+    write_json(coarse_report, coarse_quantities([coarse], False, notes, between - start))
+    write_json(report, _report(fine, problem, inputs.length_unit(), end - between))
+
+
+def _rated(problem: Problem, pose: Sim3, fraction: float, most: int) -> Hypothesis:
+    """The pose with its score on both clouds, thinned to `fraction` of the diagonal and `most` points."""
+    scale, tau = problem.scales.centre, SCORE_FRACTION * problem.scene.diagonal
+    return Hypothesis(pose, "fpfh", score(*problem.surfaces(scale, fraction, most), pose, tau, scale))
+
+
+def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> dict[str, Any]:
+    """The stage JSON, with the keys of the fine registration's."""
+    reason = "the paper's recipe has no gate"
+    print(f"ungated: {reason}", flush=True)
+    return {
+        "status": quantity("ungated", ""),
+        "reason": quantity(reason, ""),
+        **pose_quantities(best),
+        "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
+        "decided_by": quantity("geometry", ""),
+        "margin": quantity(None, "1"),
+        "free_axis": quantity(None, ""),
+        "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
+        **uncertainty_quantities(None, length),
+        "scale_ledger": quantity([ledger_row("rms", problem.scales.centre, None, "held by the paper's recipe")], ""),
+        "tau": quantity(SCORE_FRACTION * problem.scene.diagonal, length),
+        "source": quantity(best.source, ""),
+        "rival": quantity(None, ""),
+        "hypotheses": quantity([best.as_json()], ""),
+        "seconds": quantity(seconds, "s"),
+    }
+
+
+def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
+    """Rigid RANSAC on FPFH matches of the object at its rectified scale, and notes on what Open3D said.
+
+    Args:
+        problem: the clouds, and the scale at which the object is taken: the centre of the range.
     """
     import open3d as o3d
 
     registration = o3d.pipelines.registration
-    voxel = voxel_fraction * scene.diagonal
-    scaled = Sim3(scale, np.eye(3), np.zeros(3))
-
-    def features(points: np.ndarray):  # type: ignore[no-untyped-def]
-        pcd = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
-        pcd.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
-        search = o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100)
-        return pcd, registration.compute_fpfh_feature(pcd, search)  # type: ignore[call-arg]
-
-    source, source_features = features(scaled.apply(cloud.points))
-    target, target_features = features(scene.points)
+    voxel = VOXEL_FRACTION * problem.scene.diagonal
+    scaled = Sim3(problem.scales.centre, np.eye(3), np.zeros(3))
+    source, source_features = _features(scaled.apply(problem.object.points), voxel)
+    target, target_features = _features(problem.scene.points, voxel)
     matches = np.asarray(
         registration.correspondences_from_features(source_features, target_features, mutual_filter=True)
     )
     notes = []
-    if len(matches) < 0.1 * len(source.points):
+    if len(matches) < MUTUAL_SHARE * len(source.points):
         notes.append(
             f"{len(matches)} mutual matches are too few for {len(source.points)} points:"
             " Open3D falls back to one-way matches"
         )
         print(notes[-1], flush=True)
-    o3d.utility.random.seed(seed)
+    o3d.utility.random.seed(problem.seed)
     with _one_thread():
         result = registration.registration_ransac_based_on_feature_matching(
             source,
@@ -58,34 +134,44 @@ def paper_coarse(
             source_features,
             target_features,
             True,
-            1.5 * voxel,
+            RANSAC_DISTANCE * voxel,
             registration.TransformationEstimationPointToPoint(False),
-            3,
+            RANSAC_POINTS,
             [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(0.9),
-                registration.CorrespondenceCheckerBasedOnDistance(1.5 * voxel),
+                registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_LENGTH),
+                registration.CorrespondenceCheckerBasedOnDistance(RANSAC_DISTANCE * voxel),
             ],
-            registration.RANSACConvergenceCriteria(samples, 0.999),
+            registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),
         )
     return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled, notes
 
 
-def paper_fine(cloud: Cloud, scene: Cloud, start: Sim3, voxel_fraction: float) -> Sim3:
+def _features(points: Array, voxel: float) -> tuple[Any, Any]:
+    """(N, 3) points thinned to one per voxel, with normals, as an Open3D cloud; and their FPFH features."""
+    import open3d as o3d
+
+    pcd = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel)
+    pcd.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(NORMAL_RADIUS * voxel, NORMAL_NEIGHBOURS))
+    search = o3d.geometry.KDTreeSearchParamHybrid(FEATURE_RADIUS * voxel, FEATURE_NEIGHBOURS)
+    return pcd, o3d.pipelines.registration.compute_fpfh_feature(pcd, search)  # type: ignore[call-arg]
+
+
+def paper_fine(cloud: Cloud, scene: Cloud, start: Sim3) -> Sim3:
     """Point-to-point ICP, scale held, within 0.4 voxel, at most 35 iterations, both clouds at half a voxel."""
     import open3d as o3d
 
     registration = o3d.pipelines.registration
-    voxel = voxel_fraction * scene.diagonal
+    voxel = VOXEL_FRACTION * scene.diagonal
     pcd = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)) for p in (start.apply(cloud.points), scene.points)]
-    source, target = (p.voxel_down_sample(0.5 * voxel) for p in pcd)
+    source, target = (p.voxel_down_sample(ICP_SPACING * voxel) for p in pcd)
     with _one_thread():
         result = registration.registration_icp(
             source,
             target,
-            0.4 * voxel,
+            ICP_DISTANCE * voxel,
             np.eye(4),
             registration.TransformationEstimationPointToPoint(False),
-            registration.ICPConvergenceCriteria(max_iteration=35),
+            registration.ICPConvergenceCriteria(max_iteration=ICP_ITERATIONS),
         )
     return Sim3.from_matrix(np.asarray(result.transformation)) @ start
 

@@ -2,11 +2,11 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.clouds import Cloud
+from scenefuse.io.pictures import write_picture
 from scenefuse.stage import atomic_file
 from scenefuse.transforms import Array, Sim3
 
@@ -29,7 +29,7 @@ def draw_alignment(
     views = [(0, 1, 2), (0, 2, -2), (1, 2, 1)]
     rows = [np.concatenate([_splat(points, colors, view, half) for view in views], axis=1) for colors in (flat, real)]
     with atomic_file(path) as temporary:
-        cv2.imwrite(str(temporary), np.concatenate(rows)[:, :, ::-1])
+        write_picture(temporary, np.concatenate(rows))
 
 
 def _splat(points: Array, colors: NDArray[np.int64], view: tuple[int, int, int], half: float) -> NDArray[np.uint8]:

@@ -1,8 +1,7 @@
 """Registration on its own: two clouds in, a decision, a transform and a picture out; the workflow's steps in memory."""
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,20 +12,90 @@ from scenefuse.io.formats import las_crs
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop.crop_scene import CropSettings, crop_marked
-from scenefuse.registration.evidence import Evidence
-from scenefuse.registration.fine import FineSettings, Outcome, refine_hypotheses, spread_quantities
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.crop.crop_scene import MIN_POINTS, crop_marked
+from scenefuse.registration.fine import pose_quantities
+from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.picture import draw_alignment
-from scenefuse.registration.refine import ScaleRange
-from scenefuse.registration.scale import estimates, prior
-from scenefuse.registration.verify import tilt_deg
+from scenefuse.registration.problem import Evidence, Problem, check_extent
+from scenefuse.registration.refinement import Outcome, refine_hypotheses
+from scenefuse.registration.scale import ScaleSettings, estimates, prior
+from scenefuse.registration.uncertainty import uncertainty_quantities
+from scenefuse.registration.verify import FineSettings, tilt_deg
 from scenefuse.sfm.fiducials import ScenePoints, read_points
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Array, Sim3
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 MOST_POINTS = 500_000
+# Points in which too few different ones are looked for before all are counted.
+SAMPLE = 20_000
 REGISTERED, UNREGISTERED = 0, 3
+Direction = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class RegistrationSettings:
+    """Settings of all steps."""
+
+    crop: CropSettings = CropSettings()
+    scale: ScaleSettings = ScaleSettings()
+    coarse: CoarseSettings = CoarseSettings()
+    fine: FineSettings = FineSettings()
+    metrics: MetricSettings = field(default_factory=MetricSettings)
+
+    @classmethod
+    def read(cls, path: Path | None) -> tuple["RegistrationSettings", int]:
+        """The shipped settings with those of a YAML file laid over them, and the seed; StageError for a bad file."""
+        content = read_settings(path)
+        parts = content["registration"]
+        return cls(
+            build(CropSettings, parts["crop"]),
+            build(ScaleSettings, parts["scale"]),
+            build(CoarseSettings, parts["coarse"]),
+            build(FineSettings, parts["fine"]),
+            build(MetricSettings, content["metrics"]),
+        ), content["seed"]
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known beforehand of the object's place in the scene."""
+
+    up_object: Direction | None = None
+    """Direction opposite to gravity in the object's coordinates."""
+    up_scene: Direction | None = None
+    """The same in the scene's: 0 0 1 if z is up."""
+    scale: float | None = None
+    """Scene units per object unit."""
+    scale_range: tuple[float, float] | None = None
+    """Least and greatest scale."""
+    fiducials: Path | None = None
+    """File of at least four points on the object in the scene's coordinates: rows of x y z, or any cloud."""
+    crop_box: tuple[float, float, float, float, float, float] | None = None
+    """Least x y z and greatest x y z of the part of the scene to look in."""
+
+    def check(self) -> None:
+        """StageError where two of these exclude each other, or one lacks its partner."""
+        if self.fiducials is not None and self.crop_box is not None:
+            raise StageError("both --fiducials and --crop-box are given; give one")
+        if self.scale is not None and self.scale_range is not None:
+            raise StageError("both --scale and --scale-range are given; give one")
+        if self.up_object is not None and self.up_scene is None:
+            raise StageError("--up-object needs --up-scene as well; it is 0 0 1 if the scene's z is up")
+
+    def ups(self) -> tuple[Array | None, Array | None]:
+        """Unit up directions (3,) in the object's and in the scene's coordinates."""
+        return _unit("--up-object", self.up_object), _unit("--up-scene", self.up_scene)
+
+    def scales(self) -> ScaleRange | None:
+        """Bounds of the scale, or None where nothing is known of it."""
+        if self.scale is None and self.scale_range is None:
+            return None
+        low, high = self.scale_range or (self.scale, self.scale)
+        if low is None or high is None or not 0 < low <= high < np.inf:
+            raise StageError(f"a scale has to be positive, and a range's least must come first; not {low:g} {high:g}")
+        return ScaleRange(float(np.sqrt(low * high)), float(np.log(high / low) / 2))
 
 
 @dataclass(frozen=True)
@@ -55,7 +124,7 @@ class Registration:
 def register_clouds(
     obj: Cloud,
     scene: Cloud,
-    settings: Mapping[str, Any],
+    settings: RegistrationSettings,
     seed: int,
     *,
     ups: tuple[Array, Array] | None = None,
@@ -66,46 +135,50 @@ def register_clouds(
     Args:
         obj: the object, any frame and unit.
         scene: the scene's points around it (see `cut_scene`), any frame and unit; far origins lose no precision.
-        settings: all settings, as `scenefuse.io.settings.read_settings` returns them.
+        settings: of all steps.
         seed: of all random choices.
         ups: up directions in the object's and in the scene's frame; None where one of them is not known.
         scales: scene units per object unit; None to estimate them from both extents.
 
     Raises:
-        StageError: too few points, or all in one place, on either side.
+        StageError: too few different points, or all in one place or along one line, on either side.
     """
-    wanted, least = settings["registration"], settings["registration"]["crop"]["min_points"]
-    for name, cloud in (("object", obj), ("scene", scene)):
-        if len(cloud) < least or cloud.diagonal == 0:
-            raise StageError(f"the {name} has only {len(cloud)} different points; {least} or more are needed")
-    if "paper" in (wanted["coarse"]["recipe"], wanted["fine"]["recipe"]):
-        raise StageError("the paper's recipe refuses nothing and is run by the workflow only; set `recipe: default`")
+    for name, cloud in (("the object", obj), ("the scene", scene)):
+        _check_points(cloud, name)
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
     near_obj, near_scene = (
         _at_most(replace(cloud, points=cloud.points - origin), MOST_POINTS, seed)
         for cloud, origin in zip((obj, scene), origins)
     )
     if scales is None:
-        scale = wanted["scale"]
-        scales = prior(estimates(near_obj, near_scene, ups), scale["method"], scale["width_log"])
-    found = find_hypotheses(near_obj, near_scene, scales, ups, build(CoarseSettings, wanted["coarse"]), seed)
+        scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
+    problem = Problem(near_obj, near_scene, scales, Evidence(ups), seed)
+    found = find_hypotheses(problem, settings.coarse)
     if not found:
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
-    poses = [(hypothesis.pose, hypothesis.source) for hypothesis in found]
-    fine = build(FineSettings, wanted["fine"])
-    outcome = refine_hypotheses(near_obj, near_scene, poses, scales, Evidence(ups), fine, seed)
-    pose, measures = outcome.ranked[0].pose, build(MetricSettings, settings["metrics"])
-    tau = measures.tau_fraction * near_scene.diagonal
-    agreement = registration_metrics(near_obj, near_scene, pose, tau, near_scene.diagonal, "scene units", measures)
+    outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings.fine)
+    pose, diagonal = outcome.ranked[0].pose, near_scene.diagonal
+    tau = settings.metrics.tau_fraction * diagonal
+    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, "scene units", settings.metrics)
     whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
     return Registration(
         outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement
     )
 
 
+def _check_points(cloud: Cloud, name: str) -> None:
+    """StageError where a cloud has too few different points, or where they span no surface."""
+    sample = np.unique(cloud.points[:: max(1, len(cloud) // SAMPLE)], axis=0)
+    different = len(sample) if len(sample) >= MIN_POINTS else len(np.unique(cloud.points, axis=0))
+    if different < MIN_POINTS:
+        among = "" if different == len(cloud) else f" among its {len(cloud)} points"
+        raise StageError(f"{name} has only {different} different positions{among}; {MIN_POINTS} or more are needed")
+    check_extent(cloud, name)
+
+
 def cut_scene(
     scene: Cloud,
-    settings: Mapping[str, Any],
+    settings: CropSettings,
     up_in_scene: Array | None = None,
     fiducials: Path | None = None,
     box: Array | None = None,
@@ -114,7 +187,7 @@ def cut_scene(
 
     Args:
         scene: the whole scene.
-        settings: all settings.
+        settings: of the crop.
         up_in_scene: opposite to gravity; without it, no ground is removed around fiducials.
         fiducials: file of at least four points on the object in the scene's coordinates: tab-separated with the header
             `point x y z` (TSV), or any cloud file.
@@ -132,12 +205,11 @@ def cut_scene(
     if fiducials is None:
         return scene, f"the whole scene, {len(scene)} points, as if it showed little but the object"
     names, marks = _fiducials(fiducials)
-    crop = build(CropSettings, settings["registration"]["crop"])
     if up_in_scene is None:
-        crop, up_in_scene = replace(crop, remove_ground=False), np.array([0.0, 0.0, 1.0])
+        settings, up_in_scene = replace(settings, remove_ground=False), np.array([0.0, 0.0, 1.0])
     origin = np.floor(marks.mean(0))
     near = replace(scene, points=scene.points - origin)
-    cut = crop_marked(near, names, marks - origin, up_in_scene, crop, fiducials)
+    cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
     ground = "the ground removed" if cut.ground is not None else "no ground removed"
     return scene[cut.keep], f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}"
 
@@ -148,12 +220,7 @@ def register(
     scene: Path,
     out: Path = Path("registered"),
     format: Literal["ply", "laz", "las"] = "ply",
-    up_object: tuple[float, float, float] | None = None,
-    up_scene: tuple[float, float, float] | None = None,
-    scale: float | None = None,
-    scale_range: tuple[float, float] | None = None,
-    fiducials: Path | None = None,
-    crop_box: tuple[float, float, float, float, float, float] | None = None,
+    known: Known = Known(),
     config: Path | None = None,
     seed: int | None = None,
 ) -> int:
@@ -167,54 +234,42 @@ def register(
         scene: cloud that shows the object.
         out: folder for transform.json, picture.png and, if registered, object_in_scene.
         format: of object_in_scene, which has the object's points in the scene's coordinates.
-        up_object: direction opposite to gravity in the object's coordinates, where it is known.
-        up_scene: the same in the scene's: 0 0 1 if z is up.
-        scale: scene units per object unit, where it is known.
-        scale_range: least and greatest scale, where it is roughly known.
-        fiducials: file of at least four points on the object in the scene's coordinates: rows of x y z, or any cloud.
-        crop_box: least x y z and greatest x y z of the part of the scene to look in.
+        known: what is known beforehand.
         config: YAML of settings that differ from the shipped ones, with the keys of config/config.yaml.
         seed: of all random choices; the config's if not given.
     """
     start = time.perf_counter()
-    settings = read_settings(config)
-    seed = settings["seed"] if seed is None else seed
-    scales = _scales(scale, scale_range)
-    if fiducials is not None and crop_box is not None:
-        raise StageError("both --fiducials and --crop-box are given; give one")
+    settings, shipped_seed = RegistrationSettings.read(config)
+    seed = shipped_seed if seed is None else seed
+    known.check()
     if out.exists() and not out.is_dir():
         raise StageError(f"--out {out} is a file; give a folder")
-    if up_object is not None and up_scene is None:
-        raise StageError("--up-object needs --up-scene as well; it is 0 0 1 if the scene's z is up")
-    ups = _unit("--up-object", up_object), _unit("--up-scene", up_scene)
-    known = (ups[0], ups[1]) if ups[0] is not None and ups[1] is not None else None
+    (up_object, up_scene), scales = known.ups(), known.scales()
+    ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     cloud, whole = read_cloud(object), read_cloud(scene)
-    box = None if crop_box is None else np.array(crop_box)
-    part, searched = cut_scene(whole, settings, ups[1], fiducials, box)
-    found = register_clouds(cloud, part, settings, seed, ups=known, scales=scales)
-    written = [out / "transform.json"]
-    for ending in ("ply", "laz", "las"):
-        (out / f"object_in_scene.{ending}").unlink(missing_ok=True)
-    (out / "picture.png").unlink(missing_ok=True)
-    if found.scene_from_object is not None:
-        written.append(out / "picture.png")
-        draw_alignment(written[-1], cloud, part, found.scene_from_object, seed)
-        if found.registered:
-            written.append(out / f"object_in_scene.{format}")
-            _write(written[-1], cloud.transformed(found.scene_from_object), las_crs(scene))
-    seconds = time.perf_counter() - start
+    box = None if known.crop_box is None else np.array(known.crop_box)
+    part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
+    found = register_clouds(cloud, part, settings, seed, ups=ups, scales=scales)
     files = {"object": object, "scene": scene, "object_points": len(cloud), "scene_points": len(whole)}
-    write_json(
-        written[0],
-        report(found, known)
-        | {
-            "searched": quantity(searched, ""),
-            "inputs": quantity(files, ""),
-            "seed": quantity(seed, ""),
-            "seconds": quantity(seconds, "s"),
-        },
-    )
-    print("\n".join(summary(found, searched, known) + [f"written    {', '.join(map(str, written))}"]), flush=True)
+    context = {
+        "searched": quantity(searched, ""),
+        "inputs": quantity(files, ""),
+        "seed": quantity(seed, ""),
+        "seconds": quantity(time.perf_counter() - start, "s"),
+    }
+    for earlier in ("picture.png", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"):
+        (out / earlier).unlink(missing_ok=True)
+    written = [out / "transform.json"]
+    write_json(written[0], report(found, ups) | context)
+    print("\n".join(summary(found, searched, ups)), flush=True)
+    pose = found.scene_from_object
+    if pose is not None:
+        written.append(out / "picture.png")
+        draw_alignment(written[-1], cloud, part, pose, seed)
+    if pose is not None and found.registered:
+        written.append(out / f"object_in_scene.{format}")
+        _write(written[-1], cloud.transformed(pose), las_crs(scene))
+    print(f"written    {', '.join(map(str, written))}", flush=True)
     return REGISTERED if found.registered else UNREGISTERED
 
 
@@ -228,19 +283,15 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
     if pose is not None and outcome is not None:
         best, decision = outcome.ranked[0], outcome.decision
         unit = "scene units per object unit"
+        content |= pose_quantities(best)
         content |= {
             "scene_from_object": quantity(pose.matrix, ""),
             "scale": quantity(pose.scale, unit),
             "scale_prior": quantity([found.scales.clamp(0.0), found.scales.clamp(np.inf)], unit),
-            "f_score": quantity(best.score.f_score, "1"),
-            "precision": quantity(best.score.precision, "1"),
-            "recall": quantity(best.score.recall, "1"),
-            "color_agreement": quantity(best.score.color, "1"),
-            "score": quantity(best.score.total, "1"),
             "margin": quantity(decision.margin, "1"),
             "free_axis": quantity(decision.free_axis, ""),
-            **spread_quantities(outcome.spread, "scene units"),
-            "tilt_deg": quantity(tilt_deg(best.pose, ups), "degrees"),
+            **uncertainty_quantities(outcome.uncertainty, "scene units"),
+            "tilt_deg": quantity(tilt_deg(best.pose, ups), "deg"),
             "gravity_used": quantity(ups is not None, ""),
             "agreement": found.agreement,
         }
@@ -269,18 +320,7 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None)
     return lines
 
 
-def _scales(scale: float | None, scale_range: tuple[float, float] | None) -> ScaleRange | None:
-    if scale is not None and scale_range is not None:
-        raise StageError("both --scale and --scale-range are given; give one")
-    if scale is None and scale_range is None:
-        return None
-    low, high = (scale, scale) if scale is not None else scale_range  # type: ignore[misc]
-    if not 0 < low <= high < np.inf:
-        raise StageError(f"a scale has to be positive, and a range's least must come first; not {low:g} {high:g}")
-    return ScaleRange(float(np.sqrt(low * high)), float(np.log(high / low) / 2))
-
-
-def _unit(flag: str, direction: tuple[float, float, float] | None) -> Array | None:
+def _unit(flag: str, direction: Direction | None) -> Array | None:
     if direction is None:
         return None
     length = float(np.linalg.norm(direction))

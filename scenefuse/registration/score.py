@@ -1,15 +1,23 @@
-"""How well a pose explains two surfaces: two-way F-score, agreement of colours, and both as one number."""
+"""How well a pose explains two surfaces: two-way F-score, colours, free space; and hypotheses ranked by it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.registration.free_space import FreeSpace
 from scenefuse.registration.surface import Surface
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
-LEAST_CONTRAST = 0.02
+# Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
+RECALL_WEIGHT = 2.0
+# Distance within which points agree, as a share of the scene crop's diagonal.
+SCORE_FRACTION = 0.02
+# Colours that vary less (standard deviation, 0..1) say nothing about the pose.
+MIN_CONTRAST = 0.02
+# Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
+SAME_ANGLE_DEG, SAME_SCALE_LOG, SAME_SHIFT = 8.0, 0.06, 0.05
 
 
 @dataclass(frozen=True)
@@ -41,14 +49,14 @@ class Score:
         color: correlation of the colours over the pairs after one gain and bias per channel; None without colours.
         blocked: share of the object that stands where the scene's cameras saw through; None where it is not known.
         total: the number hypotheses are ranked by: F, with the object's area at the usual scale, times the agreement
-            of colours, times what is not blocked.
+            of colours, times the share outside free space.
     """
 
     f_score: float
     precision: float
     recall: float
     color: float | None
-    blocked: float | None
+    free_space_violation: float | None
     total: float
 
 
@@ -58,13 +66,12 @@ def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> P
     The object's own search serves at every pose: a similarity keeps the order of distances.
     """
     s = scene_from_object.scale
-    scored, questioning = obj.points[obj.probe], scene.points[scene.probe]
-    ahead, there = scene.nearest(scene_from_object.apply(scored), tau)
-    back, here = obj.nearest(scene_from_object.inverse().apply(questioning), tau / s)
+    ahead, there = scene.nearest(scene_from_object.apply(obj.points[obj.queries]), tau)
+    back, here = obj.nearest(scene_from_object.inverse().apply(scene.points[scene.queries]), tau / s)
     found, met = np.isfinite(ahead), np.isfinite(back)
     return Pairs(
-        np.concatenate([obj.probe[found], here[met]]),
-        np.concatenate([there[found], scene.probe[met]]),
+        np.concatenate([obj.queries[found], here[met]]),
+        np.concatenate([there[found], scene.queries[met]]),
         np.concatenate([ahead[found], back[met] * s]),
         int(found.sum()),
     )
@@ -75,7 +82,6 @@ def score(
     scene: Surface,
     scene_from_object: Sim3,
     tau: float,
-    recall_weight: float,
     usual_scale: float,
     free_space: FreeSpace | None = None,
 ) -> Score:
@@ -86,28 +92,27 @@ def score(
         scene: the scene crop.
         scene_from_object: the pose.
         tau: distance within which points agree, scene units.
-        recall_weight: beta of the F-beta measure.
         usual_scale: centre of the scale prior; in the total, an object's area counts as it would be at that scale.
-        free_space: what the scene's cameras saw through, or None.
+        free_space: space known to be empty, or None.
     """
     pairs = pair(obj, scene, scene_from_object, tau)
     turned = scene_from_object.rotate(obj.normals)
     facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
     worth = (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
-    precision = float(worth[: pairs.forward].sum() / len(obj.probe))
-    recall = float(worth[pairs.forward :].sum() / len(scene.probe))
-    b = recall_weight**2
+    precision = float(worth[: pairs.forward].sum() / len(obj.queries))
+    recall = float(worth[pairs.forward :].sum() / len(scene.queries))
+    b = RECALL_WEIGHT**2
     f_score = (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
     color = color_agreement(obj, scene, pairs)
     # A smaller object sticks out less: as a share of its own area, precision would always reward shrinking.
     level = min(1.0, precision * (scene_from_object.scale / usual_scale) ** 2)
     total = (1 + b) * level * recall / (b * level + recall) if level + recall > 0 else 0.0
     total *= 1.0 if color is None else 0.5 + 0.5 * color
-    blocked = None
+    violation = None
     if free_space is not None:
-        blocked = free_space.blocked_share(scene_from_object.apply(obj.points[obj.probe]))
-        total *= 1 - (blocked or 0.0)
-    return Score(f_score, precision, recall, color, blocked, total)
+        violation = free_space.violation(scene_from_object.apply(obj.points[obj.queries]))
+        total *= 1 - (violation or 0.0)
+    return Score(f_score, precision, recall, color, violation, total)
 
 
 def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
@@ -117,7 +122,7 @@ def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
     """
     if obj.colors is None or scene.colors is None:
         return None
-    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < LEAST_CONTRAST:
+    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < MIN_CONTRAST:
         return None
     if len(pairs.distance) < 30:
         return 0.0
@@ -137,3 +142,47 @@ def color_gain(obj: Surface, scene: Surface, pairs: Pairs) -> tuple[Array, Array
     gain = ((a - mean_a) * (b - mean_b)).sum(0) / np.maximum(((a - mean_a) ** 2).sum(0), 1e-9)
     gain = np.clip(gain, 0.25, 4.0)
     return gain, mean_b - gain * mean_a
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose (scene_from_object), where it comes from, and how well it explains both clouds."""
+
+    pose: Sim3
+    source: str
+    score: Score
+
+    def as_json(self) -> dict[str, Any]:
+        """The pose and its numbers as a stage JSON holds them."""
+        return {
+            "scene_from_object": self.pose.matrix.tolist(),
+            "scale": self.pose.scale,
+            "source": self.source,
+            "score": self.score.total,
+            "f_score": self.score.f_score,
+            "precision": self.score.precision,
+            "recall": self.score.recall,
+            "color_agreement": self.score.color,
+            "free_space_violation": self.score.free_space_violation,
+        }
+
+
+def best_distinct(
+    hypotheses: list[Hypothesis], centre: Array, diagonal: float, most: int, angle_deg: float = SAME_ANGLE_DEG
+) -> list[Hypothesis]:
+    """At most `most` hypotheses, best first, without those that equal a better one; see `distinct`."""
+    chosen: list[Hypothesis] = []
+    for one in sorted(hypotheses, key=lambda h: -h.score.total):
+        if len(chosen) == most:
+            break
+        if all(distinct(one.pose, other.pose, centre, diagonal, angle_deg) for other in chosen):
+            chosen.append(one)
+    return chosen
+
+
+def distinct(a: Sim3, b: Sim3, centre: Array, diagonal: float, angle_deg: float = SAME_ANGLE_DEG) -> bool:
+    """Whether two poses differ by more than an angle, 6 % of scale or 5 % of the diagonal at the object's centre."""
+    shift = np.linalg.norm(a.apply(centre) - b.apply(centre))
+    turn = rotation_angle_deg(a.rotation @ b.rotation.T)
+    scale_log = abs(np.log(a.scale / b.scale))
+    return bool(turn > angle_deg or scale_log > SAME_SCALE_LOG or shift > SAME_SHIFT * diagonal)

@@ -21,16 +21,16 @@ class Surface:
         normals: (N, 3) float64 unit vectors.
         colors: (N, 3) float64 in 0..1, averaged over a small neighbourhood, or None.
         tree: nearest-neighbour search over `points`.
-        probe: (P,) indices of the points that ask for their nearest neighbour on the other surface; all can answer.
-        grid: a table of the nearest points that answers in place of the tree, or None.
-        slopes: those of `color_slopes`, once known; copies that differ in `probe` share them.
+        queries: (Q,) indices of the points whose nearest neighbours on the other surface are sought.
+        grid: a table of the nearest points, used in place of the tree, or None.
+        slopes: those of `color_slopes`, once known; copies that differ in `queries` share them.
     """
 
     points: Array
     normals: Array
     colors: Array | None
     tree: cKDTree
-    probe: NDArray[np.int64]
+    queries: NDArray[np.int64]
     grid: "NearestGrid | None" = None
     slopes: list[Array] = field(default_factory=list, repr=False)
 
@@ -40,10 +40,10 @@ class Surface:
     def transformed(self, b_from_a: Sim3) -> "Surface":
         """The same surface in frame b."""
         points = b_from_a.apply(self.points)
-        return Surface(points, b_from_a.rotate(self.normals), self.colors, cKDTree(points), self.probe)
+        return Surface(points, b_from_a.rotate(self.normals), self.colors, cKDTree(points), self.queries)
 
     def color_slopes(self) -> Array:
-        """Slope of each colour channel along the tangent plane, (N, 3 channels, 3), computed when first asked for."""
+        """Slope of each colour channel along the tangent plane, (N, 3 channels, 3), computed on first use."""
         if not self.slopes:
             self.slopes.append(_color_slopes(self))
         return self.slopes[0]
@@ -57,7 +57,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class NearestGrid:
-    """The nearest point of every cell of a box: some ten times faster to ask than a tree, true to about one cell.
+    """The nearest point of every cell of a box: some ten times faster than a tree, exact to about one cell.
 
     Attributes:
         low: (3,) corner of the box.
@@ -69,19 +69,19 @@ class NearestGrid:
     cell: float
     index: NDArray[np.int32]
 
-    def nearest(self, points: Array, questions: Array, within: float) -> tuple[Array, NDArray[np.int64]]:
+    def nearest(self, points: Array, queries: Array, within: float) -> tuple[Array, NDArray[np.int64]]:
         """Distances and indices as `Surface.nearest`; what lies outside the box has nothing near."""
-        cells = np.floor((questions - self.low) / self.cell).astype(np.int64)
+        cells = np.floor((queries - self.low) / self.cell).astype(np.int64)
         shape = np.array(self.index.shape)
         inside = ((cells >= 0) & (cells < shape)).all(1)
         cells[~inside] = 0
         found = self.index[cells[:, 0], cells[:, 1], cells[:, 2]].astype(np.int64)
-        distance = np.sqrt(((points[found] - questions) ** 2).sum(1))
+        distance = np.sqrt(((points[found] - queries) ** 2).sum(1))
         return np.where(inside & (distance <= within), distance, np.inf), found
 
 
 def with_grid(surface: Surface, cell: float, reach: float) -> Surface:
-    """The same surface answering from a table with cells of `cell`, out to `reach` around it."""
+    """The same surface with a table of nearest points: cells of `cell`, out to `reach` around it."""
     low = surface.points.min(0) - reach
     shape = np.ceil((surface.points.max(0) + reach - low) / cell).astype(int) + 1
     cells = np.floor((surface.points - low) / cell).astype(np.int64)
@@ -117,12 +117,12 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
     return Surface(thin.points, normals, colors, tree, np.arange(len(thin)))
 
 
-def probing(surface: Surface, count: int, seed: int = 0) -> Surface:
-    """The same surface with at most `count` seeded random points that ask."""
+def with_queries(surface: Surface, count: int, seed: int = 0) -> Surface:
+    """The same surface with at most `count` query points, drawn by the seed."""
     if len(surface) <= count:
         return surface
     chosen = np.random.default_rng(seed).choice(len(surface), count, replace=False)
-    return replace(surface, probe=np.sort(chosen))
+    return replace(surface, queries=np.sort(chosen))
 
 
 def _plane_normals(points: Array, neighbours: NDArray[np.int64]) -> Array:

@@ -1,49 +1,63 @@
-"""May a pose be used? Turned copies of it, the margin to the best rival, free space, spread, and the gate."""
+"""May a pose be used? Turned copies of it, the margin to the best rival, and the gate (method R12)."""
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenefuse.registration.coarse import Hypothesis, distinct
-from scenefuse.registration.refine import ScaleRange, Uncertainty
-from scenefuse.registration.score import color_agreement, pair
+from scenefuse.registration.problem import Problem
+from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, color_agreement, distinct, pair
 from scenefuse.registration.surface import Surface
+from scenefuse.registration.uncertainty import Uncertainty
+from scenefuse.stage import setting
 from scenefuse.transforms import Array, Sim3
+
+DecidedBy = Literal["geometry", "photos", "both"]
+
+# The gate's further thresholds. Right poses of the planted trials pass them with room to spare.
+MIN_RECALL = 0.4  # share of the scene crop that the object explains
+MIN_COLOR = 0.5  # agreement of the colours, where both clouds have colours that vary
+MAX_TILT_DEG = 8.0  # angle between the up directions
+MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
+# A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
+SAME_SHAPE, SAME_COLOR = 0.95, 0.9
 
 
 @dataclass(frozen=True)
-class Gate:
-    """What a pose must reach to count as registered (method R12)."""
+class FineSettings:
+    """Settings of the fine registration: its gate, and how thoroughly it searches."""
 
-    min_f_score: float
-    """Smallest two-way F-score of an accepted pose."""
-    min_recall: float
-    """Smallest share of the scene crop that an accepted pose explains."""
-    min_color: float
-    """Smallest agreement of the colours, where both clouds have colours that vary."""
-    min_margin: float
-    """Smallest relative lead of the score over the best pose that differs."""
-    max_final_tilt_deg: float
-    """Largest angle in degrees between the two up directions of an accepted pose."""
-    max_blocked: float
-    """Largest share of the object that stands where the scene's cameras saw through."""
-    max_scale_sd_log: float
-    """Largest standard deviation of the scale, natural logarithm."""
-    max_rotation_sd_deg: float
-    """Largest standard deviation of the rotation about any axis, degrees; about a free axis it may be more."""
-    max_translation_sd_fraction: float
-    """Largest standard deviation of the object's centre, as a share of the diagonal."""
+    min_f_score: float = setting(0.35, least=0)
+    """Gate: smallest two-way F-score."""
+    min_margin: float = setting(0.04, least=0)
+    """Gate: smallest relative lead of the score over the best pose that differs."""
+    max_scale_sd_log: float = setting(0.01, least=0)
+    """Gate: largest standard deviation of the scale, natural logarithm."""
+    max_rotation_sd_deg: float = setting(1, unit="deg", least=0)
+    """Gate: largest standard deviation of the rotation about any axis; about a free axis it may be more."""
+    max_translation_sd_fraction: float = setting(0.005, least=0)
+    """Gate: largest standard deviation of the object's centre, as a share of the scene crop's diagonal."""
+    use_alignment: bool = True
+    """Whether the alignment from shared features is compared with the clouds' pose and can replace it."""
+    voxel_fraction: float = 0.0075
+    """Spacing of both clouds, as a share of the scene crop's diagonal."""
+    score_fraction: float = SCORE_FRACTION
+    """Distance within which points agree in the score, as a share of the diagonal."""
+    turn_steps: int = 24
+    """Turned copies of the leading poses tried about an axis."""
 
 
 @dataclass(frozen=True)
 class Decision:
-    """What the audit found.
+    """Whether a pose may be used, and why.
 
     Attributes:
         registered: whether the pose may be used.
         reason: one sentence why.
-        decided_by: `geometry`, `photos` (they overruled geometry) or `both` (they agree).
+        decided_by: `geometry`, `photos` (the alignment from shared features replaced the clouds' pose) or `both` (they
+            agree).
         margin: relative lead over the best rival, 0..1.
         rival: the best pose that differs and would leave the object elsewhere, or None.
         free_axis: unit vector (3,) in the scene about which the object can turn and stay the same, or None.
@@ -51,7 +65,7 @@ class Decision:
 
     registered: bool
     reason: str
-    decided_by: str
+    decided_by: DecidedBy
     margin: float
     rival: Hypothesis | None
     free_axis: Array | None
@@ -75,110 +89,106 @@ def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: in
 
 def decide(
     ranked: list[Hypothesis],
+    uncertainty: Uncertainty | None,
+    decided_by: DecidedBy,
     obj: Surface,
-    diagonal: float,
-    tau: float,
-    gate: Gate,
-    scales: ScaleRange,
-    ups: tuple[Array, Array] | None,
-    spread: Uncertainty | None,
-    decided_by: str,
+    problem: Problem,
+    settings: FineSettings,
 ) -> Decision:
-    """Weigh the best hypothesis against its rivals, the photos and the gate.
+    """Compare the best hypothesis with its rivals and with the gate.
 
     A rival that maps the object onto itself, in shape and colour, is no rival: fused, both give the same points.
-    Photos that link object and scene settle which pose is meant, so that rivals, colours and scores no longer matter:
-    the scene may lack nearly all of the object, or show much beside it. Free space and gravity can still deny it.
+    Shared photos settle which pose is meant, so that rivals, colours and scores no longer matter: the scene may lack
+    nearly all of the object, or show much beside it. Free space and gravity still count.
 
     Args:
-        ranked: refined hypotheses, best first; the photos' own pose first where they overrule geometry.
-        obj: the object in its own frame.
-        diagonal: of the scene crop.
-        tau: scoring distance, scene units.
-        gate: thresholds.
-        scales: the scale prior; a scale at its edge is refused.
-        ups: up in the object's and in the scene's frame, or None.
-        spread: of the best pose.
+        ranked: refined hypotheses, best first; the alignment's own pose first where it replaced the clouds'.
+        uncertainty: of the best pose.
         decided_by: see Decision.
+        obj: the object in its own frame.
+        problem: the clouds, the scale prior (a scale at its edge is rejected) and what else is known.
+        settings: the gate.
     """
-    best, centre = ranked[0], obj.points.mean(0)
-    rival, free_axis = None, None
-    for other in ranked[1:]:
-        if not distinct(best.pose, other.pose, centre, diagonal):
-            continue
-        if _maps_onto_itself(obj, best.pose.inverse() @ other.pose, tau / best.pose.scale):
-            if free_axis is None and other.score.total > (1 - gate.min_margin) * best.score.total:
-                free_axis = rotation_axis(other.pose.rotation @ best.pose.rotation.T)
-            continue
-        if rival is None:
-            rival = other
-    # The photos' pose may score less than a rival: then there is no lead.
+    best, rest = ranked[0], ranked[1:]
+    rivals, free_axis = _rivals(best, rest, obj, problem.scene.diagonal, settings)
+    rival = rivals[0] if rivals else None
+    # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    problem = _blocked(best, gate)
-    if problem is None and decided_by == "geometry":
-        problem = _poor(best, margin, diagonal, gate, scales, spread, free_axis)
-    tilt = tilt_deg(best.pose, ups)
-    if problem is None and tilt is not None and tilt > gate.max_final_tilt_deg:
-        problem = f"the object would lean by {tilt:.1f} degrees, more than {gate.max_final_tilt_deg:.1f}"
-    if problem is not None:
-        return Decision(False, problem, decided_by, margin, rival, free_axis)
+    of_clouds = _reasons_of_clouds(best, margin, free_axis, uncertainty, problem, settings)
+    reason = next(_reasons(best, of_clouds if decided_by == "geometry" else (), problem), None)
     words = {
         "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
-        "both": f"shared photos and geometry agree, F-score {best.score.f_score:.2f}",
-        "photos": f"shared photos decide against geometry, F-score {best.score.f_score:.2f}",
+        "both": f"shared photos and clouds agree, F-score {best.score.f_score:.2f}",
+        "photos": f"by shared photos, against the clouds' best fit, F-score {best.score.f_score:.2f}",
     }[decided_by]
-    return Decision(True, words, decided_by, margin, rival, free_axis)
+    return Decision(reason is None, reason or words, decided_by, margin, rival, free_axis)
 
 
-def _blocked(best: Hypothesis, gate: Gate) -> str | None:
-    if best.score.blocked is None or best.score.blocked <= gate.max_blocked:
-        return None
-    return (
-        f"{best.score.blocked:.0%} of the object would stand where the scene's photos saw through, more than"
-        f" {gate.max_blocked:.0%}"
-    )
+def _rivals(
+    best: Hypothesis, others: list[Hypothesis], obj: Surface, diagonal: float, settings: FineSettings
+) -> tuple[list[Hypothesis], Array | None]:
+    """The poses that differ from the best and leave the object elsewhere, and the axis about which it turns freely."""
+    tau, centre = settings.score_fraction * diagonal, obj.points.mean(0)
+    rivals, free_axis = [], None
+    for other in others:
+        if not distinct(best.pose, other.pose, centre, diagonal):
+            continue
+        if not _maps_onto_itself(obj, best.pose.inverse() @ other.pose, tau / best.pose.scale):
+            rivals.append(other)
+        elif free_axis is None and other.score.total > (1 - settings.min_margin) * best.score.total:
+            free_axis = rotation_axis(other.pose.rotation @ best.pose.rotation.T)
+    return rivals, free_axis
 
 
-def _poor(
+def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:
+    """Why a pose may not be used, the first of which is told; free space and gravity count whatever decided on it."""
+    violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.evidence.ups)
+    if violation is not None and violation > MAX_FREE_SPACE_VIOLATION:
+        yield (
+            f"{violation:.0%} of the object would lie in free space, where the scene's photos measured surfaces behind"
+            f" it; {MAX_FREE_SPACE_VIOLATION:.0%} are allowed"
+        )
+    yield from of_clouds
+    if tilt is not None and tilt > MAX_TILT_DEG:
+        yield f"the object would lean by {tilt:.1f} degrees, more than {MAX_TILT_DEG:.1f}"
+
+
+def _reasons_of_clouds(
     best: Hypothesis,
     margin: float,
-    diagonal: float,
-    gate: Gate,
-    scales: ScaleRange,
-    spread: Uncertainty | None,
     free_axis: Array | None,
-) -> str | None:
-    """What is wrong with a pose that only geometry and colours speak for."""
-    if best.score.f_score < gate.min_f_score:
-        return f"the two-way F-score is {best.score.f_score:.2f}, below {gate.min_f_score:.2f}"
-    if best.score.recall < gate.min_recall:
-        return f"the object explains only {best.score.recall:.2f} of the scene crop, below {gate.min_recall:.2f}"
-    if best.score.color is not None and best.score.color < gate.min_color:
-        return f"the colours agree by {best.score.color:.2f} only, below {gate.min_color:.2f}"
-    if margin < gate.min_margin:
-        return f"another pose is nearly as good: the margin is {margin:.3f}, below {gate.min_margin:.3f}"
+    uncertainty: Uncertainty | None,
+    problem: Problem,
+    settings: FineSettings,
+) -> Iterator[str]:
+    """Why a pose that no photos support may not be used."""
+    found, scales = best.score, problem.scales
+    if found.f_score < settings.min_f_score:
+        yield f"the two-way F-score is {found.f_score:.2f}, below {settings.min_f_score:.2f}"
+    if found.recall < MIN_RECALL:
+        yield f"the object explains only {found.recall:.2f} of the scene crop, below {MIN_RECALL:.2f}"
+    if found.color is not None and found.color < MIN_COLOR:
+        yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
+    if margin < settings.min_margin:
+        yield f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"
     if scales.at_edge(best.pose.scale):
-        return (
+        yield (
             f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
             f" {np.exp(scales.width):.2f}; widen the prior"
         )
-    if spread is None:
-        return "too little of the object meets the scene to tell how certain the pose is"
-    if spread.scale_sd_log > gate.max_scale_sd_log:
-        return f"the scale is uncertain by {spread.scale_sd_log:.1%}, more than {gate.max_scale_sd_log:.1%}"
-    turns_freely = free_axis is not None and abs(free_axis @ spread.rotation_axis) > 0.9
-    if spread.rotation_sd_deg > gate.max_rotation_sd_deg and not turns_freely:
-        return (
-            f"the rotation is uncertain by {spread.rotation_sd_deg:.1f} degrees, more than"
-            f" {gate.max_rotation_sd_deg:.1f}"
-        )
-    share = spread.translation_sd / diagonal
-    if share > gate.max_translation_sd_fraction:
-        return (
-            f"the position is uncertain by {share:.1%} of the diagonal, more than"
-            f" {gate.max_translation_sd_fraction:.1%}"
-        )
-    return None
+    if uncertainty is None:
+        yield "too little of the object meets the scene to tell how certain the pose is"
+        return
+    scale, most = uncertainty.scale_sd_log, settings.max_scale_sd_log
+    if scale > most:
+        yield f"the scale is uncertain by {scale:.1%}, more than {most:.1%}"
+    turns_freely = free_axis is not None and abs(free_axis @ uncertainty.rotation_axis) > 0.9
+    angle, most = uncertainty.rotation_sd_deg, settings.max_rotation_sd_deg
+    if angle > most and not turns_freely:
+        yield f"the rotation is uncertain by {angle:.1f} degrees, more than {most:.1f}"
+    shift, most = uncertainty.translation_sd / problem.scene.diagonal, settings.max_translation_sd_fraction
+    if shift > most:
+        yield f"the position is uncertain by {shift:.1%} of the diagonal, more than {most:.1%}"
 
 
 def rotation_axis(rotation: Array) -> Array:
@@ -200,6 +210,6 @@ def _maps_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
     Nearly every point must find another within `tau` (object units), both ways.
     """
     pairs = pair(obj, obj, motion, tau)
-    ahead, back = pairs.forward / len(obj.probe), (len(pairs.distance) - pairs.forward) / len(obj.probe)
+    ahead, back = pairs.forward / len(obj.queries), (len(pairs.distance) - pairs.forward) / len(obj.queries)
     color = color_agreement(obj, obj, pairs)
-    return min(ahead, back) > 0.95 and (color is None or color > 0.9)
+    return min(ahead, back) > SAME_SHAPE and (color is None or color > SAME_COLOR)

@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.fusion.fuse_object import is_placed
 from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.report.object_sheet import SIDES_DEG, inner, object_sheet, read_model, upright
+from scenefuse.report.object_sheet import SIDES_DEG, inner, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.report.values import find, flatten, number
 from scenefuse.stage import StageError, atomic_directory, read_json, value
 from scenefuse.transforms import Array, Sim3, rotation_between
+from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
@@ -29,7 +31,7 @@ class _Join:
         crop: the object's part of the scene, as registration saw it.
         object_cloud: the object at its estimated pose, or None when there is no pose.
         framed: (N, 3) points every picture has to show.
-        registered: whether the object was accepted and fused.
+        fused: whether the object was fused.
         decision: one line: status, reason, scores.
     """
 
@@ -38,28 +40,39 @@ class _Join:
     crop: Cloud
     object_cloud: Cloud | None
     framed: Array
-    registered: bool
+    fused: bool
     decision: str
 
 
-def draw_object(
-    *,
-    name: str,
-    scene: Path,
-    fused_scene: Path,
-    crop: Path,
-    crop_report: Path,
-    object_cloud: Path,
-    fine: Path,
-    metrics: Path,
-    cameras: Path,
-    masks: Path,
-    stage1: Path,
-    stage2: Path,
-    stage3: Path,
-    stage4: Path,
-    figures: Path,
-) -> None:
+@dataclass(frozen=True)
+class FigureInputs:
+    """What the figures of one object show."""
+
+    name: str
+    """The object's name, for titles."""
+    scene: Path
+    """The scene's dense cloud, scene frame."""
+    fused_scene: Path
+    """The whole scene after fusion, with the field `source` (0 scene, 1 object)."""
+    crop: Path
+    """The object's part of the scene, scene frame."""
+    crop_json: Path
+    """JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent."""
+    object_cloud: Path
+    """The object's cloud in its own frame."""
+    fine_json: Path
+    """JSON of the fine registration: status, reason, scene_from_object."""
+    metrics_json: Path
+    """JSON of the metrics, for the scores in titles."""
+    workspace: Path
+    """The object's undistorted COLMAP workspace (images/, sparse/)."""
+    masks: Path
+    """Folder of the object's masks, {photo}.png."""
+    stages: list[Path]
+    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
+
+
+def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     """Draw the figures of one object (paper Figures 2, 3 and 5).
 
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
@@ -68,42 +81,29 @@ def draw_object(
     renders, the object's cloud).
 
     Args:
-        name: the object's name, for titles.
-        scene: the scene's dense cloud, scene frame.
-        fused_scene: the whole scene after fusion, with the field `source` (0 scene, 1 object).
-        crop: the object's part of the scene, scene frame.
-        crop_report: JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent.
-        object_cloud: the object's cloud in its own frame.
-        fine: JSON of the fine registration: status, reason, scene_from_object.
-        metrics: JSON of the metrics, for the scores in titles.
-        cameras: the object's undistorted COLMAP workspace (images/, sparse/).
-        masks: folder of the object's masks, {photo}.png.
-        stage1: folder of stage 1 (depth_maps/).
-        stage2: folder of stage 2 (depth_maps/).
-        stage3: folder of stage 3 (depth_maps/).
-        stage4: folder of stage 4 (depth_maps/, renders/).
+        inputs: see FigureInputs.
         figures: output folder of PNG files, each below 1 MB.
 
     Raises:
         StageError: a cloud or JSON is missing or damaged.
     """
-    join = _load_join(name, scene, fused_scene, crop, crop_report, object_cloud, fine, metrics)
+    join = _load_join(inputs)
+    pictures = {
+        "before_after": _before_after(inputs.name, join),
+        "provenance": _provenance(inputs.name, join),
+        "registration": _registration(inputs.name, join),
+        **dict(zip(("before", "after"), _most_changed(join))),
+    }
+    cloud = join.object_cloud or upright(read_cloud(inputs.object_cloud), inputs.workspace)
+    pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
     with atomic_directory(figures) as folder:
-        save_png(folder / "before_after.png", _before_after(name, join))
-        print("before_after.png", flush=True)
-        save_png(folder / "provenance.png", _provenance(name, join))
-        print("provenance.png", flush=True)
-        save_png(folder / "registration.png", _registration(name, join))
-        print("registration.png", flush=True)
-        for label, picture in zip(("before", "after"), _most_changed(join)):
-            save_png(folder / f"{label}.png", picture)
-        cloud = join.object_cloud or upright(read_cloud(object_cloud), cameras)
-        save_png(folder / "object.png", object_sheet(name, cloud, cameras, masks, [stage1, stage2, stage3, stage4]))
-        print("object.png", flush=True)
+        for name, picture in pictures.items():
+            save_png(folder / f"{name}.png", picture)
+            print(f"{name}.png", flush=True)
 
 
 def draw_scene(
-    *, name: str, dense: Path, georeferenced: Path, crops: list[Path], objects: list[str], figure: Path
+    *, name: str, dense: Path, georeferenced: Path, objects: list[Path], failed: tuple[str, ...] = (), figure: Path
 ) -> None:
     """Draw a scene from above and obliquely with its camera positions and the boxes of its objects.
 
@@ -111,18 +111,23 @@ def draw_scene(
         name: the scene's name, for the title.
         dense: the scene's dense cloud.
         georeferenced: COLMAP model in the same frame.
-        crops: one cloud per object, scene frame; its bounding box is drawn.
-        objects: the objects' names, in the order of `crops`.
+        objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
+        failed: names of the objects that failed; they get no box.
         figure: output PNG, below 1 MB.
 
     Raises:
-        StageError: `crops` and `objects` differ in length, or an input is missing.
+        StageError: an input is missing.
     """
-    if len(crops) != len(objects):
-        raise StageError(f"{len(crops)} crops but {len(objects)} object names; give one name for each crop")
     cloud = read_cloud(dense)
-    centres = np.array([i.projection_center() for i in read_model(georeferenced).images.values() if i.has_pose])
-    boxes = {label: _box_corners(read_cloud(crop).points) for label, crop in zip(objects, crops)}
+    centres = np.array([view.centre for view in read_views(georeferenced)]).reshape(-1, 3)
+    shown = [folder for folder in objects if folder.name not in failed]
+    boxes = {f.name: _box_corners(read_cloud(f / "registration/full/crop.ply").points) for f in shown}
+    note = f"{len(cloud):,} points, cameras (red): {len(centres)}, objects (boxes): {len(boxes)}"
+    save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
+
+
+def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict[str, Array]) -> Image:
+    """The scene from above and obliquely; cameras at `centres` (N, 3), boxes of 8 corners."""
     radii = point_radii(cloud.points)
     low, high = np.percentile(cloud.points, [1, 99], axis=0)
     ground = _box_corners(np.stack([low, high]))
@@ -133,7 +138,6 @@ def draw_scene(
     size = (640 + 760 + 24, 520 + 66)
     sheet = new_figure(size)
     sheet.text(8 / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=12, fontweight="bold", va="top")
-    note = f"{len(cloud):,} points, {len(centres)} cameras (red), {len(boxes)} objects (boxes)"
     sheet.text(8 / size[0], 1 - 32 / size[1], note, fontsize=9.5, color="#444444", va="top")
     left = 8
     for title, camera in views.items():
@@ -146,31 +150,32 @@ def draw_scene(
         for label, corners in boxes.items():
             _draw_box(axes, camera.project(corners)[0], label)
         left += camera.width_px + 8
-    save_png(figure, to_image(sheet))
+    return to_image(sheet)
 
 
-def _load_join(
-    name: str, scene: Path, fused_scene: Path, crop: Path, crop_report: Path, cloud: Path, fine: Path, metrics: Path
-) -> _Join:
+def _load_join(inputs: FigureInputs) -> _Join:
     """Read the clouds and turn them upright; the surroundings are cut to a box around the object."""
-    report, scores = read_json(fine), flatten(read_json(metrics))
-    up = read_json(crop_report).get("up_in_scene", {}).get("value")
+    fine, scores = read_json(inputs.fine_json), flatten(read_json(inputs.metrics_json))
+    up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
     level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
-    crop_cloud = read_cloud(crop).transformed(level)
-    pose = report.get("scene_from_object", {}).get("value")
+    crop = read_cloud(inputs.crop).transformed(level)
+    pose = fine.get("scene_from_object", {}).get("value")
     placed = None
     if pose is not None:
-        placed = read_cloud(cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
-    registered = value(report, "status") == "registered"
-    shown = placed if registered and placed is not None else crop_cloud
+        placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
+    fused = is_placed(fine)
+    shown = placed if fused and placed is not None else crop
     low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
     reach = np.array([0.35, 0.35, 0.15]) * float(np.linalg.norm(high - low))
     before, after = (
-        _inside(read_cloud(path).transformed(level), low - reach, high + reach) for path in (scene, fused_scene)
+        _inside(read_cloud(path).transformed(level), low - reach, high + reach)
+        for path in (inputs.scene, inputs.fused_scene)
     )
     if not len(before):
-        raise StageError(f"{scene} has no points around {name}; look at the crop and at the registration's log")
-    return _Join(before, after, crop_cloud, placed, inner(shown.points), registered, _decision(report, scores))
+        raise StageError(
+            f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
+        )
+    return _Join(before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores))
 
 
 def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
@@ -231,7 +236,7 @@ def _before_after(name: str, join: _Join) -> Image:
         near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
         from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
         rows.append([*sides, render(cloud[near], from_below, radii[near])])
-    after = "after" if join.registered else "after (not fused)"
+    after = "after" if join.fused else "after (not fused)"
     columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG] + ["from below, surroundings cut away"]
     return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
 

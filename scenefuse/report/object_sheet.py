@@ -4,32 +4,33 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pycolmap
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from scenefuse.io.clouds import Cloud
 from scenefuse.io.maps import read_depth
+from scenefuse.io.pictures import read_mask, read_rgb
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.sheets import Image, Sheet, draw_sheet
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3, rotation_between
+from scenefuse.workspace import read_views
 
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 
 
-def object_sheet(name: str, cloud: Cloud, cameras: Path, masks: Path, stages: list[Path]) -> Image:
+def object_sheet(name: str, cloud: Cloud, workspace: Path, masks: Path, stages: list[Path]) -> Image:
     """Frames, masks, depth of each stage on one scale, renders, the cloud from four sides (Figure 3)."""
     tile = (320, 240)
-    photos = sorted(p for p in (cameras / "images").iterdir() if (masks / f"{p.stem}.png").is_file())
+    photos = sorted(p for p in (workspace / "images").iterdir() if (masks / f"{p.stem}.png").is_file())
     if not photos:
-        raise StageError(f"no photo in {cameras}/images has a mask in {masks}; rerun the masks stage")
+        raise StageError(f"no photo in {workspace}/images has a mask in {masks}; rerun the masks stage")
     chosen = [photos[i] for i in np.linspace(0, len(photos) - 1, 4).round().astype(int)]
-    frames = [_read_rgb(p) for p in chosen]
-    cut_out = [_dim_outside(f, _read_mask(masks / f"{p.stem}.png")) for f, p in zip(frames, chosen)]
+    frames = [read_rgb(p) for p in chosen]
+    cut_out = [_dim_outside(f, read_mask(masks / f"{p.stem}.png")) for f, p in zip(frames, chosen)]
     depths, shown = _depth_row(photos, masks, stages)
-    renders, labels = _render_row(cameras, stages[-1])
+    renders, labels = _render_row(workspace, stages[-1])
     radii = point_radii(cloud.points)
     framed = inner(cloud.points)
     sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
@@ -47,7 +48,7 @@ def _depth_row(photos: list[Path], masks: Path, stages: list[Path]) -> tuple[lis
     most = max(sum(f.is_file() for f in of_photo) for of_photo in files.values())
     shown = next(n for n, of_photo in files.items() if sum(f.is_file() for f in of_photo) == most)
     maps = [read_depth(f) if f.is_file() else None for f in files[shown]]
-    mask = _read_mask(masks / f"{Path(shown).stem}.png")
+    mask = read_mask(masks / f"{Path(shown).stem}.png")
     inside = [None if d is None else np.where(_fit(mask, d.shape), d, 0.0) for d in maps]
     known = [d[d > 0] for d in inside if d is not None and (d > 0).any()]
     if not known:
@@ -64,52 +65,32 @@ def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
     return picture
 
 
-def _render_row(cameras: Path, stage: Path) -> tuple[list[Image | None], list[str]]:
+def _render_row(workspace: Path, stage: Path) -> tuple[list[Image | None], list[str]]:
     """Two of the photos that stage 4 was measured on and their renders, and the captions."""
     row: list[Image | None] = []
     labels = []
-    by_stem = {p.stem: p for p in (cameras / "images").iterdir()} | {p.name: p for p in (cameras / "images").iterdir()}
+    by_stem = {p.stem: p for p in (workspace / "images").iterdir()} | {
+        p.name: p for p in (workspace / "images").iterdir()
+    }
     files = sorted(p for p in (stage / "renders").glob("*.png") if p.stem in by_stem)
     for path in files[:: max(1, len(files) // 2)][:2]:
         photo = by_stem[path.stem]
-        row += [_read_rgb(photo), _read_rgb(path)]
+        row += [read_rgb(photo), read_rgb(path)]
         labels += [f"photo {photo.name}", "its render, stage 4"]
     return row + [None] * (4 - len(row)), labels
 
 
-def upright(cloud: Cloud, cameras: Path) -> Cloud:
+def upright(cloud: Cloud, workspace: Path) -> Cloud:
     """The object's cloud turned so that z points up, from the photos' horizontal axes."""
-    poses = [i.cam_from_world().inverse() for i in read_model(cameras / "sparse").images.values()]
-    up, _ = estimate_up(np.array([p.rotation.matrix() for p in poses]), np.array([p.translation for p in poses]))
+    poses = [view.world_from_cam for view in read_views(workspace / "sparse")]
+    up, _ = estimate_up(np.array([pose[:3, :3] for pose in poses]), np.array([pose[:3, 3] for pose in poses]))
     return cloud.transformed(Sim3(1.0, rotation_between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3)))
-
-
-def read_model(folder: Path) -> pycolmap.Reconstruction:
-    """A COLMAP model; StageError when it cannot be read."""
-    try:
-        return pycolmap.Reconstruction(folder)
-    except Exception as error:
-        raise StageError(f"{folder} is not a readable COLMAP model ({error}); rerun the stage that writes it") from None
 
 
 def inner(points: Array, most: int = 20000) -> Array:
     """At most that many of the points, without the outermost half per cent of each axis: what a picture has to show."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
     return points[((points >= low) & (points <= high)).all(1)][:: max(1, len(points) // most)]
-
-
-def _read_rgb(path: Path) -> Image:
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None:
-        raise StageError(f"{path} is not a readable picture; rerun the stage that writes it")
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-
-
-def _read_mask(path: Path) -> NDArray[np.bool_]:
-    mask = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if mask is None:
-        raise StageError(f"{path} is not a readable mask; rerun the masks stage")
-    return np.asarray(mask > 127)
 
 
 def _fit(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

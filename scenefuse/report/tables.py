@@ -3,24 +3,15 @@
 A run may be partial: a value that does not exist is empty, an object without results carries its last error.
 """
 
-import itertools
-import re
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
-from scenefuse.report.values import Fields, find, load, number, unit_of
+from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
+from scenefuse.report.values import Fields, find, number, unit_of
 
-# What each step leaves, in the order in which the steps run.
-_OBJECT_FILES = (
-    *("photos.json", "features.db", "matches.json", "sparse.json", "undistorted.json", "masks.json"),
-    *("stage1.json", "stage2.json", "stage3.json", "stage4.json", "object.json"),
-)
-_SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
-_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
 # Columns of registration.tsv and rows of ablation.tsv: name, and where a value may stand, best first.
 REGISTRATION: dict[str, tuple[str, ...]] = {
     "scale": ("fine.scale",),
@@ -39,27 +30,6 @@ REGISTRATION: dict[str, tuple[str, ...]] = {
     "object_f_score": ("truth.object_f_score",),
 }
 _AROUND = [f"scene_{score}_{when}" for score in ("f_score", "precision", "recall") for when in ("before", "after")]
-
-
-@dataclass(frozen=True)
-class Collected:
-    """What a run has left of one object.
-
-    Attributes:
-        name: the object's name.
-        stages: its own stages' quantities, `stage4.psnr` for instance.
-        variants: variant -> quantities of its registration, `fine.scale` for instance.
-        fusion: quantities of the fusion.
-        missing: the first file that should be there and is not, or "".
-        reason: the last error in its logs, when something is missing.
-    """
-
-    name: str
-    stages: Fields
-    variants: dict[str, Fields]
-    fusion: Fields
-    missing: str
-    reason: str
 
 
 def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
@@ -137,7 +107,7 @@ def runtime_table(benchmarks: Path) -> pd.DataFrame:
     return table
 
 
-def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
+def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, errors against truth."""
     rows = []
     for name, fields in scenes.items():
@@ -156,7 +126,7 @@ def scenes_table(scenes: dict[str, Fields], logs: Path) -> pd.DataFrame:
             "completed_by": None if added is None else ", ".join(added) or "none",
         }
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
-        row["error"] = None if find(fields, "dense.points") is not None else last_error(logs, name)
+        row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(jobs, name))
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -186,21 +156,9 @@ def objects_table(objects: list[Collected]) -> pd.DataFrame:
         for name in ("precision", "completeness", "f_score"):
             row[f"{name}_1pct"] = number_in(fields, f"truth.cloud_{name}_1pct")
         row["missing"] = item.missing or None
-        row["error"] = item.reason or None
+        row["error"] = why_missing(item.failed) if item.missing else None
         rows.append(row)
     return pd.DataFrame(rows)
-
-
-def last_error(logs: Path, name: str) -> str:
-    """The last error line in the newest log of a scene or object that holds one; '' when there is none."""
-    named = re.compile(rf"(^|[^A-Za-z0-9_]){re.escape(name)}($|[^A-Za-z0-9_])")
-    found = [p for p in logs.rglob("*.log") if named.search(p.relative_to(logs).with_suffix("").as_posix())]
-    for path in sorted(found, key=lambda p: (p.stat().st_mtime, p.as_posix()), reverse=True):
-        lines = path.read_text(errors="replace").splitlines()
-        errors = [line.strip() for line in lines if re.match(r"\s*(error:|Killed|[\w.]*(Error|Exception)\b)", line)]
-        if errors:
-            return f"{errors[-1].removeprefix('error: ')} [{path.relative_to(logs).as_posix()}]"
-    return ""
 
 
 def records(table: pd.DataFrame) -> list[dict[str, Any]]:
@@ -211,93 +169,6 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 def truth_numbers(fields: Fields) -> Fields:
     """The numbers among the comparisons with truth; matrices and lists are left out."""
     return {k: v for k, v in fields.items() if k.startswith("truth.") and isinstance(v["value"], (int, float))}
-
-
-def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
-    """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
-
-    Args:
-        folder: the scene's results.
-        chunks: jobs that its depth maps are split into.
-    """
-    there, gap = unbroken(folder, (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)), "dense.json"))
-    found = read_fields(folder, [name for name in there if "/" not in name])
-    return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
-
-
-def collect(folder: Path, variants: list[str], logs: Path, scene: str = "", scene_gap: str = "") -> Collected:
-    """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
-
-    Args:
-        folder: the object's results.
-        variants: registration variants, the one that is fused first.
-        logs: folder of the rules' logs.
-        scene: name of the scene that the object lies in.
-        scene_gap: the first file that this scene lacks, or "".
-    """
-    there, gap = unbroken(folder, _OBJECT_FILES)
-    stages = read_fields(folder, [*there, *([] if gap else ["alignment.json"])])
-    if find(stages, "stage1.workspace") == "poses":
-        stages |= read_fields(folder, ["poses.json"])
-    who = folder.name
-    if not gap and scene_gap:
-        gap, who = f"{scene_gap} of the scene {scene}", scene
-    if not gap:
-        there, gap = unbroken(folder, ("alignment.json",))
-        stages |= read_fields(folder, there)
-    per_variant: dict[str, Fields] = {variant: {} for variant in variants}
-    fusion: Fields = {}
-    for variant in [] if gap else variants:
-        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
-        per_variant[variant] = read_fields(folder / "registration" / variant, there)
-        gap = gap or (lacking and f"registration/{variant}/{lacking}")
-    if "fine.status" in per_variant[variants[0]]:
-        there, lacking = unbroken(folder, ("fusion.json", "metrics.json"))
-        fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
-        per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
-        gap = gap or lacking
-    judged = fusion and all("fine.status" in fields for fields in per_variant.values())
-    truth = read_fields(folder, ["truth.json"]) if judged else {}
-    for variant in variants:
-        prefix = f"truth.variants.{variant}."
-        per_variant[variant] |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
-    stages |= {key: item for key, item in truth.items() if not key.startswith("truth.variants.")}
-    unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
-    per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
-    reason = (last_error(logs, who) or "no error in its logs; it has not run yet") if gap else ""
-    return Collected(folder.name, stages, per_variant, fusion, gap, reason)
-
-
-def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
-    """The files of a chain before the first that is missing, and that one, or "".
-
-    Snakemake removes what a rule wrote before it runs the rule again: what is behind a gap is from an earlier run.
-    """
-    there = list(itertools.takewhile(lambda name: (folder / name).is_file(), names))
-    return there, names[len(there)] if len(there) < len(names) else ""
-
-
-def read_fields(folder: Path, names: Sequence[str]) -> Fields:
-    """The quantities of the JSONs among some files of a folder, each prefixed by its file's name."""
-    stems = [name.removesuffix(".json") for name in names if name.endswith(".json")]
-    return {f"{stem}.{key}": item for stem in stems for key, item in load(folder / f"{stem}.json").items()}
-
-
-def _in_unit(fields: Fields, unit: str) -> Fields:
-    """The quantities with the scene's own unit of length where a stage knows it as "scene units" only."""
-    return {k: {**item, "unit": item["unit"].replace("scene units", unit)} for k, item in fields.items()}
-
-
-def status_of(item: Collected, variant: str) -> str:
-    """registered, unregistered, or missing."""
-    return str(find(item.variants.get(variant, {}), "fine.status") or "missing")
-
-
-def reason_of(item: Collected, variant: str) -> str | None:
-    """Why an object is not registered in a variant."""
-    if status_of(item, variant) == "missing":
-        return item.reason or None
-    return find(item.variants[variant], "fine.reason") or None
 
 
 def _six(item: float | int | None) -> str | None:
@@ -319,9 +190,8 @@ def plain(item: Any) -> Any:
 
 
 def _measure(key: str) -> tuple[str, str]:
-    """A completion key as (measure, column): `nue_null` and `null_nue` and `nue.null` are the null of `nue`."""
+    """A completion key as (measure, column): `nue_null` is the null of `nue`, `nue_scene` the scene's own."""
     for column in ("null", "scene"):
-        name = re.sub(rf"(^{column}[._]|[._]{column}(?=$|_)|[._]of_{column}$)", "", key)
-        if name != key and name:
-            return name, column
-    return key.removesuffix(".value"), "value"
+        if key.endswith(f"_{column}"):
+            return key.removesuffix(f"_{column}"), column
+    return key, "value"

@@ -30,13 +30,15 @@ _NOTES = {
     "F-score: both at once, 1 is perfect; a wrong pose can have a high fitness, hardly a high F-score. Inlier RMSE is "
     "in the scene's unit, and as a share of the crop's diagonal. Normal consistency, cross: how parallel the two "
     "surfaces are where they meet (0.5 is chance). Margin: lead over the second-best pose; near zero, two poses "
-    "explain the data equally well. Below its limits an object is refused and left out of the scene.",
+    "explain the data equally well. Below its limits an object is unregistered and left out of the scene. `ungated`: "
+    "nothing checked the pose. `failed`: a step ended with an error; `missing`: it has not run.",
     "completion": "Every measure stands beside its null, the same measure on a matched random cloud: only a clear "
     "distance from the null says something. Surface variation: 0 smooth to 1/3. NUE: evenness of the density after "
     "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
     "cloud is denser. Primitive fitting: share of added points on planes, spheres or cylinders.",
-    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published "
-    "recipe, `clouds_only` looks at the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the crop.",
+    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
+    "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the "
+    "crop.",
     "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
     "largest resident size of one job.",
 }
@@ -115,6 +117,8 @@ def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
     parts = [f'<h2 id="{escape(folder.name)}">{escape(folder.name)}{badge}</h2>']
     if reason not in ("-", ""):
         parts.append(f"<p>{escape(reason)}</p>")
+    if status in ("failed", "missing"):
+        return "\n".join([*parts, "<p>No figures: the object's stages did not finish.</p>"])
     figure_folder = folder / "figures"
     before, after = figure_folder / "before.png", figure_folder / "after.png"
     if before.is_file() and after.is_file():
@@ -125,8 +129,6 @@ def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
         )
     figures = [(figure_folder / f"{name}.png", caption) for name, caption in _OBJECT_FIGURES.items()]
     parts += [_picture(path, caption) for path, caption in figures if path.is_file()]
-    if len(parts) < 3 and not any(path.is_file() for path, _ in figures):
-        parts.append("<p>No figures: the object's stages did not finish.</p>")
     return "\n".join(parts)
 
 

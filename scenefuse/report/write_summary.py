@@ -1,39 +1,20 @@
 """The summary of a run: tables as TSV and a plain text that reads well in a terminal."""
 
-import re
-import textwrap
 from pathlib import Path
-from typing import Any
 
-import pandas as pd
-
+from scenefuse.logs import JobRecords
+from scenefuse.report.collected import Collected, collect, collect_scene, read_fields, status_of
+from scenefuse.report.summary_text import summary_text
 from scenefuse.report.tables import (
-    REGISTRATION,
-    Collected,
     ablation_table,
-    collect,
-    collect_scene,
     completion_table,
-    number_in,
     objects_table,
-    plain,
-    read_fields,
-    reason_of,
-    records,
     registration_table,
     runtime_table,
     scenes_table,
-    status_of,
-    truth_numbers,
 )
-from scenefuse.report.values import Fields, find, number, unit_of
+from scenefuse.report.values import Fields, find
 from scenefuse.stage import StageError, atomic_file
-
-WIDTH = 100
-_COLUMNS = ("value", "null", "scene")
-_NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
-_TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
-_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "workspace", "kept", "kernels")
 
 
 def write_summary(
@@ -43,8 +24,7 @@ def write_summary(
     objects: list[Path],
     scene_of: list[str],
     variants: list[str],
-    benchmarks: Path,
-    logs: Path,
+    jobs: JobRecords,
     summary: Path,
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
@@ -59,8 +39,7 @@ def write_summary(
         objects: result folders of the objects (results/objects/{object}); they need not exist.
         scene_of: name of the scene that each object lies in.
         variants: registration variants, the one that is fused first.
-        benchmarks: folder of Snakemake's benchmark files, {rule}/{job}.tsv.
-        logs: folder of the rules' logs, {rule}/{job}.log.
+        jobs: folders of the rules' logs and benchmarks; see JobRecords.
         summary: output folder; other files in it are left alone.
 
     Raises:
@@ -72,239 +51,33 @@ def write_summary(
         raise StageError(f"{len(objects)} objects but {len(scene_of)} scenes are given; name the scene of each object")
     parts = {folder.name: collect_scene(folder, chunks) for folder in scenes}
     found = [
-        collect(folder, variants, logs, scene, parts[scene][1] if scene in parts else "")
+        collect(folder, variants, jobs, scene, parts[scene][1] if scene in parts else "")
         for folder, scene in zip(objects, scene_of)
     ]
     scene_fields = {name: fields for name, (fields, _) in parts.items()}
     for folder in scenes:
-        decisions = [status_of(item, variants[0]) for item, scene in zip(found, scene_of) if scene == folder.name]
-        if not parts[folder.name][1] and "missing" not in decisions:
-            scene_fields[folder.name] |= read_fields(folder, ["completed.json"])
+        of_scene = [item for item, scene in zip(found, scene_of) if scene == folder.name]
+        if not parts[folder.name][1]:
+            scene_fields[folder.name] |= _completed(folder, of_scene, variants[0])
     tables = {
         "registration": registration_table(found, variants),
         "completion": completion_table(found, variants[0]),
         "ablation": ablation_table(found, variants),
-        "runtime": runtime_table(benchmarks),
-        "scenes": scenes_table(scene_fields, logs),
+        "runtime": runtime_table(jobs.benchmarks),
+        "scenes": scenes_table(scene_fields, jobs),
         "objects": objects_table(found),
     }
     for name, table in tables.items():
         with atomic_file(summary / f"{name}.tsv") as temporary:
             table.to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.6g")
-    text = _text(scene_fields, found, variants, tables)
+    text = summary_text(scene_fields, found, variants, tables)
     with atomic_file(summary / "summary.txt") as temporary:
         temporary.write_text(text)
     print(text, flush=True)
 
 
-def _text(
-    scenes: dict[str, Fields], objects: list[Collected], variants: list[str], tables: dict[str, pd.DataFrame]
-) -> str:
-    """summary.txt: a block per scene and object, then time and memory, within WIDTH columns."""
-    lines: list[str] = []
-    for name, row in zip(scenes, records(tables["scenes"])):
-        lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
-    done = sum(status_of(item, variants[0]) == "registered" for item in objects)
-    for item, row in zip(objects, records(tables["objects"])):
-        lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
-    lines += _heading(f"{done} of {len(objects)} objects registered and fused") + _runtime_lines(tables["runtime"])
-    return "\n".join(lines) + "\n"
-
-
-def _heading(text: str) -> list[str]:
-    return ["", text, "-" * min(len(text), WIDTH)]
-
-
-def _line(label: str, text: str) -> list[str]:
-    """`label   text`, wrapped, continuation lines indented."""
-    return textwrap.wrap(text, WIDTH, initial_indent=f"{label:<14}", subsequent_indent=" " * 14) if text else []
-
-
-def _pairs(cells: list[tuple[str, Any, str]]) -> str:
-    """`name value unit, ...` of the values that exist."""
-    return ", ".join(f"{n} {number(v)}{f' {u}' if u else ''}" for n, v, u in cells if number(v) not in ("-", "nan"))
-
-
-def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
-    unit = find(fields, "georeference.length_unit") or "scene units"
-    if find(fields, "dense.points") is None:
-        return _line("missing", f"no dense cloud: {row.get('error') or 'no error in its logs; it has not run yet'}")
-    cameras = f"{number(row['registered'])} of {number(row['photos'])} photos registered"
-    lines = _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
-    frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
-    lines += _line("frame", _pairs(frame))
-    lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
-    return lines + _completed_lines(fields) + _truth_lines(fields) + _remarks(fields)
-
-
-def _completed_lines(fields: Fields) -> list[str]:
-    """The scene with all its objects: what was added and what is not in it."""
-    added = find(fields, "completed.added_points")
-    if added is None:
-        return _line("completed", "not written: an object has no decision, or the log of complete_scene says why")
-    parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
-    parts += [f"{name} adds {count}" for name, count in added.items()]
-    parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
-    return _line("completed", ", ".join(parts))
-
-
-def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> list[str]:
-    lines = _line("missing", item.missing) + _line("because", item.reason)
-    fields = item.variants[variants[0]]
-    lines += _line(
-        "reason", "" if status_of(item, variants[0]) == "missing" else str(reason_of(item, variants[0]) or "")
-    )
-    if row["registered"] is not None and row["registered"] == row["registered"]:
-        cameras = f"{number(row['registered'])} of {number(row['frames'])} frames registered"
-        lines += _line("cameras", f"{cameras}, {_pairs([('reprojection error', row['reprojection_error_px'], 'px')])}")
-    lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
-    for stage in (1, 2, 3, 4):
-        names = {
-            "psnr_db": ("PSNR", f"dB on {row.get(f'stage{stage}_measured_on') or 'photos'}"),
-            "ssim": ("SSIM", ""),
-            "depth_error_over_diagonal": ("median depth error", "of the diagonal"),
-            "depth_within_1pct": ("within 1 %", ""),
-        }
-        cells = [(label, row.get(f"stage{stage}_{key}"), unit) for key, (label, unit) in names.items()]
-        lines += _line(f"stage {stage}", _pairs(cells))
-    cloud = [("points", row["points"], ""), ("median distance", row["accuracy_pct_of_diagonal"], "% of the diagonal")]
-    cloud += [(k.replace("_", "-"), row[f"{k}_1pct"], "at 1 %") for k in ("precision", "completeness", "f_score")]
-    lines += (
-        _line("cloud", _pairs(cloud)) + _line("alignment", _alignment(item.stages)) + _variant_lines(item, variants)
-    )
-    lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
-    lines += _around_line(item.stages) + _completion_lines(item, variants[0])
-    return lines + _remarks(item.stages | fields | item.fusion)
-
-
-_DECIDED = {
-    "geometry": "by the clouds alone: no photos link object and scene",
-    "both": "clouds and shared photos agree",
-    "photos": "by shared photos, against the clouds",
-}
-
-
-def _alignment(fields: Fields) -> str:
-    """What the photos alone say of the object's place."""
-    found, reason = find(fields, "alignment.found"), find(fields, "alignment.reason")
-    if not found:
-        return "" if found is None else f"not found: {reason}"
-    deviation = 100 * find(fields, "alignment.scale_sd_log")
-    return f"scale {number(find(fields, 'alignment.scale'))} (standard deviation {number(deviation)} %), {reason}"
-
-
-def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
-    """One line a variant; errors against truth only where it is known."""
-    shown = {
-        "scale": "scale",
-        "f_score": "F-score",
-        "fitness_source": "fit src",
-        "fitness_target": "fit tgt",
-        "inlier_rmse_over_diagonal": "rmse/dg",
-        "normal_consistency_cross": "normals",
-        "margin": "margin",
-        "scale_error_pct": "d scl %",
-        "rotation_error_deg": "d rot °",
-        "translation_error_over_diagonal": "d t/dg",
-    }
-    rows = {
-        variant: {k: number_in(item.variants.get(variant, {}), *REGISTRATION[k]) for k in shown} for variant in variants
-    }
-    used = [k for k in shown if any(row[k] is not None for row in rows.values())]
-    if not used:
-        return []
-    decisions = {"registered": "ok", "unregistered": "refused"}
-    lines = [f"{'registration':<20}" + "".join(f"{shown[k]:>8}" for k in used)]
-    for variant, row in rows.items():
-        decision = decisions.get(status_of(item, variant), "missing")
-        lines.append(f"  {variant[:10]:<10}{decision:>8}" + "".join(f"{_three(row[k]):>8}" for k in used))
-    rmse = number_in(item.variants[variants[0]], *REGISTRATION["inlier_rmse"])
-    if rmse is not None:
-        cells_of = [(k.replace("_", " "), k) for k in ("inlier_rmse", "threshold")]
-        found = item.variants[variants[0]]
-        units = [(n, number_in(found, *REGISTRATION[k]), _short(unit_of(found, *REGISTRATION[k]))) for n, k in cells_of]
-        lines += _line("", f"{variants[0]}: {_pairs(units)}")
-    decided = find(item.variants[variants[0]], "fine.decided_by")
-    if decided is not None:
-        lines += _line("pose", _DECIDED[decided] + _spread(item.variants[variants[0]]))
-    return [line.rstrip() for line in lines]
-
-
-def _spread(found: Fields) -> str:
-    """Standard deviations of the pose, where they are known."""
-    scale, turn, shift = (number_in(found, f"fine.{k}") for k in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))
-    if scale is None or turn is None or shift is None:
-        return ""
-    unit = _short(unit_of(found, "fine.translation_sd"))
-    return f"; one sd {_three(100 * scale)} % of scale, {_three(turn)} degrees, {_three(shift)} {unit}"
-
-
-def _three(item: float | int | None) -> str:
-    """Three significant digits, two of a very small number: at most seven characters; or '-'."""
-    return "-" if item is None else f"{item:.1e}" if 0 < abs(item) < 1e-4 else f"{item:.3g}"
-
-
-def _around_line(fields: Fields) -> list[str]:
-    """The scene's scores around the object before and after fusion, where truth is known."""
-    parts = []
-    for label, name in (("F-score", "f_score"), ("precision", "precision"), ("recall", "recall")):
-        before, after = (number_in(fields, f"truth.scene_{name}_{when}") for when in ("before", "after"))
-        if before is not None:
-            parts.append(f"{label} {_three(before)} -> {_three(after)}")
-    return _line("scene, truth", f"around the object, at 1 % of its diagonal: {', '.join(parts)}" if parts else "")
-
-
-def _completion_lines(item: Collected, variant: str) -> list[str]:
-    table = records(completion_table([item], variant))
-    rows = [r for r in table if isinstance(r["value"], (int, float)) and not r["measure"].startswith("scene_")]
-    if not rows:
-        return []
-    lines = [f"{'completion':<14}{'':<34}{'value':>10}{'null':>10}{'scene':>10}"]
-    for row in rows:
-        lines.append(f"{'':<14}{row['measure'][:33]:<34}" + "".join(f"{_cell(row[k]):>10}" for k in _COLUMNS))
-    return [line.rstrip() for line in lines]
-
-
-def _cell(item: Any) -> str:
-    return _three(item) if isinstance(item, (int, float)) and item == item else "-"
-
-
-def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
-    return [(label, find(fusion, f"fusion.{key}"), "") for label, key in (("points added", "added_points"),)]
-
-
-def _short(unit: str | None) -> str:
-    """The unit as printed behind a number: nothing for pure numbers."""
-    return "" if unit in (None, "1", "") else str(unit)
-
-
-def _truth_lines(fields: Fields) -> list[str]:
-    cells = [
-        (key.removeprefix("truth.").replace("_", " "), item["value"], _short(item["unit"]))
-        for key, item in truth_numbers(fields).items()
-    ]
-    return _line("truth", _pairs(cells))
-
-
-def _remarks(fields: Fields) -> list[str]:
-    """What was chosen, and every fallback, warning and note that a stage recorded."""
-    chosen = {k: i["value"] for k, i in fields.items() if k.rsplit(".", 1)[-1] in _CHOICES and k.count(".") == 1}
-    lines = _line("chosen", "; ".join(f"{k} {number(plain(v))}" for k, v in chosen.items() if v not in (None, "")))
-    for key, item in fields.items():
-        if _NOTES.search(key) and key not in _TOLD and item["value"] not in (None, "", [], {}, False):
-            lines += _line("note", f"{key}: {plain(item['value'])}")
-    return lines
-
-
-def _memory(megabytes: float) -> str:
-    return f"{megabytes:.0f}" if megabytes == megabytes else "-"
-
-
-def _runtime_lines(runtime: pd.DataFrame) -> list[str]:
-    lines = [f"{'rule':<28}{'jobs':>6}{'seconds':>11}{'longest':>11}{'memory MB':>12}"]
-    for row in records(runtime):
-        lines.append(
-            f"{str(row['rule'])[:27]:<28}{row['jobs']:>6.0f}{row['seconds']:>11.1f}"
-            f"{row['longest_seconds']:>11.1f}{_memory(row['max_rss_mb']):>12}"
-        )
-    return lines if len(runtime) > 1 else ["no benchmark files yet"]
+def _completed(folder: Path, objects: list[Collected], variant: str) -> Fields:
+    """What the completed scene holds; nothing when it is from before an object failed, or was mended."""
+    fields = read_fields(folder, ["completed.json"])
+    undecided = {item.name for item in objects if status_of(item, variant) in ("failed", "missing")}
+    return fields if set(find(fields, "completed.failed") or {}) == undecided else {}

@@ -9,6 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError
+from scenefuse.workspace import read_model
 
 Array = NDArray[np.float64]
 CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
@@ -23,7 +24,7 @@ class Clicks:
         path: the file they come from, for messages.
         points: N point names; a point appears once for each photo it was clicked in.
         photos: N photo names.
-        pixels: (N, 2) x and y in pixels of the original photo, pixel centres at +0.5.
+        pixels: (N, 2) x and y in pixels of the original photo as people see it, pixel centres at +0.5.
     """
 
     path: Path
@@ -167,7 +168,7 @@ def locate(
     marked = read_points(path)
     if isinstance(marked, ScenePoints):
         return marked.points, marked.positions, np.zeros(len(marked.points))
-    return triangulate(marked, pycolmap.Reconstruction(model), max_residual_px, sizes)
+    return triangulate(marked, read_model(model), max_residual_px, sizes)
 
 
 def _model_pixel(

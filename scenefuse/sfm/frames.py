@@ -10,9 +10,9 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
 
-from scenefuse.sfm.photos import Photo, inspect_photo, photo_names, photo_notes, write_photos
+from scenefuse.io.pictures import write_picture
+from scenefuse.sfm.photos import JPEG_QUALITY, inspect_photo, photo_names, photo_notes, save_upright, write_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
@@ -22,14 +22,12 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".web
 class FrameSettings:
     """Which frames are taken, and at what size."""
 
-    frame_step: int = setting(1, least=0)
+    frame_step: int = setting(1, least=1)
     """Take every n-th photo, or one frame out of each n of a video."""
     max_frames: int = setting(200, least=0)
     """Most frames; more are thinned out evenly. 0 sets no limit."""
-    max_width_px: int = setting(1600, unit="px", least=0)
+    max_width_px: int = setting(1600, unit="px", least=1)
     """Widest frame; wider ones are scaled down."""
-    jpeg_quality: int = setting(97, least=0)
-    """Quality of frames that have to be encoded, 1 to 100."""
 
 
 def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameSettings) -> None:
@@ -61,11 +59,8 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
     if len(listed) < 3:
         shutil.rmtree(frames)
         raise StageError(f"{source} yields {len(listed)} frames, at least 3 are needed; lower frame_step")
-    notes = photo_notes(listed)
     print(f"{len(listed)} frames from {source}", flush=True)
-    for note in notes:
-        print(f"note: {note}", flush=True)
-    write_photos(photos, listed, frames, kind, notes, origin=quantity(origin, ""))
+    write_photos(photos, listed, frames, kind, photo_notes(listed), origin=quantity(origin, ""))
 
 
 def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:
@@ -103,27 +98,15 @@ def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[st
     def copy(name: str) -> tuple[str, dict[str, Any]]:
         photo = inspect_photo(source, name)
         target = output / name.replace("/", "_")
-        size = _copy_photo(source / name, photo, target, settings)
-        return target.name, {"source": name, "width": size[0], "height": size[1]}
+        width, height = photo.width, photo.height
+        if photo.orientation == 1 and width <= settings.max_width_px:
+            shutil.copyfile(source / name, target)
+        else:
+            width, height = save_upright(source / name, target, settings.max_width_px)
+        return target.name, {"source": name, "width": width, "height": height}
 
     with ThreadPoolExecutor(threads()) as pool:
         return dict(pool.map(copy, flat.values()))
-
-
-def _copy_photo(source: Path, photo: Photo, target: Path, settings: FrameSettings) -> tuple[int, int]:
-    """Copy or scale one photo; returns the upright original's (width, height)."""
-    if photo.orientation == 1 and photo.width <= settings.max_width_px:
-        shutil.copyfile(source, target)
-        return photo.width, photo.height
-    with Image.open(source) as image:
-        exif = image.getexif()
-        upright = ImageOps.exif_transpose(image)
-        exif.pop(0x0112, None)
-        width = min(upright.width, settings.max_width_px)
-        height = round(upright.height * width / upright.width)
-        resized = upright.resize((width, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
-        resized.save(target, quality=settings.jpeg_quality, subsampling=0, exif=exif)
-        return upright.size
 
 
 def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:
@@ -171,5 +154,5 @@ def _write_frame(
         size = (settings.max_width_px, round(height * scale))
         frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
     name = f"frame_{index:06d}.jpg"
-    cv2.imwrite(str(output / name), frame, [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality])
+    write_picture(output / name, np.ascontiguousarray(frame[..., ::-1], dtype=np.uint8), JPEG_QUALITY)
     return {name: {"frame": index, "width": width, "height": height, "sharpness": round(score, 3)}}

@@ -32,7 +32,7 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     x, y, z = (world_from_cam[:, :, k] for k in range(3))
     up, spread = _orthogonal_to_all(x)
     if spread >= MIN_AXIS_SPREAD:
-        # Image-up sides and looking down both speak for a sign; for nadir photos only the latter does.
+        # Image-up sides and looking down both tell the sign; for nadir photos only the latter does.
         return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings"
     line = np.linalg.eigh(x.T @ x)[1][:, 2]
     candidates = {"image up": -y.mean(0), "viewing direction": -z.mean(0)}

@@ -1,7 +1,9 @@
 """Posed photos of any format as the workspace and the masks that the training stages read."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -9,16 +11,22 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from scenefuse.io.pictures import write_picture
 from scenefuse.masks.supplied import mask_files, matte_of
 from scenefuse.sfm.gravity import estimate_up
+from scenefuse.sfm.photos import JPEG_QUALITY
 from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
-from scenefuse.sfm.undistort import UndistortSettings
-from scenefuse.stage import StageError, atomic_directory, quantity, value, write_json
+from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
+from scenefuse.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, write_model
 
 Picture = NDArray[np.uint8]
+Lens = tuple[pycolmap.Camera, View]
 
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
+# Transparent pixels up to this far from others take their colour: farther than resampling reaches.
 BLEED_PX = 16
 
 
@@ -27,7 +35,7 @@ def import_photos(
     data: Path,
     images: Path | None,
     masks: Path | None,
-    cameras: Path,
+    workspace: Path,
     mattes: Path,
     report: Path,
     settings: UndistortSettings,
@@ -41,11 +49,11 @@ def import_photos(
         data: folder or file with the cameras; see `find_posed_photos`.
         images: folder of a COLMAP model's photos; None for `data`/images.
         masks: folder of masks named like the photos; None to look elsewhere.
-        cameras: output, workspace with images/, sparse/ (PINHOLE, no points), and held_out.txt where the data say which
-            photos are held out.
+        workspace: output, with images/, sparse/ (PINHOLE, no points), and held_out.txt where the data say which photos
+            are held out.
         mattes: output, folder of {photo}.png, 8-bit grey.
         report: output, JSON: the format, where masks come from, what was left out, `up_in_camera_frame`.
-        settings: size and quality of photos that have to be undistorted; the others are copied.
+        settings: size of photos that have to be undistorted; the others are copied.
 
     Raises:
         StageError: what the readers say; photos without masks, unlike sizes, an unreadable file.
@@ -56,59 +64,75 @@ def import_photos(
     files = {} if masks is None else mask_files(masks)
     exact = masks is None and not any(photo.mask for photo in photos)
     lenses = _lenses(photos, settings)
-    kept: list[tuple[PosedPhoto, str, pycolmap.Camera]] = []
-    with atomic_directory(cameras) as workspace, atomic_directory(mattes) as folder:
-        (workspace / "images").mkdir()
-        (workspace / "sparse").mkdir()
-        for photo, (lens, target) in zip(photos, lenses):
-            picture, alpha = _read(photo.file)
-            file = photo.mask if masks is None else files.get(Path(photo.name).stem)
-            matte = alpha if exact else _mask(file, picture)
-            if matte is None:
-                continue
-            stem, jpeg = Path(photo.name).stem, Path(photo.name).suffix.lower() in (".jpg", ".jpeg")
-            if exact:
-                picture = _bled(picture, matte)
-            if _straight(lens) and not exact:
-                name = photo.name
-                shutil.copyfile(photo.file, workspace / "images" / name)
-            else:
-                name = photo.name if jpeg and not exact else f"{stem}.png"
-                _write(workspace / "images" / name, _straightened(picture, lens, target, settings), settings)
-            _write(folder / f"{stem}.png", _straightened(matte, lens, target, settings), settings)
-            kept.append((photo, name, target))
+    kept: list[View] = []
+    held_out: list[str] = []
+    with atomic_directory(workspace) as output, atomic_directory(mattes) as folder:
+        (output / "images").mkdir()
+        (output / "sparse").mkdir()
+        for photo, lens in zip(photos, lenses):
+            mask = photo.mask if masks is None else files.get(Path(photo.name).stem)
+            view = _write_photo(photo, lens, mask, exact, output / "images", folder)
+            if view is not None:
+                kept.append(view)
+                held_out += [view.name] if photo.held_out else []
         if not kept:
             raise StageError(_no_masks(data, photos, masks, files))
-        _write_model(workspace / "sparse", kept)
-        held_out = [name for photo, name, _ in kept if photo.held_out]
+        write_model(output / "sparse", kept)
         if held_out:
-            (workspace / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))
+            (output / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))
     source = "the photos' alpha channel" if exact else str(masks or "the masks that the data name")
-    content = {
+    origin = {
         "format": quantity(kind, ""),
         "masks_from": quantity(source, ""),
         "masks_exact": quantity(exact, ""),
         "held_out_by_the_data": quantity(held_out, ""),
-        **_described(photos, lenses, kept),
     }
-    write_json(report, content)
-    left_out = value(content, "left_out_without_mask")
-    print(
-        f"{len(kept)} photos ({kind}), {value(content, 'undistorted')} undistorted, masks from {source}"
-        + (f"; {len(left_out)} left out without a mask, {left_out[0]} for one" if left_out else ""),
-        flush=True,
-    )
+    write_json(report, origin | _described(photos, lenses, kept))
+    print(f"{len(kept)} of {len(photos)} photos ({kind}) have a mask, masks from {source}", flush=True)
 
 
-def _described(photos, lenses, kept):  # type: ignore[no-untyped-def]
+def _write_photo(
+    photo: PosedPhoto, lens: Lens, mask: Path | None, exact: bool, images: Path, mattes: Path
+) -> View | None:
+    """Write one photo and its matte; returns its view by the name that it got, None for a photo without a mask.
+
+    Args:
+        photo, lens: what to write, and its cameras.
+        mask: its file; None where there is none, or where the alpha channel is the mask.
+        exact: whether it is.
+        images, mattes: folders.
+    """
+    camera, view = lens
+    picture, alpha = _read(photo.file)
+    matte = alpha if exact else _mask(mask, picture)
+    if matte is None:
+        return None
+    stem, straight = Path(photo.name).stem, _straight(camera)
+    if straight and not exact:
+        name = photo.name
+        shutil.copyfile(photo.file, images / name)
+    else:
+        jpeg = Path(photo.name).suffix.lower() in (".jpg", ".jpeg")
+        name = photo.name if jpeg and not exact else f"{stem}.png"
+        picture = _bled(picture, matte) if exact else picture
+        write_picture(images / name, picture if straight else undistort_picture(picture, camera, view), JPEG_QUALITY)
+    write_picture(mattes / f"{stem}.png", matte if straight else undistort_picture(matte, camera, view))
+    return replace(view, name=name)
+
+
+def _described(photos: list[PosedPhoto], lenses: list[Lens], kept: list[View]) -> dict[str, Any]:
     """What was read, as quantities: counts, sizes, photos left out, which way is up."""
-    poses = np.stack([photo.object_from_cam for photo, _, _ in kept])
+    poses = np.stack([view.world_from_cam for view in kept])
     up, cue = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
+    written = {Path(view.name).stem for view in kept}
+    left_out = sorted(photo.name for photo in photos if Path(photo.name).stem not in written)
+    if left_out:
+        print(f"note: {len(left_out)} photos are left out without a mask, {left_out[0]} for one", flush=True)
     return {
         "photos": quantity(len(kept), "1"),
-        "left_out_without_mask": quantity(sorted({p.name for p in photos} - {p.name for p, _, _ in kept}), ""),
-        "undistorted": quantity(sum(not _straight(lens) for lens, _ in lenses), "1"),
-        "sizes_px": quantity(sorted({(target.width, target.height) for _, _, target in kept}), "px"),
+        "left_out_without_mask": quantity(left_out, ""),
+        "undistorted": quantity(sum(not _straight(camera) for camera, _ in lenses), "1"),
+        "sizes_px": quantity(sorted({(view.width, view.height) for view in kept}), "px"),
         "up_in_camera_frame": quantity(up, "1"),
         "up_cue": quantity(cue, ""),
     }
@@ -133,8 +157,8 @@ def _straight(camera: pycolmap.Camera) -> bool:
     return camera.model_name in (*PERSPECTIVE, "FULL_OPENCV") and camera.is_undistorted()
 
 
-def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[tuple[pycolmap.Camera, pycolmap.Camera]]:
-    """Of every photo, its camera at its own size, and the PINHOLE camera it gets.
+def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]:
+    """Of every photo, its camera at its own size, and the view without distortion that it becomes.
 
     Undistorted photos that had one size get one size: cameras calibrated photo by photo lose a few columns and rows at
     the right and the bottom.
@@ -143,27 +167,29 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[tuple
     pairs = []
     for photo in photos:
         width, height = photo_size(photo.file)
-        lens = pycolmap.Camera(photo.camera.todict())
-        if abs(lens.width / lens.height * height / width - 1) > SHAPE_TOLERANCE:
+        camera = pycolmap.Camera(photo.camera.todict())
+        if abs(camera.width / camera.height * height / width - 1) > SHAPE_TOLERANCE:
             raise StageError(
-                f"{photo.file} has {width} x {height} pixels, but its camera {lens.width} x {lens.height}; give the "
-                "photos that the cameras were computed for, or smaller copies"
+                f"{photo.file} has {width} x {height} pixels, but its camera {camera.width} x {camera.height}; give"
+                " the photos that the cameras were computed for, or smaller copies"
             )
-        lens.rescale(width, height)
-        if _straight(lens):
-            params = [lens.focal_length_x, lens.focal_length_y, lens.principal_point_x, lens.principal_point_y]
-            target = pycolmap.Camera(model="PINHOLE", width=width, height=height, params=params)
-        else:
-            target = pycolmap.undistort_camera(options, lens)
-        pairs.append((lens, target))
-    for lens, target in pairs:
-        alike = [t for other, t in pairs if (other.width, other.height) == (lens.width, lens.height)]
-        target.width, target.height = min(t.width for t in alike), min(t.height for t in alike)
-    return pairs
+        camera.rescale(width, height)
+        target = camera if _straight(camera) else pycolmap.undistort_camera(options, camera)
+        cam_from_object: Array = np.array(np.linalg.inv(photo.object_from_cam), dtype=np.float64)
+        intrinsics: Array = np.array(target.calibration_matrix(), dtype=np.float64)
+        view = View(photo.name, intrinsics, cam_from_object, target.width, target.height)
+        pairs.append((camera, view))
+    smallest: dict[tuple[int, int], tuple[int, int]] = {}
+    for camera, view in pairs:
+        own = camera.width, camera.height
+        known = smallest.get(own, (view.width, view.height))
+        smallest[own] = min(known[0], view.width), min(known[1], view.height)
+    sizes = [smallest[camera.width, camera.height] for camera, _ in pairs]
+    return [(c, replace(view, width=width, height=height)) for (c, view), (width, height) in zip(pairs, sizes)]
 
 
 def _read(file: Path) -> tuple[Picture, Picture | None]:
-    """A photo as stored, whatever its EXIF orientation: (H, W, 3) BGR, and (H, W) alpha where it varies."""
+    """A photo as stored, whatever its EXIF orientation: (H, W, 3) RGB, and (H, W) alpha where it varies."""
     stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype not in (np.uint8, np.uint16):
         raise StageError(f"{file} is not a readable picture of 8 or 16 bits; export it again")
@@ -171,7 +197,7 @@ def _read(file: Path) -> tuple[Picture, Picture | None]:
     if picture.ndim == 2:
         picture = np.repeat(picture[..., None], 3, axis=2)
     alpha = picture[..., 3] if picture.shape[2] == 4 and picture[..., 3].min() < 255 else None
-    return np.ascontiguousarray(picture[..., :3]), alpha
+    return np.ascontiguousarray(picture[..., 2::-1]), alpha
 
 
 def _mask(file: Path | None, picture: Picture) -> Picture | None:
@@ -197,35 +223,3 @@ def _bled(picture: Picture, alpha: Picture) -> Picture:
         return picture
     far, (rows, columns) = ndimage.distance_transform_edt(alpha == 0, return_indices=True)
     return np.where(far[..., None] <= BLEED_PX, picture[rows, columns], 0).astype(np.uint8)
-
-
-def _straightened(
-    picture: Picture, lens: pycolmap.Camera, target: pycolmap.Camera, settings: UndistortSettings
-) -> Picture:
-    """A photo or mask (H, W) or (H, W, 3) in the pixels of the PINHOLE camera, black where the photo shows nothing."""
-    if _straight(lens):
-        return picture
-    options = pycolmap.UndistortCameraOptions(max_image_size=settings.max_size_px)
-    bitmap, _ = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(picture), lens)
-    return np.ascontiguousarray(bitmap.to_array()[: target.height, : target.width])
-
-
-def _write(file: Path, picture: Picture, settings: UndistortSettings) -> None:
-    quality = [cv2.IMWRITE_JPEG_QUALITY, settings.jpeg_quality] if file.suffix.lower() in (".jpg", ".jpeg") else []
-    if not cv2.imwrite(str(file), picture, quality):
-        raise StageError(f"{file} cannot be written; check the space on the disk")
-
-
-def _write_model(folder: Path, kept: list[tuple[PosedPhoto, str, pycolmap.Camera]]) -> None:
-    """A COLMAP model of cameras and poses alone; photos with the same lens share a camera."""
-    model = pycolmap.Reconstruction()
-    known: dict[tuple[float, ...], int] = {}
-    for number, (photo, name, target) in enumerate(kept, start=1):
-        lens = target.width, target.height, *target.params
-        if lens not in known:
-            known[lens] = target.camera_id = len(known) + 1
-            model.add_camera_with_trivial_rig(target)
-        cam_from_object = np.linalg.inv(photo.object_from_cam)[:3]
-        image = pycolmap.Image(name=name, camera_id=known[lens], image_id=number)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(cam_from_object))
-    model.write(folder)

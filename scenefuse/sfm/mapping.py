@@ -3,7 +3,6 @@
 He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver, zero tolerances.
 """
 
-import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,24 +11,27 @@ import pycolmap
 
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import read_photos
-from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, scratch_directory, setting, threads, write_json
+
+# He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
+BA_ITERATIONS, BA_LINEAR_SOLVER_ITERATIONS = 100, 200
+# Function, gradient and parameter tolerance of the last bundle adjustment: 0 runs all iterations (the paper's).
+BA_TOLERANCE = 0.0
+# Observations with a larger error are dropped; COLMAP's own.
+MAX_REPROJECTION_ERROR_PX = 4.0
+# Points whose rays meet at a smaller angle are dropped; COLMAP's own.
+MIN_TRIANGULATION_ANGLE_DEG = 1.5
+# Fewest matches of the first pair of photos; COLMAP's own.
+INIT_MIN_INLIERS = 100
+# The smallest model that has a shape.
+MIN_PHOTOS = 3
 
 
 @dataclass(frozen=True)
 class MapSettings:
     """Incremental mapping and bundle adjustment."""
 
-    ba_iterations: int = setting(100, least=0)
-    """Most iterations of a global bundle adjustment."""
-    ba_linear_solver_iterations: int = setting(200, least=0)
-    """Most iterations of the linear solver within one of them."""
-    ba_tolerance: float = setting(0, least=0)
-    """Function, gradient and parameter tolerance of the last bundle adjustment; 0 runs all iterations."""
-    max_reprojection_error_px: float = setting(4, unit="px", least=0)
-    """Observations with a larger error are dropped."""
-    init_min_inliers: int = setting(100, least=0)
-    """Fewest matches of the first pair of photos."""
-    min_registered_share: float = setting(0.7, least=0)
+    min_registered_share: float = setting(0.7, least=0, most=1)
     """Smallest share of the photos that have to be registered, 0 to 1; fewer is an error."""
 
 
@@ -51,18 +53,17 @@ def map_photos(
         StageError: too small a share of the photos is registered.
     """
     names = [p.name for p in read_photos(photos)]
-    sparse.parent.mkdir(parents=True, exist_ok=True)
     pycolmap.set_random_seed(seed)
-    with tempfile.TemporaryDirectory(dir=sparse.parent, prefix=".mapping-") as work:
+    with scratch_directory(sparse.with_name(f"{sparse.name}-models")) as work:
         models = cancellable(
-            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(settings, len(names), seed)
+            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(len(names), seed)
         )
     ranked = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     _check_registered(ranked, names, settings.min_registered_share)
     model = ranked[0]
     before_px = model.compute_mean_reprojection_error()
-    adjust(model, settings)
-    summary = describe(model, names)
+    adjust(model)
+    summary = _describe(model, names)
     print(
         f"{summary['registered']['value']} of {len(names)} photos registered, "
         f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points",
@@ -88,25 +89,25 @@ def map_photos(
     write_json(report, content)
 
 
-def adjust(model: pycolmap.Reconstruction, settings: MapSettings) -> None:
-    """Bundle-adjust a model in place with the given limits, then drop observations with large errors."""
+def adjust(model: pycolmap.Reconstruction) -> None:
+    """Bundle-adjust a model in place, then drop observations with large errors."""
     options = pycolmap.BundleAdjustmentOptions()
     solver = options.ceres.solver_options
-    solver.max_num_iterations = settings.ba_iterations
-    solver.max_linear_solver_iterations = settings.ba_linear_solver_iterations
-    solver.function_tolerance = settings.ba_tolerance
-    solver.gradient_tolerance = settings.ba_tolerance
-    solver.parameter_tolerance = settings.ba_tolerance
+    solver.max_num_iterations = BA_ITERATIONS
+    solver.max_linear_solver_iterations = BA_LINEAR_SOLVER_ITERATIONS
+    solver.function_tolerance = BA_TOLERANCE
+    solver.gradient_tolerance = BA_TOLERANCE
+    solver.parameter_tolerance = BA_TOLERANCE
     solver.num_threads = threads()
     options.print_summary = False
     cancellable(pycolmap.bundle_adjustment, model, options)
     observations = pycolmap.ObservationManager(model)
-    observations.filter_all_points3D(settings.max_reprojection_error_px, min_tri_angle=1.5)
+    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG)
     observations.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
 
 
-def describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
+def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
     """What a model holds, as quantities: photos registered, errors, points, cameras, photos left out."""
     registered = _registered_names(model)
     cameras = [
@@ -125,16 +126,16 @@ def describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]
     }
 
 
-def _mapper_options(settings: MapSettings, photos: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _mapper_options(photos: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = threads()
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    options.ba_global_max_num_iterations = settings.ba_iterations
-    options.mapper.init_min_num_inliers = settings.init_min_inliers
-    options.mapper.filter_max_reproj_error = settings.max_reprojection_error_px
-    options.min_model_size = 3
+    options.ba_global_max_num_iterations = BA_ITERATIONS
+    options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
+    options.mapper.filter_max_reproj_error = MAX_REPROJECTION_ERROR_PX
+    options.min_model_size = MIN_PHOTOS
     # A second attempt from another pair stops, by default, once it shares twenty photos with the first, however small
     # that one stayed; here every attempt goes on as far as it can, and the largest is taken.
     options.max_model_overlap = photos
@@ -144,16 +145,17 @@ def _mapper_options(settings: MapSettings, photos: int, seed: int) -> pycolmap.I
 def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], share: float) -> None:
     """StageError when the largest model holds too few of the photos."""
     count = models[0].num_reg_images() if models else 0
-    if count >= 3 and count >= share * len(names):
+    if count >= MIN_PHOTOS and count >= share * len(names):
         return
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
     missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
+    some = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
     raise StageError(
-        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} asked for "
-        f"by min_registered_share; not registered: {', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}. "
-        f"Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs "
-        f"that were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower "
-        f"min_registered_share"
+        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} that"
+        f" min_registered_share requires; not registered: {some}."
+        " Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs that"
+        " were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower"
+        " min_registered_share"
     )
 
 

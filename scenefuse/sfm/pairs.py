@@ -16,27 +16,35 @@ from scenefuse.stage import setting
 Pair = tuple[str, str]
 
 
+# GPS positions that spread less (RMS, metres) than this do not tell neighbours from others: five times the standard
+# error of a plain receiver.
+MIN_GPS_SPREAD_M = 15.0
+
+
 @dataclass(frozen=True)
-class PairSettings:
-    """The choice of pairs."""
+class MatchSettings:
+    """Which pairs of photos are compared, and how."""
 
     pairs: Literal["auto", "exhaustive", "spatial", "sequential"] = setting("auto")
-    """auto: by GPS where most photos have it, in sequence for a video, all pairs of a small set, else in sequence."""
-    spatial_from: int = setting(40, least=0)
-    """auto compares GPS neighbours only from this many photos on."""
+    """Pairs of photos that are compared; auto: by GPS where most photos have it, in sequence for a video, all pairs of
+    a small set, else in sequence."""
     exhaustive_up_to: int = setting(200, least=0)
-    """auto compares all pairs up to this many photos."""
-    neighbours: int = setting(20, least=0)
-    """spatial: nearest photos (horizontal distance) that each photo is compared with."""
-    overlap: int = setting(10, least=0)
-    """sequential: following photos that each photo is compared with."""
-    loop_every: int = setting(5, least=0)
-    """sequential: every n-th photo is compared with every other n-th photo, which closes loops."""
-    gps_accuracy_m: float = setting(3, unit="m", least=0)
-    """Standard error of a GPS position; positions that spread less than five times this are not used."""
+    """Auto compares all pairs up to this many photos."""
+    max_ratio: float = setting(0.7, above=0)
+    """Lowe's ratio test: best over second-best descriptor distance."""
+    guided_matching: bool = setting(True)
+    """Match again along the epipolar lines once a pair is verified."""
+    spatial_from: int = 40
+    """Auto compares GPS neighbours only from this many photos on: all pairs of fewer cost little."""
+    neighbours: int = 20
+    """Spatial: nearest photos (horizontal distance) that each photo is compared with."""
+    overlap: int = 10
+    """Sequential: following photos that each photo is compared with."""
+    loop_every: int = 5
+    """Sequential: every n-th photo is compared with every other n-th photo, which closes loops."""
 
 
-def choose_pairs(photos: list[Photo], is_video: bool, settings: PairSettings) -> tuple[str, str, list[Pair]]:
+def choose_pairs(photos: list[Photo], is_video: bool, settings: MatchSettings) -> tuple[str, str, list[Pair]]:
     """The kind of pairs, why, and the pairs themselves, sorted by the photos' order (method M5).
 
     Args:
@@ -48,8 +56,8 @@ def choose_pairs(photos: list[Photo], is_video: bool, settings: PairSettings) ->
     kind, reason = settings.pairs, "as configured"
     if kind == "auto":
         kind, reason = _automatic(photos, is_video, settings)
-    if kind == "spatial" and not _gps_usable(photos, settings.gps_accuracy_m):
-        kind, reason = "exhaustive", "spatial pairs were asked for, but too few photos have a useful GPS position"
+    if kind == "spatial" and not _gps_usable(photos):
+        kind, reason = "exhaustive", "pairs are set to spatial, but too few photos have a useful GPS position"
     if kind == "exhaustive":
         return kind, reason, list(combinations(names, 2))
     if kind == "spatial":
@@ -94,10 +102,10 @@ def gps_spread_m(positions: NDArray[np.float64]) -> float:
 
 
 def _automatic(
-    photos: list[Photo], is_video: bool, settings: PairSettings
+    photos: list[Photo], is_video: bool, settings: MatchSettings
 ) -> tuple[Literal["exhaustive", "spatial", "sequential"], str]:
     count = len(photos)
-    if count >= settings.spatial_from and _gps_usable(photos, settings.gps_accuracy_m):
+    if count >= settings.spatial_from and _gps_usable(photos):
         return "spatial", f"{count} photos with GPS, {settings.neighbours} neighbours each"
     if is_video and count > settings.overlap * 2:
         return "sequential", "frames of a video"
@@ -106,9 +114,9 @@ def _automatic(
     return "sequential", f"{count} photos without GPS, more than {settings.exhaustive_up_to}"
 
 
-def _gps_usable(photos: list[Photo], accuracy_m: float) -> bool:
+def _gps_usable(photos: list[Photo]) -> bool:
     known, positions = gps_positions(photos)
-    return len(known) >= max(3, 0.8 * len(photos)) and gps_spread_m(positions) > 5.0 * accuracy_m
+    return len(known) >= max(3, 0.8 * len(photos)) and gps_spread_m(positions) > MIN_GPS_SPREAD_M
 
 
 def _ordered(a: str, b: str, order: dict[str, int]) -> Pair:

@@ -1,5 +1,7 @@
-"""A folder of photos: which files they are, whether each can be decoded, and what their EXIF says."""
+"""Photos as the reconstruction reads them: checked, upright, and what their EXIF says."""
 
+import os
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -7,12 +9,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
-from PIL.ExifTags import IFD, Base
+from PIL import Image, ImageOps
+from PIL.ExifTags import GPS, IFD, Base
 
-from scenefuse.stage import StageError, quantity, read_json, sha256, threads, write_json
+from scenefuse.sfm.photo_files import photo_files
+from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
+# Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.
+JPEG_QUALITY = 97
+# What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.
+KEPT_EXIF = {
+    IFD.Exif: (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.DateTimeOriginal),
+    IFD.GPSInfo: (GPS.GPSLatitudeRef, GPS.GPSLatitude, GPS.GPSLongitudeRef, GPS.GPSLongitude)
+    + (GPS.GPSAltitudeRef, GPS.GPSAltitude),
+}
 
 
 @dataclass(frozen=True)
@@ -21,8 +31,8 @@ class Photo:
 
     Attributes:
         name: path relative to its folder, with forward slashes.
-        width: columns as stored, before any EXIF rotation.
-        height: rows as stored.
+        width: columns as stored; as people see them where `orientation` is 1.
+        height: rows, likewise.
         sha256: of the file's bytes.
         latitude_deg: WGS84 latitude from EXIF, or None.
         longitude_deg: WGS84 longitude from EXIF, or None.
@@ -49,91 +59,137 @@ class Photo:
         return self.latitude_deg is not None and self.longitude_deg is not None
 
 
-def list_photos(*, folder: Path, photos: Path) -> None:
-    """List the photos of a folder and its subfolders, and check that every one can be decoded.
+def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
+    """List the photos of a folder and its subfolders, check that every one can be decoded, and stand them upright.
+
+    Photos that EXIF says are rotated are turned and written again; all others are linked. From here on pixels count as
+    people see them.
 
     Args:
         folder: folder of photos; JPEG, PNG, TIFF or BMP.
-        photos: output, JSON with name, size in pixels, SHA-256, position and focal length of each photo.
+        upright: output, folder of the same names with upright copies of the rotated photos and links to all others.
+        photos: output, JSON with name, size in pixels, SHA-256, position and focal length of each photo in `upright`.
 
     Raises:
         StageError: the folder is missing or holds no photo, or a photo cannot be decoded.
     """
     names = photo_names(folder)
-    with ThreadPoolExecutor(threads()) as pool:
-        listed = list(pool.map(lambda name: inspect_photo(folder, name), names))
+    with atomic_directory(upright) as temporary, ThreadPoolExecutor(threads()) as pool:
+        listed = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
+    turned = [p.name for p in listed if not (upright / p.name).is_symlink()]
     notes = photo_notes(listed)
+    if turned:
+        notes.append(f"{len(turned)} photos ({turned[0]}, ...) carry an EXIF rotation; upright copies of them are used")
     with_gps = sum(p.has_gps for p in listed)
     print(f"{len(listed)} photos in {folder}, {with_gps} with a GPS position", flush=True)
-    for note in notes:
-        print(f"note: {note}", flush=True)
-    write_photos(photos, listed, folder, kind="photos", notes=notes)
+    write_photos(photos, listed, upright, kind="photos", notes=notes, turned=quantity(turned, ""))
 
 
 def photo_names(folder: Path) -> list[str]:
-    """Relative names of all photos below a folder, sorted; StageError when there are none."""
-    if not folder.is_dir():
-        raise StageError(f"the photo folder {folder} does not exist; check its path in the configuration")
-    files = [p for p in folder.rglob("*") if p.is_file() and not p.name.startswith(".")]
-    names = sorted(p.relative_to(folder).as_posix() for p in files if p.suffix.lower() in SUFFIXES)
-    if not names:
-        raise StageError(
-            f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there "
-            f"({len(files)} other files were found)"
-        )
-    spaced = next((name for name in names if any(c.isspace() for c in name)), None)
-    if spaced is not None:
-        raise StageError(f"'{spaced}' in {folder} has a space in its name, which COLMAP's lists cannot hold; rename it")
+    """Relative names of all photos below a folder, sorted; see `photo_files`.
+
+    Raises:
+        StageError: what `photo_files` says; a name that holds control characters or undecodable bytes.
+    """
+    names = [file.relative_to(folder).as_posix() for file in photo_files(folder)]
+    odd = next((name for name in names if not name.isprintable()), None)
+    if odd is not None:
+        raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
     return names
+
+
+def _stood_upright(folder: Path, name: str, output: Path) -> Photo:
+    """Link or turn one photo into `output`; what is listed is the result."""
+    photo, target = inspect_photo(folder, name), output / name
+    target.parent.mkdir(parents=True, exist_ok=True)
+    if photo.orientation == 1:
+        target.symlink_to(os.path.relpath(os.path.realpath(folder / name), os.path.realpath(target.parent)))
+        return photo
+    save_upright(folder / name, target)
+    return inspect_photo(output, name)
+
+
+def save_upright(source: Path, target: Path, max_width_px: int | None = None) -> tuple[int, int]:
+    """Write a photo as people see it, at most `max_width_px` wide; position, camera and focal length in EXIF stay.
+
+    Returns:
+        Width and height of the upright photo before it was scaled.
+    """
+    with open(source, "rb") as file, Image.open(file) as image:
+        before = image.getexif()
+        exif = Image.Exif()
+        exif.update({tag: before[tag] for tag in (Base.Make, Base.Model) if tag in before})
+        for block, wanted in KEPT_EXIF.items():
+            if tags := {tag: entry for tag, entry in before.get_ifd(block).items() if tag in wanted}:
+                exif[block] = tags
+        upright = ImageOps.exif_transpose(image)
+        size = upright.size
+        if max_width_px is not None and upright.width > max_width_px:
+            height = round(upright.height * max_width_px / upright.width)
+            upright = upright.resize((max_width_px, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
+        coded: dict[str, Any] = (
+            {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
+        )
+        upright.save(target, exif=exif.tobytes(), **coded)
+    return size
+
+
+def check_unchanged(folder: Path, photos: Iterable[Photo]) -> None:
+    """Check that photos are still the files that were listed.
+
+    Raises:
+        StageError: photos are missing, or have other bytes than when they were listed.
+    """
+    photos = list(photos)
+    missing = [p.name for p in photos if not (folder / p.name).is_file()]
+    if missing:
+        raise StageError(
+            f"{len(missing)} photos are missing in {folder}, {missing[0]} for one; put them back, or delete the"
+            " photos.json that lists them and run again"
+        )
+    with ThreadPoolExecutor(threads()) as pool:
+        found = pool.map(lambda photo: sha256(folder / photo.name), photos)
+        changed = [photo.name for photo, digest in zip(photos, found) if digest != photo.sha256]
+    if changed:
+        raise StageError(
+            f"{folder / changed[0]} is not the photo that was listed any more ({len(changed)} have changed); delete the"
+            " photos.json that lists it and run again"
+        )
 
 
 def inspect_photo(folder: Path, name: str) -> Photo:
     """Decode one photo completely and read its EXIF; StageError names a photo that cannot be decoded."""
     path = folder / name
     try:
-        with Image.open(path) as image:
+        # Opened by handle: by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
+        with open(path, "rb") as file, Image.open(file) as image:
+            exif = image.getexif()
+            # Decoding a TIFF turns it upright and forgets the tag.
+            orientation = int(exif.get(Base.Orientation, 1) or 1)
+            camera = f"{_text(exif.get(Base.Make))} {_text(exif.get(Base.Model))}".strip()
+            latitude, longitude, altitude = _position(exif.get_ifd(IFD.GPSInfo))
+            equivalent_mm = _number(exif.get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm))
             image.load()
             width, height = image.size
-            exif = image.getexif()
     except Exception as error:
         raise StageError(
             f"the photo {path} cannot be decoded ({str(error) or type(error).__name__}); "
             f"replace it or remove it from the folder"
         ) from None
-    latitude, longitude, altitude = _position(exif.get_ifd(IFD.GPSInfo))
-    equivalent_mm = _number(exif.get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm))
     # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
     focal_px = equivalent_mm / 36.0 * max(width, height) if equivalent_mm else None
-    camera = f"{_text(exif.get(Base.Make))} {_text(exif.get(Base.Model))}".strip()
-    orientation = int(exif.get(Base.Orientation, 1) or 1)
-    return Photo(
-        name,
-        width,
-        height,
-        sha256(path),
-        latitude,
-        longitude,
-        altitude,
-        focal_px,
-        camera,
-        orientation,
-    )
+    digest = sha256(path)
+    return Photo(name, width, height, digest, latitude, longitude, altitude, focal_px, camera, orientation)
 
 
 def photo_notes(photos: list[Photo]) -> list[str]:
-    """What a person should know about a list of photos: repeated files, rotated files, odd sizes."""
+    """What a person should know about a list of photos: repeated files, odd sizes."""
     notes = []
     first_of: dict[str, str] = {}
     for photo in photos:
         if photo.sha256 in first_of:
             notes.append(f"{photo.name} is a copy of {first_of[photo.sha256]}")
         first_of.setdefault(photo.sha256, photo.name)
-    rotated = [p.name for p in photos if p.orientation != 1]
-    if rotated:
-        notes.append(
-            f"{len(rotated)} photos ({rotated[0]}, ...) carry an EXIF rotation, which is not applied: "
-            f"pixel coordinates count in the file as stored"
-        )
     sizes = {(p.width, p.height) for p in photos}
     if len(sizes) > 1:
         notes.append(f"the photos have {len(sizes)} different sizes")
@@ -143,7 +199,9 @@ def photo_notes(photos: list[Photo]) -> list[str]:
 def write_photos(
     path: Path, photos: list[Photo], folder: Path, kind: str, notes: list[str], **more: dict[str, Any]
 ) -> None:
-    """Write photos.json; `kind` is "photos" or "video", `more` are further quantities."""
+    """Write photos.json, and print its notes; `kind` is "photos" or "video", `more` are further quantities."""
+    for note in notes:
+        print(f"note: {note}", flush=True)
     content = {
         "folder": folder,
         "kind": quantity(kind, ""),
@@ -164,12 +222,10 @@ def read_photos(path: Path) -> list[Photo]:
 def gps_positions(photos: list[Photo]) -> tuple[list[str], NDArray[np.float64]]:
     """Names and (N, 3) WGS84 latitude (deg), longitude (deg), altitude (m) of the photos that have a position.
 
-    A missing altitude becomes the median of the others, or 0.
+    A missing altitude is NaN.
     """
     known = [p for p in photos if p.has_gps]
-    altitudes = [p.altitude_m for p in known if p.altitude_m is not None]
-    middle = float(np.median(altitudes)) if altitudes else 0.0
-    rows = [(p.latitude_deg, p.longitude_deg, middle if p.altitude_m is None else p.altitude_m) for p in known]
+    rows = [(p.latitude_deg, p.longitude_deg, np.nan if p.altitude_m is None else p.altitude_m) for p in known]
     return [p.name for p in known], np.array(rows, dtype=np.float64).reshape(-1, 3)
 
 

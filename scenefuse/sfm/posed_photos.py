@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scenefuse.stage import StageError
+from scenefuse.workspace import posed_images, read_model
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
@@ -76,18 +77,13 @@ def find_posed_photos(data: Path, images: Path | None) -> tuple[list[PosedPhoto]
 
 
 def _read_colmap(model: Path, images: Path) -> list[PosedPhoto]:
-    try:
-        reconstruction = pycolmap.Reconstruction(model)
-    except Exception as error:
-        raise StageError(f"{model} is not a readable COLMAP model ({error}); export it again") from None
-    photos = []
-    for image in sorted(reconstruction.images.values(), key=lambda i: i.name):
-        if image.has_pose:
-            pose = np.eye(4)
-            pose[:3] = image.cam_from_world().inverse().matrix()
-            camera = reconstruction.cameras[image.camera_id]
-            name = "_".join(Path(image.name).parts)
-            photos.append(PosedPhoto(name, images / image.name, camera, pose, None, False))
+    reconstruction, photos = read_model(model), []
+    for image in posed_images(reconstruction):
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        camera = reconstruction.cameras[image.camera_id]
+        name = "_".join(Path(image.name).parts)
+        photos.append(PosedPhoto(name, images / image.name, camera, pose, None, False))
     missing = [photo.file for photo in photos if not photo.file.is_file()]
     if missing:
         raise StageError(

@@ -1,73 +1,123 @@
-"""Photos without lens distortion, as dense reconstruction and training want them."""
+"""Photos without lens distortion, as dense reconstruction, masks and training want them."""
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import cv2
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
+from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.stage import StageError, atomic_directory, manifest, quantity, setting, threads, write_json
+from scenefuse.sfm.photos import JPEG_QUALITY, check_unchanged, read_photos
+from scenefuse.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
+from scenefuse.workspace import View, read_workspace
+
+# A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
+# alone scales by a few percent, which bilinear sampling does better without.
+AVERAGE_ABOVE = 1 / 0.9
 
 
 @dataclass(frozen=True)
 class UndistortSettings:
-    """Size and quality of undistorted photos."""
+    """Size of undistorted photos."""
 
-    max_size_px: int = setting(2000, unit="px", least=0)
+    max_size_px: int = setting(2000, unit="px", least=1)
     """Longest side of an undistorted photo; larger ones are scaled down (method M4)."""
-    jpeg_quality: int = setting(97, least=0)
-    """Quality of undistorted JPEG files, 1 to 100."""
 
 
-def undistort_photos(*, folder: Path, sparse: Path, dense: Path, report: Path, settings: UndistortSettings) -> None:
-    """Write a COLMAP workspace: undistorted photos with PINHOLE cameras.
+def undistort_photos(
+    *,
+    folder: Path,
+    photos: Path,
+    sparse: Path,
+    georeference: Path | None = None,
+    workspace: Path,
+    report: Path,
+    settings: UndistortSettings,
+) -> None:
+    """Write a COLMAP workspace of undistorted photos with PINHOLE cameras, and find which way is up in its frame.
 
     Args:
         folder: folder of the original photos.
-        sparse: COLMAP model of them.
-        dense: output, workspace with images/, sparse/ and stereo/.
-        report: output, JSON: sizes and the hashes of all files.
-        settings: size and quality.
+        photos: JSON list of them.
+        sparse: COLMAP model of them; its world is the workspace's.
+        georeference: JSON of a model that has been turned upright, whose z is up; without it the cameras say.
+        workspace: output, COLMAP workspace with images/ and sparse/.
+        report: output, JSON: up direction, sizes, hashes of all files.
+        settings: size.
 
     Raises:
-        StageError: a photo of the model is missing in the folder.
+        StageError: a photo is missing in the folder, or has changed since it was listed.
     """
-    with atomic_directory(dense) as temporary:
-        write_workspace(folder, sparse, temporary, settings)
-    content = describe_workspace(dense)
-    print(f"{content['photos']['value']} undistorted photos", flush=True)
-    write_json(report, {**content, "files": quantity(manifest(dense), "")})
-
-
-def write_workspace(folder: Path, sparse: Path, output: Path, settings: UndistortSettings) -> None:
-    """Undistort into an existing empty folder."""
-    model = pycolmap.Reconstruction(sparse)
-    missing = [i.name for i in model.images.values() if i.has_pose and not (folder / i.name).is_file()]
-    if missing:
-        raise StageError(
-            f"{len(missing)} photos of the model {sparse} are missing in {folder}, {missing[0]} for one; "
-            f"put them back, or rerun from the photo list"
+    check_unchanged(folder, read_photos(photos))
+    with atomic_directory(workspace) as temporary:
+        cancellable(
+            pycolmap.undistort_images,
+            temporary,
+            sparse,
+            folder,
+            undistort_options=pycolmap.UndistortCameraOptions(max_image_size=settings.max_size_px),
+            jpeg_quality=JPEG_QUALITY,
+            num_threads=threads(),
         )
-    cancellable(
-        pycolmap.undistort_images,
-        output,
-        sparse,
-        folder,
-        undistort_options=pycolmap.UndistortCameraOptions(max_image_size=settings.max_size_px),
-        jpeg_quality=settings.jpeg_quality,
-        num_threads=threads(),
+        # For COLMAP's own dense part, which reads neither from here.
+        shutil.rmtree(temporary / "stereo", ignore_errors=True)
+        for script in temporary.glob("run-colmap-*.sh"):
+            script.unlink()
+    known_cue = None if georeference is None else str(value(read_json(georeference), "up_cue"))
+    write_json(report, _report(workspace, known_cue))
+
+
+def undistort_picture(pixels: NDArray[Any], camera: pycolmap.Camera, view: View) -> NDArray[Any]:
+    """Move a picture or mask from the pixels of an original photo into those of the undistorted one.
+
+    Args:
+        pixels: (H, W) or (H, W, C), uint8, uint16 or float32, of the photo's size or of a smaller or larger copy.
+        camera: of the original photo.
+        view: the undistorted photo; its pose does not matter.
+
+    Returns:
+        (view.height, view.width[, C]) of the same type, sampled bilinearly; 0 where the original shows nothing.
+    """
+    width, height = pixels.shape[1], pixels.shape[0]
+    shrink = view.intrinsics[0, 0] * camera.width / (camera.mean_focal_length() * width)
+    if shrink * AVERAGE_ABOVE < 1:
+        width, height = max(round(width * shrink), 1), max(round(height * shrink), 1)
+        pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
+    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ np.linalg.inv(view.intrinsics).T
+    at = np.asarray(camera.img_from_cam(rays)).reshape(view.height, view.width, 2)
+    at = (at * np.array([width / camera.width, height / camera.height]) - 0.5).astype(np.float32)
+    x, y = np.moveaxis(at, -1, 0)
+    return cv2.remap(pixels, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+
+
+def _report(folder: Path, known_cue: str | None) -> dict[str, Any]:
+    """Content of undistorted.json; `known_cue` says what turned the frame upright already."""
+    workspace = read_workspace(folder)
+    poses = np.stack([view.world_from_cam for view in workspace.views])
+    up, cue = estimate_up(poses[:, :3, :3], poses[:, :3, 3])
+    if known_cue is not None:
+        up, cue = np.array([0.0, 0.0, 1.0]), known_cue
+    roll_deg = roll_spread_deg(poses[:, :3, :3], up)
+    print(
+        f"{len(workspace.views)} undistorted photos; up: {np.round(up, 3)} from {cue}, median roll {roll_deg:.2f} deg",
+        flush=True,
     )
-    for script in output.glob("run-colmap-*.sh"):
-        script.unlink()
-
-
-def describe_workspace(workspace: Path) -> dict[str, dict[str, object]]:
-    """Photos, their sizes and focal lengths in an undistorted workspace, as quantities."""
-    model = pycolmap.Reconstruction(workspace / "sparse")
-    cameras = [c for _, c in sorted(model.cameras.items())]
+    cameras = sorted(
+        {(v.width, v.height, round(float(np.mean(np.diag(v.intrinsics)[:2])), 3)) for v in workspace.views}
+    )
     return {
-        "photos": quantity(model.num_reg_images(), "1"),
-        "sizes_px": quantity(sorted({(c.width, c.height) for c in cameras}), "px"),
-        "focal_px": quantity([round(float(c.mean_focal_length()), 3) for c in cameras], "px"),
-        "points": quantity(model.num_points3D(), "1"),
+        "up_in_camera_frame": quantity(up, "1"),
+        "up_cue": quantity(cue, ""),
+        "camera_roll_median_deg": quantity(roll_deg, "deg"),
+        "photos": quantity(len(workspace.views), "1"),
+        "points": quantity(len(workspace.points), "1"),
+        "sizes_px": quantity(sorted({camera[:2] for camera in cameras}), "px"),
+        "focal_px": quantity([camera[2] for camera in cameras], "px"),
+        "files": quantity(manifest(folder), ""),
     }

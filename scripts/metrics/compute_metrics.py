@@ -1,6 +1,6 @@
 """Measure a registration and a completion."""
 
-from scenefuse.metrics.registration import compute_metrics
+from scenefuse.metrics.compute_metrics import compute_metrics
 from scenefuse.stage import run
 
 if __name__ == "__main__":

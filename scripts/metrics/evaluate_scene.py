@@ -1,6 +1,6 @@
 """Judge a scene of the demo against its truth."""
 
-from scenefuse.metrics.evaluation import evaluate_scene
+from scenefuse.metrics.evaluate_scene import evaluate_scene
 from scenefuse.stage import run
 
 if __name__ == "__main__":

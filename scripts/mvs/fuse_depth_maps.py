@@ -1,6 +1,6 @@
 """Fuse a scene's depth maps into its dense cloud."""
 
-from scenefuse.mvs.depth_maps import fuse_depth_maps
+from scenefuse.mvs.dense_cloud import fuse_depth_maps
 from scenefuse.stage import run
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Match features between chosen pairs of photos."""
 
-from scenefuse.sfm.features import match_features
+from scenefuse.sfm.matches import match_features
 from scenefuse.stage import run
 
 if __name__ == "__main__":

@@ -9,47 +9,46 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import yaml
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.settings import build, merge, read_settings
+from scenefuse.io.settings import ROOT, build, read_settings
 from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
-from scenefuse.registration.fine import FineSettings, register_finely
+from scenefuse.registration.fine import EvidenceFiles, register_finely
+from scenefuse.registration.paper import register_as_paper
+from scenefuse.registration.problem import Inputs
+from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
 
 OBJECTS = ("house", "balloon", "sculpture")
 
 
-def one(results: Path, name: str, variant: str, seed: int, settings: dict[str, Any], true: Sim3) -> dict[str, Any]:
+def one(results: Path, name: str, variant: str, seed: int, options: dict[str, Any], true: Sim3) -> dict[str, Any]:
     """Register one object again with another seed, from the workflow's crop and scale, and measure it."""
     folder, scene = results / "objects" / name, results / "scenes/demo"
-    own = merge(settings["registration"], settings["variants"][variant])
-    files = {
-        "object": folder / "object.ply",
-        "crop": folder / f"registration/{variant}/crop.ply",
-        "crop_report": folder / f"registration/{variant}/crop.json",
-        "scale": folder / f"registration/{variant}/scale.json",
-        "cameras": folder / "undistorted.json",
-    }
+    made = folder / "registration" / variant
+    inputs = Inputs(folder / "object.ply", made / "crop.ply", made / "crop.json", folder / "undistorted.json")
     with tempfile.TemporaryDirectory() as temporary:
-        coarse, fine = Path(temporary) / "coarse.json", Path(temporary) / "fine.json"
-        register_coarsely(
-            **files, report=coarse, recipe=own["coarse"]["recipe"], seed=seed,
-            settings=build(CoarseSettings, own["coarse"]),
-        )  # fmt: skip
-        register_finely(
-            **files, coarse=coarse, alignment=folder / "alignment.json", workspace=scene / "undistorted",
-            depth=sorted(p for p in (scene / "depth").iterdir() if p.is_dir()), fine=fine,
-            recipe=own["fine"]["recipe"], voxel_fraction=own["fine"]["voxel_fraction"], seed=seed,
-            settings=build(FineSettings, own["fine"]),
-        )  # fmt: skip
+        scale, coarse, fine = (Path(temporary) / f"{step}.json" for step in ("scale", "coarse", "fine"))
+        if variant == "paper":
+            register_as_paper(inputs=inputs, scale_report=scale, coarse_report=coarse, report=fine, seed=seed)
+        else:
+            scale, depth = made / "scale.json", tuple(p for p in sorted((scene / "depth").iterdir()) if p.is_dir())
+            evidence = EvidenceFiles(folder / "alignment.json", scene / "undistorted", depth)
+            settings = build(CoarseSettings, options.get("coarse", {})), build(FineSettings, options.get("fine", {}))
+            register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=seed, settings=settings[0])
+            register_finely(
+                inputs=inputs, scale_json=scale, coarse_json=coarse, evidence=evidence, report=fine, seed=seed,
+                settings=settings[1],
+            )  # fmt: skip
         found = read_json(fine)
     reference = read_json(folder / "registration/full/crop.json")
     obj, crop = read_cloud(folder / "object.ply"), read_cloud(folder / "registration/full/crop.ply")
-    diagonal, measures = value(reference, "diagonal"), build(MetricSettings, settings["metrics"])
+    diagonal, measures = value(reference, "diagonal"), MetricSettings()
     pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
     measured = registration_metrics(obj, crop, pose, measures.tau_fraction * diagonal, diagonal, "m", measures)
     error = registration_error(pose, true, *_size(obj, true))
@@ -81,7 +80,8 @@ def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
         results: folder of a finished demo.
         seeds: 0 to this.
     """
-    settings, rows = read_settings(None), []
+    shipped, rows = read_settings(None)["registration"]["variants"], []
+    variants = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
     truth = results / "demo/demo/truth"
     scene_cameras = read_cameras(truth / "scene/cameras.json")
     scene = fit_cameras(read_posed(results / "scenes/demo/georeferenced", scene_cameras), scene_cameras)
@@ -90,9 +90,7 @@ def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
         orbit = fit_cameras(read_posed(results / f"objects/{name}/undistorted/sparse", cameras), cameras)
         true = scene.truth_from_model.inverse() @ orbit.truth_from_model
         rows += [
-            one(results, name, variant, seed, settings, true)
-            for variant in settings["variants"]
-            for seed in range(seeds)
+            one(results, name, variant, seed, variants[variant], true) for variant in shipped for seed in range(seeds)
         ]
     table = pd.DataFrame(rows)
     out = results / "bench/ablation.tsv"

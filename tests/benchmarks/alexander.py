@@ -12,12 +12,14 @@ import pandas as pd
 
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import ROOT, build, read_settings
-from scenefuse.masks.make_masks import MaskSettings, make_masks, read_frames
+from scenefuse.masks.make_masks import MaskInputs, make_masks
+from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.metrics.truth import mask_iou
 from scenefuse.report.object_sheet import inner, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.stage import read_json, run, value
+from scenefuse.workspace import read_workspace
 
 EXAMPLE = ROOT / "config/examples/alexander"
 WRONG = {"DSC05138.JPG"}
@@ -35,15 +37,16 @@ def alexander(*, results: Path, given: Path) -> None:
         given: folder of supplied masks.
     """
     folder, shipped = results / "objects/alexander", read_settings(EXAMPLE / "config.yaml")
-    frames, _ = read_frames(folder / "undistorted")
-    supplied = supplied_masks(given, folder / "sparse", frames)
+    views = read_workspace(folder / "undistorted").views
+    supplied, _ = supplied_masks(given, folder / "sparse", views)
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         make_masks(
-            cameras=folder / "undistorted", cameras_json=folder / "undistorted.json", sfm=folder / "sparse",
-            photos=folder / "photos.json", method="grabcut", prompts=EXAMPLE / "prompts.tsv", supplied=None,
-            sam2_encoder=Path(), sam2_decoder=Path(), sam2_checkpoint=None, keep="object",
-            settings=build(MaskSettings, shipped["object"]["masks"]),
+            inputs=MaskInputs(
+                workspace=folder / "undistorted", undistorted_json=folder / "undistorted.json",
+                sparse=folder / "sparse", photos_json=folder / "photos.json", prompts=EXAMPLE / "prompts.tsv",
+            ),
+            settings=build(MaskSettings, shipped["object"]["masks"] | {"method": "grabcut"}),
             seed=shipped["seed"], masks=work / "masks", contact_sheet=results / "bench/alexander_grabcut.png",
             report=work / "masks.json",
         )  # fmt: skip

@@ -20,8 +20,8 @@ import pycolmap
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
-from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
-from scenefuse.depth.train_depth import DepthSettings, train_depth
+from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.mvs.photo_refinement import RefinementSettings
@@ -32,13 +32,13 @@ from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
 from scenefuse.nerf.training import Schedule
 from scenefuse.stage import quantity, run, write_json
 
+# A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
+SMALL = {"width_px": 160, "crop_px": 72}
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
     ("scenefuse.depth.train_depth", "load_views"): "loading",
     ("scenefuse.depth.train_depth", "network_inputs"): "plane sweep",
     ("scenefuse.depth.train_depth", "train_networks"): "training",
-    ("scenefuse.depth.refine_depth", "load_views"): "loading",
-    ("scenefuse.depth.refine_depth", "network_inputs"): "plane sweep",
     ("scenefuse.depth.refine_depth", "train_networks"): "training",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
     ("scenefuse.nerf.train_object_nerf", "make_photos"): "loading",
@@ -80,13 +80,13 @@ def workspace(photos: Path, truth: Path, chosen: list[int], folder: Path, seed: 
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(np.column_stack([turn, -turn @ few.centres[index]])))
         for place, row in enumerate(rows):
             tracks[row].append(pycolmap.TrackElement(index + 1, place))
-        (folder / "cameras/images" / name).symlink_to((photos / name).resolve())
+        (folder / "undistorted/images" / name).symlink_to((photos / name).resolve())
         mask = f"{Path(name).stem}.png"
         (folder / "masks" / mask).symlink_to((truth / "masks" / mask).resolve())
     for point, track in zip(points, tracks):
         if len(track) > 1:
             model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
-    model.write_binary(folder / "cameras/sparse")
+    model.write_binary(folder / "undistorted/sparse")
     write_json(folder / "undistorted.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
 
 
@@ -100,7 +100,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
 
     def nerf(number: int, prior: int, previous: Path | None) -> None:
-        settings = own["nerf"] | own["matching"] | own[f"stage{number}"]
+        settings = own["nerf"] | own[f"stage{number}"]
         train_object_nerf(
             **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
             report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
@@ -111,14 +111,15 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     start, began = time.monotonic(), os.times()
     if part == "stage1":
         train_depth(
-            **inputs, **common, stage=folder / part, report=folder / "stage1.json",
-            settings=build(DepthSettings, own["stage1"]),
+            workspace=folder / "undistorted", masks=folder / "masks", **common, stage=folder / part,
+            report=folder / "stage1.json", settings=replace(build(DepthTrainingSettings, own["stage1"]), **SMALL),
         )  # fmt: skip
     elif part == "stage2":
         nerf(2, 1, None)
     elif part == "stage3":
         refine_depth(
-            **inputs, **common, previous=folder / "stage1", rendered=folder / "stage2", stage=folder / part,
+            workspace=folder / "undistorted", masks=folder / "masks", **common, stage=folder / part,
+            earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
             report=folder / "stage3.json", settings=build(FeedbackSettings, own["stage3"]),
         )  # fmt: skip
     elif part == "stage4":
@@ -127,7 +128,7 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
         make_object_cloud(
             **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
             cameras_report=folder / "undistorted.json", cloud=folder / "object.ply", report=folder / "object.json",
-            refinement=build(RefinementSettings, own["cloud"] | own["matching"]),
+            refinement=build(RefinementSettings, own["cloud"]),
             settings=build(CloudSettings, own["cloud"]),
         )  # fmt: skip
     now = os.times()

@@ -74,11 +74,11 @@ def lego(
     chosen = build(NerfSettings, settings["nerf"] | FLAGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        places = {"cameras": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        places = {"workspace": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
             data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )
-        views = load_views(places["cameras"], places["mattes"], chosen.width_px, 0)
+        views = load_views(places["workspace"], places["mattes"], chosen.width_px, 0)
     start = time.perf_counter()
     trained, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
     outlines = silhouettes(views.masks[trained], views.intrinsics[trained], views.object_from_cam[trained])

@@ -17,7 +17,8 @@ from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
 from scenefuse.cores import use_threads
 from scenefuse.io.settings import build, read_settings
-from scenefuse.mvs.plane_sweep import DepthSettings, Photo, _Matcher
+from scenefuse.mvs.matcher import Matcher
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf import encoding, kernels
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
 from scenefuse.nerf.field import FieldSettings
@@ -26,6 +27,7 @@ from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
 from scenefuse.stage import run
+from scenefuse.workspace import View
 
 LEVELS, LOG2_TABLE, COARSEST, FINEST, SAMPLES = 16, 19, 16, 1024, 32768
 
@@ -85,17 +87,18 @@ def matching() -> dict[str, Callable[[], None]]:
     """A chunk of the plane sweep, by the kernel and in plain PyTorch."""
     rng = np.random.default_rng(0)
     grays = [cv2.GaussianBlur(rng.random((300, 400), np.float32), (0, 0), 2) for _ in range(9)]
-    poses = [np.column_stack([np.eye(3), [x, 0, 0]]) for x in (0, -4, -3, -2, -1, 1, 2, 3, 4)]
+    poses = np.repeat(np.eye(4)[None], 9, axis=0)
+    poses[:, 0, 3] = 0, -4, -3, -2, -1, 1, 2, 3, 4
     intrinsics = np.array([[350, 0, 200], [0, 350, 150], [0, 0, 1.0]])
-    photos = [Photo(gray, intrinsics, pose) for gray, pose in zip(grays, poses)]
-    settings = build(DepthSettings, read_settings(None)["scene"]["depth_maps"])
-    matcher = _Matcher(photos[0], photos[1:], settings, "cpu")
+    photos = [View("", intrinsics, pose, 400, 300, gray) for gray, pose in zip(grays, poses)]
+    settings = build(DepthMapSettings, read_settings(None)["scene"]["depth_maps"])
+    matcher = Matcher(photos[0], photos[1:], settings.best_sources, settings.window_px, "cpu")
     inverse = torch.linspace(1 / 60, 1 / 20, 16)[:, None, None].expand(-1, 300, 400).contiguous()
 
     def plain() -> None:
         best = inverse.new_full((matcher.best, *inverse.shape), -0.5)
         for source in matcher.sources:
-            matcher._keep_best(inverse, best, *source)
+            matcher.keep_best(inverse, best, *source)
 
     return {"scenefuse": lambda: matcher.score(inverse), "scenefuse in plain PyTorch": plain}
 

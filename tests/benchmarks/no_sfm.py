@@ -15,11 +15,11 @@ import cv2
 import numpy as np
 import pycolmap
 
-from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
-from scenefuse.depth.train_depth import DepthSettings, train_depth
+from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import cloud_results, read_object_truth
+from scenefuse.metrics.object_truth import cloud_results, read_object_truth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -32,7 +32,7 @@ from scenefuse.stage import quantity, run, value, write_json
 
 def workspace(frames: Path, masks: Path, folder: Path) -> None:
     """An undistorted workspace that knows no poses: the photos, their EXIF's focal length, and masks of their size."""
-    for name in ("cameras/images", "cameras/sparse", "masks"):
+    for name in ("undistorted/images", "undistorted/sparse", "masks"):
         (folder / name).mkdir(parents=True, exist_ok=True)
     model = pycolmap.Reconstruction()
     for number, path in enumerate(sorted(p for p in frames.iterdir() if not p.name.startswith(".")), 1):
@@ -42,18 +42,18 @@ def workspace(frames: Path, masks: Path, folder: Path) -> None:
         model.add_camera_with_trivial_rig(pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size))
         image = pycolmap.Image(name=path.name, camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
-        shutil.copy(path, folder / "cameras/images" / path.name)
+        shutil.copy(path, folder / "undistorted/images" / path.name)
         mask = cv2.imread(str(masks / f"{path.stem}.png"), cv2.IMREAD_GRAYSCALE)
         if mask is not None:
             # the workflow's masks are those of undistorted photos, a pixel smaller here
             cv2.imwrite(str(folder / "masks" / f"{path.stem}.png"), cv2.resize(mask, (guess.width, guess.height)))
-    model.write(folder / "cameras/sparse")
+    model.write(folder / "undistorted/sparse")
 
 
 def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, seed: int) -> None:
     """All stages from a workspace to the cloud, as the workflow runs them."""
     find_poses(
-        cameras=folder / "undistorted", posed=folder / "poses", report=folder / "poses.json",
+        workspace=folder / "undistorted", posed=folder / "poses", report=folder / "poses.json",
         settings=build(PoseSettings, settings["poses"]), seed=seed,
     )  # fmt: skip
     inputs: dict[str, Any] = {"cameras": folder / "poses", "masks": folder / "masks"}
@@ -63,21 +63,25 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         return {"stage": folder / name, "report": folder / f"{name}.json"}
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
-        own = settings["nerf"] | settings["matching"] | settings[name]
+        own = settings["nerf"] | settings[name]
         train_object_nerf(
             **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
             field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
             refinement=build(RefinementSettings, own), settings=build(NerfSettings, own),
         )  # fmt: skip
 
-    train_depth(**inputs, **common, **outputs("stage1"), settings=build(DepthSettings, settings["stage1"]))
+    train_depth(
+        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage1"),
+        settings=build(DepthTrainingSettings, settings["stage1"]),
+    )  # fmt: skip
     nerf("stage2", "stage1", None)
     refine_depth(
-        **inputs, **common, **outputs("stage3"), previous=folder / "stage1", rendered=folder / "stage2",
+        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage3"),
+        earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
         settings=build(FeedbackSettings, settings["stage3"]),
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
-    own = settings["cloud"] | settings["matching"]
+    own = settings["cloud"]
     make_object_cloud(
         **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
         cloud=folder / "object.ply", report=folder / "object.json",
@@ -108,11 +112,11 @@ def no_sfm(
         workspace(source / "frames", source / "masks", folder)
         reconstruct(folder, own, own["hold_out_every"], seed)
         known = read_object_truth(folder / "poses", truth / "scene", truth / name, samples, seed)
-        extent = float(np.linalg.norm(np.ptp(known.orbit.centres[known.posed.true], axis=0)))
+        extent = float(np.linalg.norm(np.ptp(known.orbit.centres[[true for _, true in known.posed]], axis=0)))
         points = known.fit.truth_from_model.apply(read_cloud(folder / "object.ply").points)
         measured = {
             "photos": quantity(len(known.orbit.names), "1"),
-            "photos_with_pose": quantity(len(known.posed.names), "1"),
+            "photos_with_pose": quantity(len(known.posed), "1"),
             "trajectory_error_over_extent": quantity(float(np.sqrt(np.mean(known.fit.position**2))) / extent, "1"),
             "rotation_error_median_deg": quantity(float(np.median(known.fit.rotation_deg)), "degrees"),
             "rotation_error_max_deg": quantity(float(known.fit.rotation_deg.max()), "degrees"),

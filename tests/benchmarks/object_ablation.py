@@ -14,10 +14,10 @@ import numpy as np
 import pandas as pd
 import torch
 
-from scenefuse.depth.refine_depth import FeedbackSettings, refine_depth
+from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
 from scenefuse.mvs.views import load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
@@ -61,11 +61,10 @@ def one(
     with tempfile.TemporaryDirectory() as temporary:
         work = Path(temporary)
         masks = folder / "masks" if variant.masks else white(folder / "masks", work / "masks")
-        inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": masks}
         common = {"checkpoints": work / "checkpoints", "hold_out_every": settings["hold_out_every"], "seed": seed}
 
         def nerf(stage: int, prior: Path, previous: Path | None, epochs: int) -> None:
-            own = settings["nerf"] | settings["matching"] | variant.nerf | {"epochs": epochs}
+            own = settings["nerf"] | variant.nerf | {"epochs": epochs}
             train_object_nerf(
                 inputs=NerfInputs(folder / "undistorted", masks, prior if variant.prior else None, previous),
                 stage=work / f"stage{stage}",
@@ -80,13 +79,14 @@ def one(
         if variant.feedback and variant.prior and not variant.long:
             prior = work / "stage3"
             refine_depth(
-                **inputs, **common, previous=folder / "stage1", rendered=work / "stage2", stage=prior,
+                workspace=folder / "undistorted", masks=masks, **common, stage=prior,
+                earlier=EarlierStages(previous=folder / "stage1", rendered=work / "stage2"),
                 report=work / "stage3.json", settings=build(FeedbackSettings, settings["stage3"]),
             )  # fmt: skip
         if not variant.long:
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if variant.long else "stage4")
-        seconds, fusing = time.monotonic() - start, settings["cloud"] | settings["matching"]
+        seconds, fusing = time.monotonic() - start, settings["cloud"]
         depth = depth_results([work / "stage2", last], truth, photos)
         return {
             "depth_2_pct": 100 * value(depth, "stage2_depth_error"),

@@ -16,10 +16,11 @@ import pandas as pd
 from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals, write_depth
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.evaluation import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.mvs.consistency import compare
-from scenefuse.mvs.depth_maps import FusionSettings, estimate_depth_maps, fuse_depth_maps
-from scenefuse.mvs.plane_sweep import DepthSettings
+from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
+from scenefuse.mvs.depth_maps import estimate_depth_maps
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.object_cloud import CloudSettings, clean, fuse_depths
 from scenefuse.stage import StageError, read_json, run, value
@@ -61,8 +62,8 @@ def fused(
         return fuse_depths(views, views.object_from_cam, depths, (depths > 0).astype(np.float32), normals, settings)[0]
     path = depth.with_name("fused.ply")
     fuse_depth_maps(
-        workspace=folder / "undistorted", depth=[depth], depth_reports=[report], cloud=path,
-        report=path.with_suffix(".json"), settings=build(FusionSettings, own["dense_cloud"] | over),
+        workspace=folder / "undistorted", depth=[depth], depth_json=[report], cloud=path,
+        report=path.with_suffix(".json"), settings=build(DenseCloudSettings, own["dense_cloud"] | over),
     )  # fmt: skip
     cloud = read_cloud(path)
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for m in views.masks])
@@ -82,8 +83,8 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
             depth, report = Path(temporary) / maps.replace(" ", "_"), Path(temporary) / "depth.json"
             start, began = time.monotonic(), os.times()
             estimate_depth_maps(
-                workspace=folder / "undistorted", chunk=0, chunks=1, backend=own["depth_maps"]["backend"],
-                settings=build(DepthSettings, own["depth_maps"] | {"max_image_size_px": width} | over),
+                workspace=folder / "undistorted", chunk=0, chunks=1,
+                settings=build(DepthMapSettings, own["depth_maps"] | {"max_image_size_px": width} | over),
                 seed=settings["seed"], depth=depth, report=report,
             )  # fmt: skip
             mask_depths(depth, views)

@@ -13,21 +13,20 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 import pandas as pd
-from planted import SHAPES, Trial, errors, plant
+from support.planted import SHAPES, Trial, errors, plant
 
 from scenefuse.io.clouds import Cloud
-from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud
-from scenefuse.registration.evidence import Evidence
-from scenefuse.registration.fine import FineSettings, refine_hypotheses
+from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.paper import paper_coarse, paper_fine
-from scenefuse.registration.refine import ScaleRange
-from scenefuse.registration.scale import estimates, prior_centre
+from scenefuse.registration.problem import Evidence, Problem
+from scenefuse.registration.refinement import refine_hypotheses
+from scenefuse.registration.scale import ScaleSettings, estimates, prior
+from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import run
 from scenefuse.transforms import Sim3
 
-CONFIG = read_settings(None)["registration"]
 UP = np.array([0.0, 0.0, 1.0])
 COVERAGES = (0.3, 0.5, 0.7, 0.9)
 SCALE_PCT, ROTATION_DEG, SHIFT = 2.0, 2.0, 0.01
@@ -48,21 +47,20 @@ def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
     if blind:
         cloud, scene = Cloud(cloud.points, cloud.normals), Cloud(scene.points, scene.normals)
         evidence = Evidence()
-    scales = ScaleRange(prior_centre(estimates(cloud, scene, evidence.ups)), CONFIG["scale"]["width_log"])
-    found = find_hypotheses(cloud, scene, scales, evidence.ups, build(CoarseSettings, CONFIG["coarse"]), 0)
+    scales = prior(estimates(cloud, scene, evidence.ups), ScaleSettings())
+    problem = Problem(cloud, scene, scales, evidence)
+    found = find_hypotheses(problem, CoarseSettings())
     if not found:
         return Found(None, False, "no hypothesis")
-    poses = [(h.pose, h.source) for h in found]
-    outcome = refine_hypotheses(cloud, scene, poses, scales, evidence, build(FineSettings, CONFIG["fine"]), 0)
-
+    outcome = refine_hypotheses(problem, [(h.pose, h.source) for h in found], FineSettings())
     return Found(outcome.ranked[0].pose, outcome.decision.registered, outcome.decision.reason)
 
 
 def paper(trial: Trial, scene: Cloud) -> Found:
     """The paper's recipe: RMS scale, FPFH RANSAC at 4 %, point-to-point ICP."""
-    scale = estimates(trial.object, scene, None)[0].scale
-    start, _ = paper_coarse(trial.object, scene, scale, 0.04, 4000000, 0)
-    return Found(paper_fine(trial.object, scene, start, 0.04), True)
+    scales = ScaleRange(estimates(trial.object, scene, None)[0].scale, 0.0)
+    start, _ = paper_coarse(Problem(trial.object, scene, scales))
+    return Found(paper_fine(trial.object, scene, start), True)
 
 
 def fgr(trial: Trial, scene: Cloud) -> Found:
@@ -77,7 +75,7 @@ def fgr(trial: Trial, scene: Cloud) -> Found:
     option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=1.5 * voxel)
     result = registration.registration_fgr_based_on_feature_matching(source, target, *features, option)
     start = Sim3.from_matrix(np.asarray(result.transformation)) @ scaled
-    return Found(paper_fine(trial.object, scene, start, 0.04), True)
+    return Found(paper_fine(trial.object, scene, start), True)
 
 
 def kiss(trial: Trial, scene: Cloud) -> Found:
@@ -90,7 +88,7 @@ def kiss(trial: Trial, scene: Cloud) -> Found:
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = found.rotation, np.ravel(found.translation)
     start = Sim3.from_matrix(matrix) @ scaled
-    return Found(paper_fine(trial.object, scene, start, 0.04), bool(found.valid))
+    return Found(paper_fine(trial.object, scene, start), bool(found.valid))
 
 
 def _at_rms_scale(trial: Trial, scene: Cloud) -> tuple[Sim3, Any, Any, float]:
@@ -125,7 +123,7 @@ def planted(name: str, coverage: float, repeat: int) -> tuple[Trial, Cloud, dict
         "slope": float(rng.uniform(-0.1, 0.1)),
     }
     trial = plant(name, seed, coverage=coverage, object_points=12000, **drawn)
-    cut = crop_cloud(trial.scene, trial.fiducials, UP, build(CropSettings, CONFIG["crop"]))
+    cut = crop_cloud(trial.scene, trial.fiducials, UP, CropSettings())
     return trial, trial.scene[cut.keep], drawn
 
 

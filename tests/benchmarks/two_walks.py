@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.picture import draw_alignment
-from scenefuse.registration.register import register_clouds
+from scenefuse.registration.register import RegistrationSettings, register_clouds
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.registration.shared_features.landmarks import read_landmarks
 from scenefuse.stage import run, value
@@ -29,23 +28,13 @@ def two_walks(*, results: Path, pictures: Path) -> None:
         results: the results folder of the workflow.
         pictures: folder for the clouds on each other, by clouds and by photos.
     """
-    settings = read_settings(None)
-    alignment_settings = build(AlignmentSettings, settings["registration"]["alignment"])
     pictures.mkdir(parents=True, exist_ok=True)
     for name, pair in PAIRS.items():
         folders = [results / "scenes" / part for part in pair]
         obj, scene = (read_cloud(folder / "dense.ply") for folder in folders)
-        found = register_clouds(obj, scene, settings, 0, ups=(UP, UP))
-        ours, theirs = (
-            read_landmarks(
-                folder / "georeferenced",
-                folder / "database.db",
-                alignment_settings.most_points,
-                alignment_settings.descriptors_per_point,
-            )
-            for folder in folders
-        )
-        alignment = align_landmarks(ours, theirs, alignment_settings, 0)
+        found = register_clouds(obj, scene, RegistrationSettings(), 0, ups=(UP, UP))
+        ours, theirs = (read_landmarks(folder / "georeferenced", folder / "features.db") for folder in folders)
+        alignment = align_landmarks(ours, theirs, AlignmentSettings(), 0)
         print(f"{name}, {len(obj)} points in {len(scene)}")
         print(f"  clouds  {'registered' if found.registered else 'unregistered'}: {found.reason}")
         print(f"  photos  {'found' if value(alignment, 'found') else 'not found'}: {value(alignment, 'reason')}")

@@ -1,13 +1,12 @@
 """The whole workflow on a tiny capture: what it writes, what a second run does, what an edit reruns."""
 
 import json
-import re
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from conftest import ROOT
+from conftest import ROOT, planned
 
 from scenefuse.io.clouds import read_cloud
 
@@ -19,11 +18,6 @@ def finished(tmp_path_factory, snakemake):
     result = snakemake(directory)
     assert result.returncode == 0, result.stdout[-6000:]
     return directory
-
-
-def planned(output: str) -> set[str]:
-    """Rules that a dry run lists."""
-    return set(re.findall(r"^([a-z0-9_]+) +\d+$", output, re.MULTILINE)) - {"total"}
 
 
 def test_everything_a_user_reads_is_there(finished):

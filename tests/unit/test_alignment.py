@@ -10,24 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_models
 from scenefuse.registration.shared_features.landmarks import match_landmarks, read_landmarks
-from scenefuse.registration.shared_features.reprojection import match_errors, observations, refine
+from scenefuse.registration.shared_features.reprojection import match_errors, minimise_reprojection, observations
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3, rotation_angle_deg
 
-SETTINGS = AlignmentSettings(
-    most_points=10000,
-    descriptors_per_point=3,
-    max_ratio=0.85,
-    ransac_samples=50000,
-    max_error_px=6,
-    min_points=15,
-    min_photos=3,
-    nearest_points=200,
-    max_rival_share=0.5,
-    max_scale_sd_log=0.05,
-    max_rotation_sd_deg=3,
-    bootstrap_draws=100,
-)
+SETTINGS = AlignmentSettings()
 
 
 @dataclass(frozen=True)
@@ -96,13 +83,13 @@ def capture(folder, name, seen, views, seed, *, model_from_world=None, noise_px=
     return folder / name, folder / f"{name}.db"
 
 
-def ask(folder, obj, scene, settings=SETTINGS, seed=0):
+def aligned(folder, obj, scene, settings=SETTINGS, seed=0):
     align_models(
-        object_model=obj[0],
+        object_sparse=obj[0],
         object_features=obj[1],
-        scene_model=scene[0],
+        scene_sparse=scene[0],
         scene_features=scene[1],
-        alignment=folder / "alignment.json",
+        report=folder / "alignment.json",
         seed=seed,
         settings=settings,
     )
@@ -135,7 +122,7 @@ def pair(tmp_path_factory):
 
 
 def test_a_planted_similarity_is_found(pair, tmp_path):
-    found = ask(tmp_path, *pair)
+    found = aligned(tmp_path, *pair)
     assert value(found, "found") is True
     truth = OBJECT_FROM_WORLD.inverse()
     pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
@@ -151,7 +138,7 @@ def test_a_planted_similarity_is_found(pair, tmp_path):
 
 
 def test_camera_centres_say_the_same(pair, tmp_path):
-    found = ask(tmp_path, *pair)
+    found = aligned(tmp_path, *pair)
     assert value(found, "centres_photos") >= 8
     assert value(found, "scale_from_centres") == pytest.approx(OBJECT_FROM_WORLD.inverse().scale, rel=0.02)
     assert value(found, "centres_rotation_deg") < 1 and value(found, "centres_shift") < 0.1
@@ -166,7 +153,7 @@ def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos
     truth, centre = OBJECT_FROM_WORLD.inverse(), OBJECT_FROM_WORLD.apply(np.zeros(3))
     shifts = []
     for count in (100, 1000):
-        found = ask(tmp_path, obj, scene, replace(SETTINGS, nearest_points=count))
+        found = aligned(tmp_path, obj, scene, replace(SETTINGS, nearest_points=count))
         pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
         shifts.append(np.linalg.norm(pose.apply(centre) - truth.apply(centre)))
         if count == 100:
@@ -175,23 +162,23 @@ def test_a_scene_that_is_bent_far_away_does_not_bend_the_pose_of_what_the_photos
 
 
 def test_the_same_input_gives_the_same_output(pair, tmp_path):
-    first, second = (ask(tmp_path, *pair) for _ in range(2))
+    first, second = (aligned(tmp_path, *pair) for _ in range(2))
     del first["seconds"], second["seconds"]
     assert first == second
 
 
 def test_another_place_is_not_found(pair, tmp_path):
     elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
-    found = ask(tmp_path, pair[0], elsewhere)
+    found = aligned(tmp_path, pair[0], elsewhere)
     assert value(found, "found") is False and value(found, "scene_from_object") is None
-    # Without a ratio test every point has a partner, and still nothing is believed.
-    found = ask(tmp_path, pair[0], elsewhere, replace(SETTINGS, max_ratio=1.0))
+    # Without a ratio test every point has a partner, and still nothing is found.
+    found = aligned(tmp_path, pair[0], elsewhere, replace(SETTINGS, max_ratio=1.0))
     assert value(found, "matches") > 50
     assert value(found, "found") is False and "are needed" in value(found, "reason")
 
 
 def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
-    """Its twin looks the same where it looks like anything: each half of the matches believes another place."""
+    """Its twin looks the same where it looks like anything: each half of the matches agrees on another place."""
     whole = world(1)
     middle = near(whole)
     rng = np.random.default_rng(0)
@@ -203,7 +190,7 @@ def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
     looks = np.concatenate([rest.looks, own.looks, twin.looks])
     scene = capture(tmp_path, "scene", World(points, looks), ring(6, 25, 12, (6, 0, 0)), 3)
     obj = capture(tmp_path, "object", middle, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
-    found = ask(tmp_path, obj, scene)
+    found = aligned(tmp_path, obj, scene)
     assert value(found, "found") is False and "twice" in value(found, "reason")
 
 
@@ -215,7 +202,7 @@ def test_points_along_one_line_leave_the_rotation_open(tmp_path):
     obj = capture(
         tmp_path, "object", part(line, np.arange(40)), ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD
     )
-    found = ask(tmp_path, obj, scene)
+    found = aligned(tmp_path, obj, scene)
     assert value(found, "found") is False and "rotation open" in value(found, "reason")
 
 
@@ -226,7 +213,7 @@ def test_photos_in_both_models(tmp_path):
     names = [f"{k}.jpg" for k in range(12)]
     obj = capture(tmp_path, "object", whole, views, 4, model_from_world=OBJECT_FROM_WORLD, names=names)
     scene = capture(tmp_path, "scene", whole, views[::2], 4, names=names[::2])
-    found = ask(tmp_path, obj, scene)
+    found = aligned(tmp_path, obj, scene)
     assert value(found, "found") is True
     assert value(found, "scale") == pytest.approx(1 / 3.7, rel=2e-3)
 
@@ -239,7 +226,7 @@ def test_refinement_undoes_a_wrong_start(pair):
     tilt = Rotation.from_rotvec([0.06, -0.03, 0.09]).as_matrix()
     start = Sim3(1.06, tilt, np.array([0.15, 0.06, -0.12])) @ truth
     assert np.median(match_errors(seen, start)) > 6
-    found = refine(seen, start, 3.0, 30)
+    found = minimise_reprojection(seen, start, 3.0, 30)
     assert np.median(match_errors(seen, found)) < 2
     assert found.scale == pytest.approx(truth.scale, rel=3e-3)
 
@@ -260,12 +247,12 @@ def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
 
 def test_a_database_of_other_photos_is_refused(pair, tmp_path):
     with pytest.raises(StageError, match="rerun the matching"):
-        ask(tmp_path, (pair[0][0], pair[1][1]), pair[1])
+        aligned(tmp_path, (pair[0][0], pair[1][1]), pair[1])
 
 
 def test_inputs_are_not_written_to(pair, tmp_path):
     databases = [side[1] for side in pair]
     for database in databases:
         os.utime(database, (1e9, 1e9))
-    ask(tmp_path, *pair)
+    aligned(tmp_path, *pair)
     assert [database.stat().st_mtime for database in databases] == [1e9, 1e9]

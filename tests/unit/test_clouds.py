@@ -38,6 +38,21 @@ def test_laz_round_trip_at_utm_coordinates_is_a_millimetre(tmp_path):
     assert np.array_equal(las["source"], cloud().fields["source"])
 
 
+def test_columns_of_any_name_are_written_and_the_new_names_told(tmp_path, capsys):
+    rows, long = cloud(3).points, "a name that is longer than thirty-two letters"
+    fields = {
+        name: np.arange(3.0) + k for k, name in enumerate(["scan angle", "scan_angle", "Höhe", long, "scan  angle"])
+    }
+    write_cloud(tmp_path / "a.ply", Cloud(rows, fields=fields))
+    assert "'scan angle' is 'scan_angle'" in capsys.readouterr().out
+    after = read_cloud(tmp_path / "a.ply")
+    names = ["scan_angle", "scan_angle_", "H_he", "a_name_that_is_longer_than_thirt", "scan_angle_2"]
+    assert np.array_equal(after.points, rows) and list(after.fields) == names
+    assert [after.fields[name][0] for name in names] == [0, 1, 2, 3, 4]
+    write_laz(tmp_path / "a.laz", Cloud(rows, fields=fields), np.zeros(3), None)
+    assert len(read_cloud(tmp_path / "a.laz").fields) == 5
+
+
 @pytest.mark.parametrize("content", [b"not a cloud", b"ply\nformat ascii 1.0\nend_header\n"])
 def test_unreadable_cloud_is_named(tmp_path, content):
     (tmp_path / "bad.ply").write_bytes(content)

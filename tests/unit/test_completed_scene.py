@@ -1,18 +1,18 @@
 """The completed scene on hand-made clouds: what each object adds, what is taken away, who is named."""
 
+from dataclasses import replace
+
 import laspy
 import numpy as np
-import pytest
 
-from scenefuse.fusion.complete_scene import complete_scene
+from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
 from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.logs import JobRecords
+from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
-SETTINGS = FusionSettings(
-    fill_spacings=1.5, fill_residuals=2.5, density=0.0, feather_spacings=4.0, match_colors=True, min_confidence=0.0
-)
+SETTINGS = FusionSettings(fill_spacings=1.5, fill_residuals=2.5, density=0.0, feather_spacings=4.0, match_colors=True)
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
 
 
@@ -24,25 +24,28 @@ def strip(low, high, y=0.0, color=(200, 100, 50)):
     return Cloud(points, normals, (np.array(color) * (0.6 + 0.4 * np.sin(points[:, :1]))).astype(np.uint8))
 
 
-def run(folder, scene, objects, mode="fill", refused=()):
+def run(folder, scene, objects, mode="fill", refused=(), failed=()):
     """The stage on objects given in the scene's frame; each one's crop is the scene itself."""
     write_cloud(folder / "scene.ply", scene)
     for name, cloud in objects.items():
-        write_cloud(folder / f"{name}.ply", cloud.transformed(POSE.inverse()))
+        write_cloud(folder / name / "object.ply", cloud.transformed(POSE.inverse()))
+        write_cloud(folder / name / "registration/full/crop.ply", scene)
         status = "unregistered" if name in refused else "registered"
         fine = {"status": quantity(status, ""), "reason": quantity("weak", "")}
-        write_json(folder / f"{name}.json", fine | {"scene_from_object": quantity(POSE.matrix, "")})
+        write_json(
+            folder / name / "registration/full/fine.json", fine | {"scene_from_object": quantity(POSE.matrix, "")}
+        )
     complete_scene(
-        scene=folder / "scene.ply",
-        names=list(objects),
-        objects=[folder / f"{name}.ply" for name in objects],
-        crops=[folder / "scene.ply"] * len(objects),
-        fines=[folder / f"{name}.json" for name in objects],
+        inputs=CompletionInputs(
+            scene=folder / "scene.ply",
+            objects=[folder / name for name in (*objects, *(f for f in failed if f not in objects))],
+            failed=tuple(failed),
+            jobs=JobRecords(folder / "logs", folder / "benchmarks"),
+        ),
         completed=folder / "completed.ply",
         completed_laz=folder / "completed.laz",
         report=folder / "completed.json",
-        mode=mode,
-        settings=SETTINGS,
+        settings=replace(SETTINGS, mode=mode),
     )
     return read_cloud(folder / "completed.ply"), read_json(folder / "completed.json")
 
@@ -53,7 +56,7 @@ def test_objects_apart_add_what_each_adds_alone(tmp_path):
     assert value(report, "sources") == {"0": "scene", "1": "left", "2": "right"}
     assert np.array_equal(whole.points[whole.fields["source"] == 0], scene.points)
     for number, (name, cloud) in enumerate(objects.items(), 1):
-        alone = fuse_clouds(cloud.transformed(POSE.inverse()), scene, scene, POSE, "fill", SETTINGS).added
+        alone = fuse_clouds(cloud.transformed(POSE.inverse()), scene, scene, POSE, SETTINGS).added
         mine = whole[whole.fields["source"] == number]
         assert len(mine) == value(report, "added_points")[name] > 100
         assert np.allclose(mine.points, alone.points)
@@ -91,8 +94,16 @@ def test_the_laz_file_holds_the_same_points_with_their_sources(tmp_path):
     assert np.array_equal(np.asarray(las["source"]), whole.fields["source"]) and whole.fields["source"].max() == 1
 
 
-def test_lists_of_different_length_are_refused(tmp_path):
-    lists = {"names": ["a"], "objects": [], "crops": [], "fines": []}
-    outputs = {k: tmp_path / k for k in ("scene", "completed", "completed_laz", "report")}
-    with pytest.raises(StageError, match="one of each for every object"):
-        complete_scene(**lists, **outputs, mode="fill", settings=SETTINGS)
+def test_a_failed_object_is_named_with_its_reason_and_the_others_keep_their_numbers(tmp_path):
+    scene = strip(0, 20)
+    (tmp_path / "logs/make_masks").mkdir(parents=True)
+    (tmp_path / "logs/make_masks/broken.log").write_text("error: 3.png is no readable picture\n")
+    # What an earlier run left of the object is out of date.
+    objects = {"broken": strip(0.03, 3, 1.54), "good": strip(10, 13, 1.5)}
+    whole, report = run(tmp_path, scene, objects, "replace", failed=["broken", "absent"])
+    assert value(report, "failed") == {
+        "broken": "3.png is no readable picture [make_masks/broken.log]",
+        "absent": "its jobs did not run",
+    }
+    assert set(whole.fields["source"]) == {0, 2} and list(value(report, "added_points")) == ["good"]
+    assert value(report, "sources")["2"] == "good" and value(report, "unregistered") == {}

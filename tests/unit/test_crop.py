@@ -7,31 +7,19 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-from planted import plant
+from support.planted import plant
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.registration.crop.crop_scene import CropSettings, crop_cloud, crop_scene
-from scenefuse.registration.crop.ground import fit_ground
+from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
-from scenefuse.registration.crop.vote import count, read_silhouettes, vote
+from scenefuse.registration.crop.vote import count, read_masked_views, vote
+from scenefuse.sfm.ground import fit_ground
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
-SETTINGS = CropSettings(
-    shape="box",
-    margin=0.05,
-    margin_fraction=0.04,
-    remove_ground=True,
-    ring_fraction=0.5,
-    ground_fraction=0.015,
-    link_fraction=0.03,
-    reach_fraction=0.05,
-    min_part=0.01,
-    min_points=200,
-    max_residual_px=5.0,
-    min_votes=0.8,
-)
+SETTINGS, BY_MASKS = CropSettings(), CropSettings(mode="masks")
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.15])
@@ -60,11 +48,12 @@ def test_without_ground_nothing_is_removed_and_that_is_said():
     assert "no ground" in cut.notes[0]
 
 
-def test_parts_far_from_every_fiducial_are_kept_and_that_is_said():
+def test_parts_far_from_every_fiducial_are_kept_and_that_is_said(monkeypatch):
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     low, high = trial.scene.points.min(0), trial.scene.points.max(0)
     far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
-    cut = crop_cloud(trial.scene, far, Z, replace(SETTINGS, reach_fraction=1e-6, min_part=1.1))
+    monkeypatch.setattr("scenefuse.registration.crop.crop_cloud.MIN_PART", 1.1)
+    cut = crop_cloud(trial.scene, far, Z, SETTINGS)
     assert cut.keep.all() and "no part in the box lies near a fiducial" in cut.notes[1]
 
 
@@ -79,15 +68,17 @@ def test_ground_is_a_height_field_with_the_planted_slope():
 def test_stage_writes_the_crop_and_its_box(tmp_path):
     trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
     files = stage_files(tmp_path, trial, trial.fiducials)
-    crop_scene(**files, mode="fiducials", settings=SETTINGS)
+    crop_scene(**files, settings=SETTINGS)
     report = read_json(files["report"])
     assert value(report, "crop_points") == len(read_cloud(files["crop"])) > 2500
     assert value(report, "up_in_scene") == [0.0, 0.0, 1.0] and report["diagonal"]["unit"] == "scene units"
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
-    crop_scene(**files, georeference=tmp_path / "georeference.json", mode="fiducials", settings=SETTINGS)
+    georeferenced = replace(files["inputs"], georeference_json=tmp_path / "georeference.json")
+    crop_scene(**files | {"inputs": georeferenced}, settings=SETTINGS)
     assert read_json(files["report"])["diagonal"]["unit"] == "m"
-    crop_scene(**files, mode="none", settings=SETTINGS)
+    crop_scene(**files, settings=replace(SETTINGS, whole_scene=True))
     assert len(read_cloud(files["crop"])) == len(trial.scene)
+    assert value(read_json(files["report"]), "mode") == "none"
 
 
 def test_bad_fiducials_end_in_one_sentence(tmp_path):
@@ -100,7 +91,7 @@ def test_bad_fiducials_end_in_one_sentence(tmp_path):
     for fiducials, sentence in cases:
         files = stage_files(tmp_path, trial, fiducials)
         with pytest.raises(StageError, match=sentence):
-            crop_scene(**files, mode="fiducials", settings=SETTINGS)
+            crop_scene(**files, settings=SETTINGS)
         assert not files["crop"].exists()
 
 
@@ -232,8 +223,8 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
     behind = middle - [0.8 * trial.diagonal, 0, 0] + np.random.default_rng(0).normal(0, 0.004, (50, 3)) * trial.diagonal
     on_it = np.array([middle, middle + 0.02 * trial.diagonal])
     votes = vote(np.concatenate([behind, on_it]), folder / "cameras", tmp_path / "masks", trial.scene_from_object, 0.8)
-    silhouettes = read_silhouettes(folder / "cameras", tmp_path / "masks", 0.8)[0]
-    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), silhouettes)
+    views = read_masked_views(folder / "cameras", tmp_path / "masks", 0.8)[0]
+    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), views)
     assert ((inside == 3) & (shown == 3)).mean() > 0.8
     assert not votes.object[:50].any()
 
@@ -241,16 +232,16 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
 def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     """A fence between some of the cameras and the house; their masks show no house."""
     folder, trial = orbit
-    silhouettes = read_silhouettes(folder / "cameras", folder / "masks", 0.8)[0]
+    views = read_masked_views(folder / "cameras", folder / "masks", 0.8)[0]
     middle, size = trial.fiducials.mean(0), trial.diagonal
     rng = np.random.default_rng(0)
     y, z = rng.uniform(-2 * size, 2 * size, 200000), rng.uniform(-size, size, 200000)
     fence = middle + np.stack([np.full(200000, 0.7 * size), y, z], axis=1)
     blind = []
-    for s in silhouettes:
-        centre = trial.scene_from_object.apply(-np.linalg.inv(s.projection[:, :3]) @ s.projection[:, 3])
-        blind.append(replace(s, mask=np.zeros_like(s.mask)) if centre[0] > middle[0] + 0.7 * size else s)
-    assert sum(not s.mask.any() for s in blind) == 3
+    for view in views:
+        hidden = trial.scene_from_object.apply(view.centre)[0] > middle[0] + 0.7 * size
+        blind.append(replace(view, pixels=np.zeros_like(view.pixels)) if hidden else view)
+    assert sum(not view.pixels.any() for view in blind) == 3
     points = trial.scene.points
     facing = np.flatnonzero(points[: own_points(trial), 0] > middle[0] + 0.2 * size)
     assert len(facing) > 100
@@ -264,11 +255,10 @@ def test_what_hides_the_object_takes_no_vote_from_it(orbit):
 def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     folder, trial = orbit
     files = stage_files(tmp_path, trial, trial.fiducials)
-    crop_scene(**files, mode="fiducials", settings=SETTINGS)
+    crop_scene(**files, settings=SETTINGS)
     clicked = read_cloud(files["crop"]).points
-    files |= {"fiducials": None, "alignment": folder / "alignment.json"}
-    files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
-    crop_scene(**files, mode="masks", settings=SETTINGS)
+    files |= {"inputs": masked(files["inputs"], folder, folder / "alignment.json")}
+    crop_scene(**files, settings=BY_MASKS)
     voted, report = read_cloud(files["crop"]).points, read_json(files["report"])
     both = len({*map(tuple, clicked)} & {*map(tuple, voted)})
     assert both > 0.9 * max(len(clicked), len(voted))
@@ -276,22 +266,19 @@ def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     assert value(report, "fiducials") == [] and value(report, "ground_removed") is True
 
 
-def test_without_fiducials_and_without_a_witness_the_sentence_names_both_ways_out(orbit, tmp_path):
+def test_without_fiducials_and_without_an_alignment_the_sentence_names_both_ways_out(orbit, tmp_path):
     folder, trial = orbit
-    files = stage_files(tmp_path, trial, trial.fiducials) | {
-        "fiducials": None,
-        "alignment": tmp_path / "alignment.json",
-    }
-    files |= {"cameras": folder / "cameras", "masks": folder / "masks"}
-    denied = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
-    write_json(tmp_path / "alignment.json", denied)
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    files |= {"inputs": masked(files["inputs"], folder, tmp_path / "alignment.json")}
+    not_found = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
+    write_json(tmp_path / "alignment.json", not_found)
     with pytest.raises(StageError, match=r"only 3 of 90 .* column fiducials .* or add photos"):
-        crop_scene(**files, mode="masks", settings=SETTINGS)
+        crop_scene(**files, settings=BY_MASKS)
     far = Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])) @ trial.scene_from_object
     elsewhere = {"found": quantity(True, ""), "scene_from_object": quantity(far.matrix, "")}
     write_json(tmp_path / "alignment.json", elsewhere)
     with pytest.raises(StageError, match="only 0 scene points are left in the box of .*masks"):
-        crop_scene(**files, mode="masks", settings=SETTINGS)
+        crop_scene(**files, settings=BY_MASKS)
     assert not files["crop"].exists()
 
 
@@ -299,10 +286,19 @@ def stage_files(folder, trial, fiducials):
     lines = [f"p{k}\t{x}\t{y}\t{z}" for k, (x, y, z) in enumerate(fiducials)]
     (folder / "fiducials.tsv").write_text("point\tx\ty\tz\n" + "\n".join(lines) + "\n")
     write_cloud(folder / "dense.ply", trial.scene)
-    return {
-        "scene": folder / "dense.ply",
-        "model": folder,
-        "fiducials": folder / "fiducials.tsv",
-        "crop": folder / "crop.ply",
-        "report": folder / "crop.json",
-    }
+    inputs = CropInputs(scene=folder / "dense.ply", sparse=folder, fiducials=folder / "fiducials.tsv")
+    return {"inputs": inputs, "crop": folder / "crop.ply", "report": folder / "crop.json"}
+
+
+def masked(inputs, folder, alignment_json):
+    """The inputs with the masks of `orbit` in place of the fiducials."""
+    marks = {"alignment_json": alignment_json, "workspace": folder / "cameras", "masks": folder / "masks"}
+    return replace(inputs, fiducials=None, **marks)
+
+
+def test_a_mask_of_another_size_is_one_sentence(orbit, tmp_path):
+    folder, _ = orbit
+    shutil.copytree(folder / "masks", tmp_path / "masks")
+    cv2.imwrite(str(tmp_path / "masks/3.png"), np.full((120, 160), 255, np.uint8))
+    with pytest.raises(StageError, match="3.png is 160 x 120 pixels, but its photo 320 x 240"):
+        read_masked_views(folder / "cameras", tmp_path / "masks", 0.8)

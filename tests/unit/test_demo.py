@@ -1,5 +1,6 @@
 """The demo capture: truth that agrees with the photos, and the same bytes for the same seed."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -14,8 +15,18 @@ from scenefuse.demo.world import ORIGIN, World, build_world, openness
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import StageError, manifest, read_json, value
 
-FLIGHT = capture.FlightSettings(2, 2, 2, 40.0, 80, 60, 60.0, 1, 0.0, 0.0)
-ORBIT = capture.OrbitSettings(4, (5.0, 34.0), 0.65, 64, 48, 56.0, 1)
+FLIGHT = capture.FlightSettings(
+    columns=2,
+    rows=2,
+    obliques=2,
+    width_px=80,
+    height_px=60,
+    focal_px=60.0,
+    supersampling=1,
+    gps_noise_horizontal=0.0,
+    gps_noise_vertical=0.0,
+)
+ORBIT = capture.OrbitSettings(views=4, width_px=64, height_px=48, focal_px=56.0, supersampling=1)
 
 
 @pytest.fixture(scope="module")
@@ -89,9 +100,12 @@ def test_clicks_without_noise_meet_at_the_landmarks(tmp_path: Path, world: World
     capture.render_object(name="sculpture", photos=tmp_path / "p", truth=tmp_path / "t", settings=ORBIT, seed=0)
     table = tmp_path / "prompts.tsv"
     clicks.click_points(
-        name="sculpture", cameras=tmp_path / "t/cameras.json", clicks=table, photos=4, separation_deg=20.0,
-        noise_px=0.0, seed=0, click_seed=0,
-    )  # fmt: skip
+        name="sculpture",
+        cameras=tmp_path / "t/cameras.json",
+        clicks=table,
+        settings=clicks.ClickSettings(photos=4, separation_deg=20.0, noise_px=0.0),
+        seed=0,
+    )
     cameras = read_cameras(tmp_path / "t/cameras.json")
     lines = [line.split("\t") for line in table.read_text().splitlines()]
     assert lines[0] == ["point", "photo", "x_px", "y_px"]
@@ -137,8 +151,8 @@ def test_the_sky_is_hidden_under_the_balloon(world: World) -> None:
 
 def test_noise_fades_out_where_a_pixel_is_larger_than_it() -> None:
     points = np.random.default_rng(0).uniform(-5, 5, (500, 3))
-    full = np.array([textures._fbm(*p, 1.0, 5, 1.0, 1e-3, 1) for p in points])
-    coarse = np.array([textures._fbm(*p, 1.0, 5, 1.0, 3.0, 1) for p in points])
+    full = np.array([textures.fractal_noise(*p, 1.0, 5, 1.0, 1e-3, 1) for p in points])
+    coarse = np.array([textures.fractal_noise(*p, 1.0, 5, 1.0, 3.0, 1) for p in points])
     assert full.std() > 0.2 and np.all(coarse == 0)
     assert np.allclose(full, textures.noise_at(points, 5, 1.0, 1))
 
@@ -153,9 +167,9 @@ def test_look_at_points_upright() -> None:
     ("name", "settings", "sentence"),
     [
         ("castle", ORBIT, "no object 'castle'; use one of house, balloon, sculpture"),
-        ("house", capture.OrbitSettings(0, (5.0,), 0.6, 64, 48, 56.0, 1), "asked for 0 photos"),
-        ("house", capture.OrbitSettings(3, (5.0,), 0.6, 4, 4, 56.0, 1), "4 x 4 pixels"),
-        ("house", capture.OrbitSettings(3, (), 0.6, 64, 48, 56.0, 1), "needs an elevation"),
+        ("house", replace(ORBIT, views=0), "asked for 0 photos"),
+        ("house", replace(ORBIT, width_px=4, height_px=4), "4 x 4 pixels"),
+        ("house", replace(ORBIT, elevations_deg=()), "needs an elevation"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path: Path, name: str, settings, sentence: str) -> None:

@@ -1,6 +1,8 @@
 """Stereo and fusion on a planted scene: a bumpy, textured surface of known depth seen by five cameras."""
 
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -9,14 +11,19 @@ import pytest
 import torch
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.maps import read_depth, read_normals
-from scenefuse.mvs.depth_maps import FusionSettings, estimate_depth_maps, fuse_depth_maps
-from scenefuse.mvs.plane_sweep import DepthSettings, Photo, _Matcher
+from scenefuse.io.maps import read_depth, read_normals, write_depth, write_normals
+from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
+from scenefuse.mvs.depth_maps import estimate_depth_maps
+from scenefuse.mvs.matcher import Matcher
+from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.workspace import View
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
-DEPTH = DepthSettings(160, 4, 2, 48, 2, 7, 0.1, 0.5, 1.0, True)
-FUSION = FusionSettings(3, 2.0, 0.01, 20.0, 100, 8, 0.0)
+DEPTH = DepthMapSettings(
+    backend="torch", max_image_size_px=160, sources=4, min_angle_deg=1.0, best_sources=2, planes=48
+)
+FUSION = DenseCloudSettings(max_normal_error_deg=20)
 
 
 def surface(x, y):
@@ -80,7 +87,6 @@ def maps(workspace, tmp_path_factory):
             workspace=workspace,
             chunk=chunk,
             chunks=2,
-            backend="torch",
             settings=DEPTH,
             seed=0,
             depth=folder / f"{chunk}",
@@ -93,16 +99,16 @@ def maps(workspace, tmp_path_factory):
 def test_matching_kernel_scores_as_its_twin(window):
     rng = np.random.default_rng(0)
     intrinsics = np.array([[60, 0, 35], [0, 60, 25], [0, 0, 1.0]])
-    photos = [
-        Photo(rng.random(size, np.float32), intrinsics, np.column_stack([np.eye(3), [x, 0.1, 0]]))
-        for x, size in ((0, (50, 70)), (1, (50, 70)), (-2, (50, 70)), (9, (40, 80)))
-    ]
-    matcher = _Matcher(photos[0], photos[1:], replace(DEPTH, best_sources=2, window_px=window), "cpu")
+    poses = np.repeat(np.eye(4)[None], 4, axis=0)
+    poses[:, 0, 3], poses[:, 1, 3] = (0, 1, -2, 9), 0.1
+    sizes = [(50, 70), (50, 70), (50, 70), (40, 80)]
+    photos = [View("", intrinsics, p, s[1], s[0], rng.random(s, np.float32)) for p, s in zip(poses, sizes)]
+    matcher = Matcher(photos[0], photos[1:], 2, window, "cpu")
     # From behind the camera to far in front of it, some places beside the source photos.
     inverse = torch.linspace(-0.3, 0.5, 5)[:, None, None] + torch.from_numpy(0.05 * rng.random((5, 50, 70), np.float32))
     twin = torch.full((2, *inverse.shape), -0.5)
     for source in matcher.sources:
-        matcher._keep_best(inverse, twin, *source)
+        matcher.keep_best(inverse, twin, *source)
     assert (twin == -0.5).any() and (twin > 0).any()
     assert (matcher.score(inverse) - twin.mean(0)).abs().max() < 2e-4
 
@@ -136,8 +142,8 @@ def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, m
     fuse_depth_maps(
         workspace=workspace,
         depth=[maps / "0", maps / "1"],
-        depth_reports=[maps / "0.json", maps / "1.json"],
-        georeference=tmp_path / "georeference.json",
+        depth_json=[maps / "0.json", maps / "1.json"],
+        georeference_json=tmp_path / "georeference.json",
         settings=FUSION,
         cloud=cloud_path,
         report=report_path,
@@ -159,7 +165,7 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     fuse_depth_maps(
         workspace=workspace,
         depth=[maps / "0", maps / "1"],
-        depth_reports=[maps / "0.json", maps / "1.json"],
+        depth_json=[maps / "0.json", maps / "1.json"],
         settings=replace(FUSION, max_reprojection_px=0.3, max_depth_error=1e-3),
         cloud=tmp_path / "dense.ply",
         report=tmp_path / "dense.json",
@@ -169,24 +175,85 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
 
 
+@pytest.fixture
+def patch_match(monkeypatch):
+    """Stands in for COLMAP's patch-match, which needs CUDA: a flat map for every photo listed; the folders it ran in.
+
+    Like COLMAP it makes no folders, and the system's temporary folder is on another file system where there is one.
+    """
+    folders = []
+
+    def stereo(folder, _format, _option, options, cancellation_token):
+        folders.append(folder)
+        names = (folder / "stereo" / "patch-match.cfg").read_text().splitlines()[::2]
+        for name in names:
+            for part in ("depth_maps", "normal_maps", "consistency_graphs"):
+                assert (folder / "stereo" / part / name).parent.is_dir()
+            shape = (options.max_image_size * HEIGHT // WIDTH, options.max_image_size)
+            write_depth(folder / "stereo" / "depth_maps" / f"{name}.geometric.bin", np.full(shape, 5, np.float32))
+            normals = np.zeros((*shape, 3), np.float32)
+            write_normals(folder / "stereo" / "normal_maps" / f"{name}.geometric.bin", normals)
+
+    monkeypatch.setattr(pycolmap, "has_cuda", True)
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", stereo)
+    if Path("/dev/shm").is_dir():
+        monkeypatch.setattr(tempfile, "tempdir", "/dev/shm")
+    return folders
+
+
+def test_maps_of_patch_match_reach_their_place_from_subfolders_without_leaving_the_file_system(
+    workspace, patch_match, tmp_path
+):
+    walks = tmp_path / "workspace"
+    (walks / "sparse").mkdir(parents=True)
+    model = pycolmap.Reconstruction(workspace / "sparse")
+    for key, image in model.images.items():
+        image.name = f"walk{key % 2}/{image.name}"
+    model.write_binary(walks / "sparse")
+    estimate_depth_maps(
+        workspace=walks, chunk=0, chunks=2, settings=replace(DEPTH, backend="colmap", max_image_size_px=80), seed=0,
+        depth=tmp_path / "depth" / "0", report=tmp_path / "depth" / "0.json",
+    )  # fmt: skip
+    assert read_depth(tmp_path / "depth/0/depth_maps/walk0/2.png.bin").shape == (60, 80)
+    report = read_json(tmp_path / "depth/0.json")
+    names = ["walk0/2.png", "walk1/1.png", "walk1/5.png"]
+    assert value(report, "backend") == "colmap" and sorted(report["photos"]) == names
+    assert sorted(report["files"]) == [f"{part}/{name}.bin" for part in ("depth_maps", "normal_maps") for name in names]
+    # The temporary workspace lay beside the maps, and is gone.
+    assert all(folder.is_relative_to(tmp_path / "depth") and not folder.exists() for folder in patch_match)
+    assert sorted(p.name for p in (tmp_path / "depth").iterdir()) == ["0", "0.json"]
+
+
+def test_a_photo_without_a_map_of_patch_match_is_named(workspace, patch_match, monkeypatch, tmp_path):
+    monkeypatch.setattr(pycolmap, "patch_match_stereo", lambda *_, **__: None)
+    with pytest.raises(StageError, match="patch-match left no 1.png.geometric.bin in depth_maps"):
+        estimate_depth_maps(
+            workspace=workspace, chunk=0, chunks=1, settings=replace(DEPTH, backend="colmap"), seed=0,
+            depth=tmp_path / "depth", report=tmp_path / "depth.json",
+        )  # fmt: skip
+    assert not list(tmp_path.iterdir())
+
+
 def test_errors_are_sentences(workspace, maps, tmp_path):
     outputs = {"depth": tmp_path / "d", "report": tmp_path / "d.json"}
     common = {"workspace": workspace, "settings": DEPTH, "seed": 0}
     with pytest.raises(StageError, match="chunk 2 of 2 does not exist"):
-        estimate_depth_maps(chunk=2, chunks=2, backend="torch", **common, **outputs)
+        estimate_depth_maps(chunk=2, chunks=2, **common, **outputs)
     if not pycolmap.has_cuda:
         with pytest.raises(StageError, match="needs CUDA"):
-            estimate_depth_maps(chunk=0, chunks=1, backend="colmap", **common, **outputs)
+            estimate_depth_maps(
+                chunk=0, chunks=1, **(common | {"settings": replace(DEPTH, backend="colmap")}), **outputs
+            )
     with pytest.raises(StageError, match="not a readable COLMAP model"):
-        estimate_depth_maps(chunk=0, chunks=1, backend="torch", **(common | {"workspace": tmp_path}), **outputs)
+        estimate_depth_maps(chunk=0, chunks=1, **(common | {"workspace": tmp_path}), **outputs)
     fusion = {"workspace": workspace, "settings": FUSION, "cloud": tmp_path / "c.ply", "report": tmp_path / "c.json"}
     with pytest.raises(StageError, match="no depth maps in"):
-        fuse_depth_maps(depth=[tmp_path], depth_reports=[], **fusion)
-    strict = FusionSettings(6, 2.0, 0.01, 20.0, 100, 8, 0.0)
+        fuse_depth_maps(depth=[tmp_path], depth_json=[], **fusion)
+    strict = replace(FUSION, min_photos=6)
     with pytest.raises(StageError, match="no point is seen alike by 6 photos"):
         fuse_depth_maps(
             depth=[maps / "0", maps / "1"],
-            depth_reports=[maps / "0.json", maps / "1.json"],
+            depth_json=[maps / "0.json", maps / "1.json"],
             **(fusion | {"settings": strict}),
         )
     assert not list(tmp_path.iterdir())

@@ -2,27 +2,21 @@
 
 import json
 import math
+import os
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from support.textured_plane import plane_views
 
 from scenefuse.depth import train_depth as stage
-from scenefuse.depth.consistency import (
-    agreement_between_views,
-    align_to_points,
-    fuse_by_inverse_variance,
-)
-from scenefuse.depth.inputs import make_frames, network_inputs
-from scenefuse.depth.networks import (
-    DepthNetwork,
-    PoseNetwork,
-    depth_from_disparity,
-    disparity_from_depth,
-    parameters,
-    rigid,
-)
+from scenefuse.depth.consistency import align_to_points, consistency_between_views, fuse_by_inverse_variance
+from scenefuse.depth.first_depth import network_inputs
+from scenefuse.depth.inputs import photo_tensors
+from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
+from scenefuse.depth.pose_network import PoseNetwork, rigid
 from scenefuse.depth.self_supervision import (
     minimum_reprojection,
     photometric_error,
@@ -30,57 +24,16 @@ from scenefuse.depth.self_supervision import (
     ssim,
     warp,
 )
-from scenefuse.depth.training import Recipe, Supervision, train_networks, warmup_then_cosine
+from scenefuse.depth.training import Networks, Recipe, Supervision, train_networks
 from scenefuse.io.maps import read_depth
-from scenefuse.mvs.views import Views
 from scenefuse.stage import StageError
 
 INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])
 
 
-def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    red = np.sin(5.1 * x + 1.3 * y) + np.sin(11.0 * x - 7.0 * y)
-    green = np.sin(4.3 * y - 2.0 * x) + np.sin(9.0 * y + 8.0 * x)
-    blue = np.sin(6.0 * x * 1.1 + 3.7 * y + 1.0) + np.sin(13.0 * y)
-    return (127.5 + 55.0 * np.stack([red, green, blue], -1)).astype(np.uint8)
-
-
-def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int = 1) -> tuple[Views, np.ndarray]:
-    """A slanted textured square, z = 3 + 0.3 x in the object frame, seen by cameras along an arc; with true depths."""
-    focal = 0.9 * width
-    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
-    v, u = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
-    rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
-    rng = np.random.default_rng(0)
-    xy = rng.uniform(-0.9, 0.9, (150, 2))
-    sparse = np.column_stack([xy, 3.0 + 0.3 * xy[:, 0]])
-    images, masks, poses, depths, tracks = [], [], [], [], []
-    for angle in np.linspace(-0.4, 0.4, count):
-        rotation = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
-        centre = np.array([0, 0, 3.0]) - 3.0 * rotation[:, 2]
-        pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation, centre
-        directions = rays @ rotation.T
-        depth = (3.0 + 0.3 * centre[0] - centre[2]) / (directions[..., 2] - 0.3 * directions[..., 0])
-        points = centre + directions * depth[..., None]
-        mask = (np.abs(points[..., 0]) < 1) & (np.abs(points[..., 1]) < 1)
-        images.append(np.where(mask[..., None], _texture(points[..., 0], points[..., 1]), 90).astype(np.uint8))
-        masks.append(mask)
-        poses.append(pose)
-        depths.append(np.where(mask, depth, 0.0))
-        tracks.append(np.arange(150))
-    held = np.zeros(count, bool)
-    held[count // 2 : count // 2 + held_out] = True
-    names = [f"{i:03d}.jpg" for i in range(count)]
-    k = np.repeat(intrinsics[None], count, 0)
-    mattes = np.stack(masks).astype(np.uint8) * 255
-    views = Views(names, np.stack(images), mattes, k, np.stack(poses), held, sparse, tracks)
-    return views, np.stack(depths)
-
-
-def _settings(**changes: float) -> stage.DepthSettings:
-    base = stage.DepthSettings(64, 56, 4, 16, 2, 1, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.01)
-    return replace(base, **changes)
+SETTINGS = stage.DepthTrainingSettings(
+    width_px=64, crop_px=56, sources=4, sweep_planes=16, epochs=2, batch_photos=4, warmup_epochs=1
+)
 
 
 def test_warp_with_identity_pose_is_identity():
@@ -124,7 +77,7 @@ def test_ssim_of_equal_images_is_one_and_of_flat_images_is_the_luminance_term():
     luminance = (2 * 0.2 * 0.4 + 1e-4) / (0.2**2 + 0.4**2 + 1e-4)
     assert torch.allclose(ssim(dark, bright), torch.full((1, 3, 8, 8), luminance), atol=1e-3)
     expected = 0.85 * (1 - luminance) / 2 + 0.15 * 0.2
-    assert torch.allclose(photometric_error(dark, bright, 0.85), torch.full((1, 1, 8, 8), expected), atol=1e-3)
+    assert torch.allclose(photometric_error(dark, bright), torch.full((1, 1, 8, 8), expected), atol=1e-3)
 
 
 def test_minimum_reprojection_picks_the_smallest_valid_error_and_masks_what_did_not_move():
@@ -166,13 +119,6 @@ def test_networks_are_small_and_start_from_the_first_disparity():
     assert torch.allclose(network(torch.randn(2, 9, 33, 50), first), first, atol=1e-5)
 
 
-def test_warm_up_then_cosine():
-    values = [warmup_then_cosine(step, 100, 10.0) for step in range(100)]
-    assert values[0] < 0.1 and values[10] == pytest.approx(1.0) and values[99] < 0.01
-    assert values[55] == pytest.approx(0.5)
-    assert np.argmax(values) == 10
-
-
 def test_alignment_finds_a_planted_scale_and_shift_among_outliers():
     rng = np.random.default_rng(0)
     predicted = rng.uniform(2, 5, 200)
@@ -209,75 +155,155 @@ def test_inverse_variance_by_hand():
 
 def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
     views, truth = plane_views(held_out=0)
-    frames = make_frames(views, 4, torch.device("cpu"))
+    photos = photo_tensors(views, 4, torch.device("cpu"))
     depth = torch.tensor(truth, dtype=torch.float32)[:, None]
-    right = agreement_between_views(depth, frames, 0.02)
-    inner = torch.nn.functional.max_pool2d(1 - frames.masks, 5, 1, 2) == 0
+    right = consistency_between_views(depth, photos, 0.02)
+    inner = torch.nn.functional.max_pool2d(1 - photos.masks, 5, 1, 2) == 0
     assert right.confidence[inner].mean() > 0.9
     wrong = depth.clone()
     wrong[2] *= 1.15
-    assert agreement_between_views(wrong, frames, 0.02).confidence[2][inner[2]].mean() < 0.1
-    assert (right.confidence[frames.masks == 0] == 0).all()
+    assert consistency_between_views(wrong, photos, 0.02).confidence[2][inner[2]].mean() < 0.1
+    assert (right.confidence[photos.masks == 0] == 0).all()
 
 
 def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
     views, truth = plane_views()
-    frames = make_frames(views, 4, torch.device("cpu"))
-    assert not np.isin(np.flatnonzero(views.held_out), frames.sources.numpy()).any()
-    _, first, _ = network_inputs(frames, 16)
-    depth = depth_from_disparity(first, frames.near, frames.far).numpy()[:, 0]
-    error = np.abs(depth - truth)[views.masks] / frames.diagonal
+    photos = photo_tensors(views, 4, torch.device("cpu"))
+    assert not np.isin(np.flatnonzero(views.held_out), photos.sources.numpy()).any()
+    first = network_inputs(photos, 16).first
+    depth = depth_from_disparity(first, photos.near, photos.far).numpy()[:, 0]
+    error = np.abs(depth - truth)[views.masks] / photos.diagonal
     assert np.median(error) < 0.005
 
 
-def _recipe() -> Recipe:
-    return Recipe(2, 2, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.0, 0.3)
+def test_the_plane_sweep_alone_is_near_the_truth():
+    views, truth = plane_views(width=128, height=96)
+    photos = photo_tensors(views, 4, torch.device("cpu"))
+    swept = (network_inputs(photos, 24).channels[:, -2:-1] + 1) / 2
+    depth = depth_from_disparity(swept, photos.near, photos.far).numpy()[:, 0]
+    error = np.abs(depth - truth)[views.masks] / photos.diagonal
+    assert np.median(error) < 0.003
 
 
-def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, monkeypatch):
-    views, _ = plane_views(6)
-    frames = make_frames(views, 3, torch.device("cpu"))
-    inputs, first, _ = network_inputs(frames, 0)
+RECIPE = Recipe(epochs=4, warmup_epochs=1, batch_photos=4, coarse_share=0.3)
 
-    def train(checkpoint, stop_at=None):
-        torch.manual_seed(0)
-        depth, pose = DepthNetwork(inputs.shape[1]), PoseNetwork(3.0)
-        calls = iter(range(1000))
-        original = torch.optim.Adam.step
 
-        def step(self, *args):
-            if next(calls) == stop_at:
-                raise SystemExit(143)
-            return original(self, *args)
+def _train(checkpoint, photos, stop_at=None):
+    """Trained networks and their losses; a SIGTERM comes in step `stop_at`."""
+    inputs = network_inputs(photos, 0)
+    torch.manual_seed(0)
+    networks = Networks(DepthNetwork(inputs.channels.shape[1]), PoseNetwork(3.0))
+    calls, original = iter(range(1000)), torch.optim.Adam.step
 
-        with monkeypatch.context() as patch:
-            patch.setattr(torch.optim.Adam, "step", step)
-            patch.setattr("scenefuse.depth.training.CHECKPOINT_EVERY", 2)
-            losses = train_networks(depth, pose, frames, Supervision(inputs, first), _recipe(), checkpoint, 3)
-        return depth, losses
+    def step(self, *args):
+        if next(calls) == stop_at:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return original(self, *args)
 
-    whole, losses = train(tmp_path / "a.pt")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(torch.optim.Adam, "step", step)
+        losses = train_networks(networks, photos, Supervision(inputs.channels, inputs.first), RECIPE, checkpoint, 3)
+    return networks.depth, losses
+
+
+def _photos():
+    return photo_tensors(plane_views(6)[0], 3, torch.device("cpu"))
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, capsys):
+    photos = _photos()
+    whole, losses = _train(tmp_path / "a.pt", photos)
     with pytest.raises(SystemExit):
-        train(tmp_path / "b.pt", stop_at=3)
-    resumed, again = train(tmp_path / "b.pt")
+        _train(tmp_path / "b.pt", photos, stop_at=3)
+    capsys.readouterr()
+    resumed, again = _train(tmp_path / "b.pt", photos)
+    assert "resuming at step 4" in capsys.readouterr().out
     assert losses == again
     for a, b in zip(whole.parameters(), resumed.parameters()):
         assert torch.equal(a, b)
 
 
-def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkeypatch):
-    views, truth = plane_views()
-    monkeypatch.setattr(stage, "load_views", lambda *_: views)
+def test_a_truncated_checkpoint_starts_the_training_afresh_and_says_so(tmp_path, capsys):
+    photos, checkpoint = _photos(), tmp_path / "state.pt"
+    _, losses = _train(tmp_path / "whole.pt", photos)
+    with pytest.raises(SystemExit):
+        _train(checkpoint, photos, stop_at=2)
+    checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
+    assert _train(checkpoint, photos)[1] == losses
+    assert "training starts afresh" in capsys.readouterr().out
+
+
+def test_a_diverged_training_is_one_sentence_and_saves_nothing(tmp_path):
+    photos, checkpoint = _photos(), tmp_path / "state.pt"
+    photos.images[0, :, 20:30, 20:30] = torch.nan
+    with pytest.raises(StageError, match="training diverged"):
+        _train(checkpoint, photos, stop_at=2)
+    assert not checkpoint.exists()
+
+
+def test_a_failed_save_does_not_end_the_training(tmp_path, monkeypatch, capsys):
+    photos = _photos()
+    _, losses = _train(tmp_path / "whole.pt", photos)
+    monkeypatch.setattr("scenefuse.checkpoints.SAVE_EVERY_SECONDS", 0.0)
+    monkeypatch.setattr(torch, "save", _full_disk)
+    assert _train(tmp_path / "other/state.pt", photos)[1] == losses
+    assert "could not be saved" in capsys.readouterr().out
+
+
+def _full_disk(*_):
+    raise OSError(28, "No space left on device")
+
+
+def _stage(tmp_path, settings=SETTINGS, hold_out_every=8):
     stage.train_depth(
-        cameras=tmp_path,
+        workspace=tmp_path,
         masks=tmp_path,
         stage=tmp_path / "stage1",
         report=tmp_path / "stage1.json",
         checkpoints=tmp_path / "checkpoints",
-        settings=_settings(),
-        hold_out_every=8,
+        settings=settings,
+        hold_out_every=hold_out_every,
         seed=0,
     )
+
+
+@pytest.mark.parametrize("what", ["held out", "poses", "intrinsics", "points", "torch"])
+def test_a_checkpoint_of_other_inputs_is_not_resumed(tmp_path, monkeypatch, what):
+    views, _ = plane_views()
+
+    def killed(self, *args):
+        raise SystemExit(143)
+
+    def keys(views):
+        monkeypatch.setattr(stage, "load_views", lambda *_: views)
+        seen = []
+        with monkeypatch.context() as patch:
+            patch.setattr(stage, "train_networks", lambda *given: seen.append(given[-2]) or killed(None))
+            with pytest.raises(SystemExit):
+                _stage(tmp_path, replace(SETTINGS, sweep_planes=0))
+        return seen[0]
+
+    first = keys(views)
+    assert keys(replace(views)) == first
+    if what == "torch":
+        monkeypatch.setattr(torch, "__version__", "0.0")
+        assert keys(views) != first
+        return
+    turned = views.intrinsics.copy()
+    turned[3, 0, 0] *= 1.0001
+    other = {
+        "held out": {"held_out": np.roll(views.held_out, 1)},
+        "poses": {"object_from_cam": views.object_from_cam + np.eye(4, k=3) * 1e-5},
+        "intrinsics": {"intrinsics": turned},
+        "points": {"sparse": views.sparse + 1e-4},
+    }
+    assert keys(replace(views, **other[what])) != first
+
+
+def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkeypatch):
+    views, truth = plane_views()
+    monkeypatch.setattr(stage, "load_views", lambda *_: views)
+    _stage(tmp_path)
     report = json.loads((tmp_path / "stage1.json").read_text())
     errors, confident = [], []
     for index, name in enumerate(views.names):
@@ -297,6 +323,6 @@ def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkey
 def test_too_few_points_or_photos_is_one_sentence():
     views, _ = plane_views()
     with pytest.raises(StageError, match="SfM points lie on the object"):
-        make_frames(replace(views, tracks=[np.arange(3)] * 8), 4, torch.device("cpu"))
+        photo_tensors(replace(views, tracks=[np.arange(3)] * 8), 4, torch.device("cpu"))
     with pytest.raises(StageError, match="needs at least 3"):
-        make_frames(replace(views, held_out=np.arange(8) > 1), 4, torch.device("cpu"))
+        photo_tensors(replace(views, held_out=np.arange(8) > 1), 4, torch.device("cpu"))

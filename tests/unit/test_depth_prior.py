@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_depth import plane_views
+from support.textured_plane import plane_views
 from test_photo_refinement import _speckled, _wrong
 
 from scenefuse.depth.prior import read_prior
@@ -54,12 +54,12 @@ def test_held_out_photos_and_their_maps_change_nothing(plane, tmp_path):
 def test_maps_that_contradict_each_other_get_no_confidence(plane, tmp_path):
     views, truth = plane
     factor = np.where(np.arange(len(truth)) % 2, 1.0, 1.1)[:, None, None]
-    lonely = np.flatnonzero(~views.held_out)[0]
-    factor[lonely] = 1.25
+    alone = np.flatnonzero(~views.held_out)[0]
+    factor[alone] = 1.25
     _write(tmp_path, views, (truth * factor).astype(np.float32))
     prior = read_prior(tmp_path, views, AS_IT_IS, 0.01)
-    inside = truth[lonely] > 0
-    assert prior.confidence[lonely][inside].mean() < 0.05
+    inside = truth[alone] > 0
+    assert prior.confidence[alone][inside].mean() < 0.05
     assert prior.refined_share == 0 and prior.confidence.max() == pytest.approx(0.5)
 
 

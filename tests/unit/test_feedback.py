@@ -5,22 +5,25 @@ import json
 import numpy as np
 import pytest
 import torch
+from support.textured_plane import plane_views
 
 from scenefuse.depth import refine_depth as feedback
 from scenefuse.depth import train_depth as depth
+from scenefuse.depth.candidates import best_candidate
 from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.stage import StageError
-from tests.unit.test_depth import plane_views
 
-SETTINGS = feedback.FeedbackSettings(1, 1, 4, 1e-3, 1, 1.0, 0.5)
+SETTINGS = feedback.FeedbackSettings(epochs=1, batch_photos=4, warmup_epochs=1)
+DEPTH_SETTINGS = depth.DepthTrainingSettings(
+    width_px=64, crop_px=56, sources=4, sweep_planes=16, epochs=1, batch_photos=4, warmup_epochs=1
+)
 
 
 def _refine(tmp_path):
     feedback.refine_depth(
-        cameras=tmp_path,
+        workspace=tmp_path,
         masks=tmp_path,
-        previous=tmp_path / "stage1",
-        rendered=tmp_path / "stage2",
+        earlier=feedback.EarlierStages(previous=tmp_path / "stage1", rendered=tmp_path / "stage2"),
         stage=tmp_path / "stage3",
         report=tmp_path / "stage3.json",
         checkpoints=tmp_path / "checkpoints",
@@ -35,14 +38,13 @@ def _refine(tmp_path):
 def stage1(tmp_path, monkeypatch):
     views, truth = plane_views()
     monkeypatch.setattr(depth, "load_views", lambda *_: views)
-    monkeypatch.setattr(feedback, "load_views", lambda *_: views)
     depth.train_depth(
-        cameras=tmp_path,
+        workspace=tmp_path,
         masks=tmp_path,
         stage=tmp_path / "stage1",
         report=tmp_path / "stage1.json",
         checkpoints=tmp_path / "checkpoints",
-        settings=depth.DepthSettings(64, 56, 4, 16, 1, 1, 4, 1e-3, 1, 0.85, 1e-3, 1.0, 0.01),
+        settings=DEPTH_SETTINGS,
         hold_out_every=8,
         seed=0,
     )
@@ -81,12 +83,12 @@ def test_bad_rendered_depth_is_not_kept(tmp_path, stage1):
 
 def test_the_lowest_rank_sum_wins_and_a_tie_goes_to_the_first():
     scores = {
-        "rendered": {"photometric": 0.2, "doubt": 0.1, "residual": None},
-        "refined": {"photometric": 0.1, "doubt": 0.1, "residual": 0.0},
+        "rendered": {"photometric": 0.2, "inconsistency": 0.1, "residual": None},
+        "refined": {"photometric": 0.1, "inconsistency": 0.1, "residual": 0.0},
     }
-    assert feedback.choose(scores) == "refined"
-    scores["refined"]["doubt"] = 0.2
-    assert feedback.choose(scores) == "rendered"
+    assert best_candidate(scores) == "refined"
+    scores["refined"]["inconsistency"] = 0.2
+    assert best_candidate(scores) == "rendered"
 
 
 def test_missing_rendered_depth_or_networks_is_one_sentence(tmp_path, stage1):

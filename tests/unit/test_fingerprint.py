@@ -1,13 +1,14 @@
+import os
+
 import pytest
 
-from scenefuse.fingerprint import _normalised, _tree, fingerprint
+from scenefuse.fingerprint import files_fingerprint, fingerprint, forget
 
 
 @pytest.fixture
 def project(tmp_path):
     def write(**modules: str) -> str:
-        for cached in (fingerprint, _normalised, _tree):
-            cached.cache_clear()
+        forget()
         for name, source in modules.items():
             path = tmp_path / f"{name.replace('__', '/')}.py"
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -53,3 +54,58 @@ def test_edits_that_change_the_code(project, edit):
     before = project(**START)
     assert before != project(**edit)
     assert before == project(**START)
+
+
+def test_an_upgraded_package_changes_what_imports_it_and_nothing_else(project, monkeypatch):
+    versions = {"numpy": "2.0", "opencv-python-headless": "5.0", "torch": "2.0+cpu", "scipy": "1.0"}
+    monkeypatch.setattr("importlib.metadata.version", versions.__getitem__)
+    start = START | {"lib__late": "import numpy as np\nfrom torch import nn\ndef f():\n    import cv2\n"}
+    before = project(**start)
+    versions |= {"scipy": "2.0", "torch": "2.0+cu130"}
+    assert project(**start) == before
+    for name in ("numpy", "torch", "opencv-python-headless"):
+        old, versions[name] = versions[name], "9.9"
+        assert project(**start) != before, name
+        versions[name] = old
+
+
+def test_imports_in_brackets_and_over_lines_are_followed(project):
+    for source in (
+        "from lib import (  # both\n    b,\n    a,\n)\n",
+        "from lib import b, \\\n    a\n",
+        "import lib.b, lib.a as x\n",
+    ):
+        before = project(**START | {"scripts__s": source})
+        assert project(lib__a="z = 3\n") != before
+
+
+@pytest.fixture
+def photo(tmp_path):
+    def write(content: bytes, seconds: int) -> str:
+        path = tmp_path / "photo.jpg"
+        path.write_bytes(content)
+        os.utime(path, (seconds, seconds))
+        forget()
+        return files_fingerprint((str(path),))
+
+    return write
+
+
+def test_a_file_replaced_by_an_older_one_is_noticed(photo):
+    assert photo(b"new", 2000) != photo(b"old", 1000)
+    large = 2_000_000
+    assert photo(b"n" * large, 2000) != photo(b"o" * large, 1000)
+
+
+def test_a_small_file_that_is_only_touched_stays_the_same(photo):
+    assert photo(b"same", 1000) == photo(b"same", 2000)
+
+
+def test_a_folder_goes_by_what_lies_in_it(tmp_path):
+    (tmp_path / "truth").mkdir()
+    found = set()
+    for content in ("a", "b"):
+        (tmp_path / "truth/cameras.json").write_text(content)
+        forget()
+        found.add(files_fingerprint((str(tmp_path / "truth"),)))
+    assert len(found) == 2

@@ -7,7 +7,7 @@ from scenefuse.sfm.frames import FrameSettings, extract_frames, original_sizes, 
 from scenefuse.sfm.photos import read_photos
 from scenefuse.stage import StageError, read_json, value
 
-SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64, jpeg_quality=95)
+SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64)
 
 
 def picture(width=64, height=48, seed=0):
@@ -52,12 +52,38 @@ def test_rotated_photos_are_stood_upright_and_keep_their_focal_length(tmp_path):
     assert original_sizes(content)["00.jpg"] == (40, 60)
 
 
+@pytest.mark.parametrize("kind", ["RGB", "L", "I;16", "RGBA"])
+def test_a_tiff_that_is_too_wide_is_scaled_and_keeps_its_place_and_focal_length(tmp_path, kind):
+    folder = folder_of(tmp_path, [(64, 48)] * 2)
+    exif = Image.Exif()
+    exif[0x0112] = 8
+    exif[0x8769] = {0xA405: 36}
+    exif[0x8825] = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\x00", 6: 431.5}
+    colours = picture(96, 200)
+    pixels = colours[..., 0].astype(np.uint16) * 257 if kind == "I;16" else colours
+    image = Image.fromarray(pixels) if kind == "I;16" else Image.fromarray(colours).convert(kind)
+    image.save(folder / "wide.tif", exif=exif.tobytes())
+    photos, content = extract(tmp_path, folder)
+    wide = photos[-1]
+    assert (wide.name, wide.width, wide.height, wide.orientation) == ("wide.tif", 64, 31, 1)
+    assert (wide.latitude_deg, wide.longitude_deg, wide.altitude_m) == pytest.approx((47.5, 8.25, 431.5))
+    assert wide.focal_px == pytest.approx(64.0) and original_sizes(content)["wide.tif"] == (200, 96)
+
+
+def test_any_name_of_a_photo_serves(tmp_path):
+    folder = folder_of(tmp_path, [(64, 48)] * 2)
+    names = ["#1.png", "a {1} (2).png", "Übersicht Süd.png"]
+    for index, name in enumerate(names):
+        Image.fromarray(picture(seed=9 + index)).save(folder / name)
+    assert {p.name for p in extract(tmp_path, folder)[0]} == {"00.png", "01.png", *names}
+
+
 def test_step_and_limit(tmp_path):
     assert thin_out(10, 3, 0) == [0, 3, 6, 9]
     assert thin_out(101, 1, 3) == [0, 50, 100]
     assert thin_out(4, 1, 9) == [0, 1, 2, 3]
     folder = folder_of(tmp_path, [(64, 48)] * 9)
-    photos, _ = extract(tmp_path, folder, FrameSettings(2, 3, 64, 95))
+    photos, _ = extract(tmp_path, folder, FrameSettings(frame_step=2, max_frames=3, max_width_px=64))
     assert [p.name for p in photos] == ["00.png", "04.png", "08.png"]
 
 
@@ -69,7 +95,7 @@ def test_the_sharpest_frame_of_each_window_of_a_video_is_kept(tmp_path):
         frame = cv2.resize(picture(32, 24, index), (128, 96), interpolation=cv2.INTER_NEAREST)
         video.write(frame if index in sharp else cv2.GaussianBlur(frame, (0, 0), 6.0))
     video.release()
-    photos, content = extract(tmp_path, path, FrameSettings(4, 0, 64, 95))
+    photos, content = extract(tmp_path, path, FrameSettings(frame_step=4, max_frames=0, max_width_px=64))
     assert value(content, "kind") == "video"
     origin = value(content, "origin")
     chosen = [origin[p.name]["frame"] for p in photos]

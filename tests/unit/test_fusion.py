@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds, fuse_object, match_colors
+from scenefuse.fusion.fuse_object import FusionInputs, FusionSettings, fuse_clouds, fuse_object, match_colors
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -16,7 +17,6 @@ SETTINGS = FusionSettings(
     density=1.0,
     feather_spacings=4.0,
     match_colors=True,
-    min_confidence=0.0,
 )
 
 
@@ -43,7 +43,7 @@ def obj():
 
 
 def test_fill_adds_only_what_the_scene_lacks(scene, obj):
-    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), "fill", SETTINGS)
+    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), SETTINGS)
     assert fusion.kept.all()
     assert fusion.added.points[:, 0].min() > 4.0
     assert set(fusion.added.fields["source"]) == {1}
@@ -51,28 +51,28 @@ def test_fill_adds_only_what_the_scene_lacks(scene, obj):
 
 
 def test_append_adds_everything_at_its_own_density(scene, obj):
-    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), "append", replace(SETTINGS, density=0.0))
+    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), replace(SETTINGS, mode="append", density=0.0))
     assert len(fusion.added) == len(obj) and fusion.kept.all()
 
 
 def test_replace_takes_the_scene_away_under_the_object(scene, obj):
     half = obj[obj.points[:, 0] > 2]
-    fusion = fuse_clouds(half, scene, scene, Sim3.identity(), "replace", SETTINGS)
+    fusion = fuse_clouds(half, scene, scene, Sim3.identity(), replace(SETTINGS, mode="replace"))
     assert fusion.kept[scene.points[:, 0] < 1.8].all()
     assert not fusion.kept[scene.points[:, 0] > 2.2].any()
 
 
 def test_the_feathered_seam_moves_a_shifted_object_half_way_to_the_scene(scene):
     raised = sheet(2, 8, 0.05, [200, 100, 50], z=0.1)
-    settings = replace(SETTINGS, density=0.0, fill_residuals=0.0)
-    added = fuse_clouds(raised, scene, scene, Sim3.identity(), "replace", settings).added
+    settings = replace(SETTINGS, mode="replace", density=0.0, fill_residuals=0.0)
+    added = fuse_clouds(raised, scene, scene, Sim3.identity(), settings).added
     at_seam, far = added.points[:, 0] < 2.05, added.points[:, 0] > 4
     assert np.allclose(added.points[far, 2], 0.1)
     assert 0.04 < added.points[at_seam, 2].mean() < 0.09
 
 
 def test_colors_of_what_is_added_follow_the_scene(scene, obj):
-    added = fuse_clouds(obj, scene, scene, Sim3.identity(), "fill", SETTINGS).added
+    added = fuse_clouds(obj, scene, scene, Sim3.identity(), SETTINGS).added
     expected = np.array([200, 100, 50]) * (0.6 + 0.4 * np.sin(added.points[:, 1:2]))
     assert np.abs(added.colors - expected).mean() < 5
 
@@ -83,7 +83,7 @@ def test_gain_and_bias_are_recovered():
     assert np.allclose(gain, 1.5, atol=0.03) and np.allclose(bias, 10, atol=3)
 
 
-@pytest.mark.parametrize("status", ["registered", "unregistered"])
+@pytest.mark.parametrize("status", ["registered", "unregistered", "ungated"])
 def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, scene, obj, status):
     pose = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
     for name, cloud in (("scene", scene), ("crop", scene), ("object", obj.transformed(pose.inverse()))):
@@ -104,27 +104,28 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
             "scene_from_object": quantity(pose.matrix, ""),
         },
     )
-    crs_from_scene = Sim3(1.0, np.eye(3), np.array([4e5, 5e6, 100.0]))
     write_json(
         tmp_path / "georeference.json",
         {
             "length_unit": quantity("m", ""),
-            "crs": quantity("EPSG:32632", ""),
-            "crs_from_scene": quantity(crs_from_scene.matrix, "m"),
+            "origin_latitude_deg": quantity(47.4, "deg"),
+            "origin_longitude_deg": quantity(8.55, "deg"),
+            "origin_altitude_m": quantity(430.0, "m"),
         },
     )
     fuse_object(
-        object=tmp_path / "object.ply",
-        scene=tmp_path / "scene.ply",
-        crop=tmp_path / "crop.ply",
-        crop_report=tmp_path / "crop.json",
-        fine=tmp_path / "fine.json",
-        georeference=tmp_path / "georeference.json",
+        inputs=FusionInputs(
+            object=tmp_path / "object.ply",
+            scene=tmp_path / "scene.ply",
+            crop=tmp_path / "crop.ply",
+            crop_json=tmp_path / "crop.json",
+            fine_json=tmp_path / "fine.json",
+            georeference_json=tmp_path / "georeference.json",
+        ),
         fused=tmp_path / "fused.ply",
         fused_scene=tmp_path / "fused_scene.ply",
         fused_laz=tmp_path / "fused_scene.laz",
         report=tmp_path / "fusion.json",
-        mode="fill",
         settings=SETTINGS,
     )
     whole, around, report = (
@@ -134,7 +135,7 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     )
     assert report["scene_spacing"]["unit"] == "m"
     added = value(report, "added_points")
-    assert (added > 0) == (status == "registered")
+    assert (added > 0) == (status != "unregistered") and value(report, "registration") == status
     assert len(whole) == len(scene) + added and (whole.fields["source"] == 1).sum() == added
     assert whole.fields["source"].dtype == np.uint8
     assert whole.fields["confidence"].dtype == np.float32 and whole.fields["views"].dtype == np.int32
@@ -142,4 +143,5 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     import laspy
 
     las = laspy.read(tmp_path / "fused_scene.laz")
-    assert len(las.points) == len(whole) and np.asarray(las.x).min() == pytest.approx(4e5, abs=0.01)
+    in_crs = LocalFrame(47.4, 8.55, 430.0).in_crs(whole.points)
+    np.testing.assert_allclose(np.stack([las.x, las.y, las.z], axis=1), in_crs, atol=1e-3)

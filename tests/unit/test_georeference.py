@@ -1,10 +1,12 @@
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.sfm.geodesy import LocalFrame, local_frame
+from scenefuse.sfm.geodesy import LocalFrame, local_frame, scene_frame
 from scenefuse.sfm.georeference import (
     GeoreferenceSettings,
     camera_poses,
@@ -15,8 +17,9 @@ from scenefuse.sfm.georeference import (
 from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.stage import read_json, value
 from scenefuse.transforms import Sim3, rotation_angle_deg
+from scenefuse.workspace import View, write_model
 
-SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0, min_gps_photos=5)
+SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0)
 FRAME = LocalFrame(47.37, 8.55, 430.0)
 PLANTED = Sim3(7.5, Rotation.from_euler("xyz", [150, 20, -80], degrees=True).as_matrix(), np.array([30.0, -12.0, 55.0]))
 
@@ -50,6 +53,30 @@ def test_similarity_to_utm_agrees_with_pyproj(longitude, latitude, crs):
     in_crs = frame.crs_from_local().apply(local)
     np.testing.assert_allclose(in_crs[:, :2], np.stack([easting, northing], axis=1), atol=0.02)
     np.testing.assert_allclose(in_crs[:, 2], 430.0 + local[:, 2], atol=0.02)
+
+
+def test_points_five_kilometres_away_are_projected_not_turned():
+    frame = LocalFrame(47.37, 8.55, 430.0)
+    far = np.array([[5000.0, 0.0, 0.0], [0.0, 5000.0, 0.0], [3000.0, -4000.0, 60.0]])
+    in_crs = frame.in_crs(far)
+    # Height above the ellipsoid is up plus the drop of the tangent plane, d^2 / 2R; a similarity misses it.
+    np.testing.assert_allclose(in_crs[:, 2], 430.0 + far[:, 2] + 5000.0**2 / (2 * 6.38e6), atol=0.01)
+    there = pyproj.Transformer.from_crs(frame.crs, 4979, always_xy=True).transform(*in_crs.T)
+    np.testing.assert_allclose(frame.apply(np.stack([there[1], there[0], there[2]], axis=1)), far, atol=1e-3)
+    assert np.abs(frame.crs_from_local().apply(far)[:, 2] - in_crs[:, 2]).min() > 1.9
+
+
+def test_one_wild_position_does_not_move_the_origin():
+    positions = FRAME.inverse(flight())
+    wild = positions.copy()
+    wild[3] = [12.0, 77.0, 9000.0]
+    moved = FRAME.apply(np.array([[*(getattr(local_frame(wild), k) for k in ("latitude_deg", "longitude_deg"))] + [0]]))
+    assert np.linalg.norm(moved[0, :2]) < 60 and local_frame(wild).altitude_m == pytest.approx(490, abs=1)
+
+
+def test_longitudes_on_both_sides_of_the_antimeridian_are_neighbours():
+    frame = local_frame(np.array([[-17.0, 179.999, 10.0], [-17.0, -179.997, 10.0], [-17.0, -179.999, np.nan]]))
+    assert (frame.longitude_deg, frame.altitude_m) == (-179.999, 10.0)
 
 
 def test_origin_is_rounded_mean():
@@ -88,6 +115,55 @@ def test_fit_level_is_exact_without_noise():
     fitted, inliers = fit_level(PLANTED.inverse().apply(target), target, PLANTED.rotation.T @ [0, 0, 1.0], 8.0)
     assert inliers.all()
     np.testing.assert_allclose(fitted.matrix, PLANTED.matrix, atol=1e-9)
+
+
+def tilted(unknown, seed=5):
+    """A flight, and its placement by noisy positions, some heights unknown, with cameras that lean by 3 degrees."""
+    target = flight()
+    noisy = target + np.random.default_rng(seed).normal(0, [0.5, 0.5, 1.0], target.shape)
+    noisy[unknown, 2] = np.nan
+    up = PLANTED.rotation.T @ Rotation.from_euler("x", 3, degrees=True).apply([0.0, 0.0, 1.0])
+    return target, place_by_gps(PLANTED.inverse().apply(target), noisy, up, SETTINGS, seed=0)
+
+
+def test_unknown_heights_of_some_photos_take_no_part():
+    target, placement = tilted(slice(0, None, 2))
+    assert "15 of them have no GPS height" in placement.reason and placement.heights == "measured"
+    assert placement.inliers.all() and not placement.levelled
+    fitted = placement.local_from_model
+    assert rotation_angle_deg(fitted.rotation.T @ PLANTED.rotation) < 1.5
+    assert np.linalg.norm(fitted.apply(PLANTED.inverse().apply(target)) - target, axis=1).max() < 1.5
+    # Where heights are filled in and fitted, the model leans: the mean height of all stands for half of the photos.
+    lifted = flight() + np.arange(30)[:, None] % 6 * [0, 0, 5.0]  # six columns, each five metres higher
+    heights = np.where(np.arange(30) % 2, lifted[:, 2], np.nan)
+    partly = np.column_stack([lifted[:, :2], heights])
+    up = PLANTED.rotation.T @ np.array([0.0, 0.0, 1.0])
+    fitted = place_by_gps(PLANTED.inverse().apply(lifted), partly, up, SETTINGS, seed=0).local_from_model
+    assert rotation_angle_deg(fitted.rotation.T @ PLANTED.rotation) < 0.01
+    assert fitted.scale == pytest.approx(PLANTED.scale, rel=1e-4)
+
+
+def test_without_any_height_the_cameras_level_the_model_and_heights_are_relative():
+    target, placement = tilted(slice(None))
+    assert placement.status == "georeferenced" and placement.heights == "relative" and placement.levelled
+    assert "levelled by the cameras" in placement.reason and "heights are relative" in placement.reason
+    fitted = placement.local_from_model
+    assert rotation_angle_deg(fitted.rotation.T @ PLANTED.rotation) == pytest.approx(3.0, abs=0.5)
+    assert fitted.scale == pytest.approx(PLANTED.scale, rel=0.02)
+    heights = fitted.apply(PLANTED.inverse().apply(target))[:, 2]
+    assert np.median(heights) == pytest.approx(0, abs=1e-6)
+
+
+def test_wild_positions_do_no_harm_without_heights_or_along_one_line():
+    for rows, columns in ((5, 6), (1, 12)):
+        target = flight(rows, columns)
+        centres, wild = PLANTED.inverse().apply(target), target.copy()
+        wild[[2, 7], :2] += [[4000, 100], [-80, 300]]
+        wild[:, 2] = np.nan if rows > 1 else 60.0
+        placement = place_by_gps(centres, wild, PLANTED.rotation.T @ [0, 0, 1.0], SETTINGS, seed=0)
+        assert placement.status == "georeferenced" and placement.levelled
+        assert list(np.flatnonzero(~placement.inliers)) == [2, 7]
+        assert placement.local_from_model.scale == pytest.approx(PLANTED.scale, rel=0.01)
 
 
 def test_positions_that_hardly_move_give_no_scale():
@@ -150,6 +226,27 @@ def test_stage_brings_a_model_into_metres(model):
     np.testing.assert_allclose(centres, origin.apply(FRAME.inverse(truth)), atol=1e-3)
     crs_from_scene = Sim3.from_matrix(np.array(value(report, "crs_from_scene")))
     np.testing.assert_allclose(crs_from_scene.translation, value(report, "origin_in_crs"))
+
+
+def test_stage_without_altitudes_says_so(tmp_path):
+    views, truth = [], flight()
+    for k, centre in enumerate(PLANTED.inverse().apply(truth)):
+        heading = Rotation.from_euler("z", 40 * k, degrees=True).as_matrix()
+        level_cam = heading @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # x right, y down, z ahead
+        pose = np.eye(4)
+        pose[:3, :3] = level_cam.T @ PLANTED.rotation
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        views.append(View(f"{k:02d}.jpg", np.diag([80.0, 80, 1]), pose, 100, 80))
+    (tmp_path / "sparse").mkdir()
+    write_model(tmp_path / "sparse", views)
+    photos = [replace(photo, altitude_m=None) for photo in listed([view.name for view in views], truth)]
+    report, moved = georegister_in(tmp_path, photos)
+    heights = camera_poses(moved)[2][:, 2]
+    np.testing.assert_allclose(heights, truth[:, 2] - np.median(truth[:, 2]), atol=0.01)
+    assert value(report, "heights") == "relative" and "heights are relative" in value(report, "reason")
+    assert value(report, "photos_with_gps_height") == 0 and value(report, "origin_altitude_m") is None
+    assert value(report, "gps_residual_vertical_rms_m") is None and value(report, "up_cue") != "GPS"
+    assert scene_frame(report) is not None
 
 
 def test_stage_without_gps_names_no_metre(model):

@@ -143,10 +143,10 @@ def imported(data, out, images=None, masks=None):
         data=data,
         images=images,
         masks=masks,
-        cameras=out / "cameras",
+        workspace=out / "cameras",
         mattes=out / "masks",
         report=out / "photos.json",
-        settings=UndistortSettings(1600, 97),
+        settings=UndistortSettings(max_size_px=1600),
     )
     return load_views(out / "cameras", out / "masks", WIDTH, 0), read_json(out / "photos.json")
 

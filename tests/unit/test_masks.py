@@ -11,25 +11,28 @@ import pycolmap
 import pytest
 import torch
 
+from scenefuse.io.pictures import read_rgb
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.box import find_ground, upright_box
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.masks.grabcut_passes import stamp
-from scenefuse.masks.make_masks import MaskSettings, make_masks
+from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights
 from scenefuse.masks.sam2_weights import fetch_sam2_weights
+from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.target import target_from_points
-from scenefuse.mvs.visual_hull import Frame, agreement, carve, silhouette
+from scenefuse.mvs.visual_hull import carve, mask_iou, silhouette
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
+from scenefuse.workspace import View, Workspace
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
-SETTINGS = MaskSettings(0.15, 0.02, 120, 3, 40, 0.1, 5.0, 0.6, 4, 2.0, "0" * 64, "0" * 64)
+SETTINGS = MaskSettings(grabcut_width_px=120, hull_voxels=40, min_photos=4, max_click_residual_px=2)
 CENTRE, RADIUS = np.array([0, 0, 1.0]), 1.0
 
 
 def camera_pose(k):
-    """(3, 4) cam_from_object of a camera on a circle, five away and 2.5 high, looking at the ball."""
+    """(4, 4) cam_from_object of a camera on a circle, five away and 2.5 high, looking at the ball."""
     angle = 2 * np.pi * k / PHOTOS
     position = np.array([5 * np.cos(angle), 5 * np.sin(angle), 2.5])
     forward = CENTRE - position
@@ -37,14 +40,20 @@ def camera_pose(k):
     right = np.cross(forward, [0, 0, 1])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    return np.column_stack([rotation, -rotation @ position])
+    return np.vstack([np.column_stack([rotation, -rotation @ position]), [0, 0, 0, 1]])
+
+
+def view(k, pixels=None):
+    """The camera of photo k."""
+    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    return View(f"{k}", intrinsics, camera_pose(k), WIDTH, HEIGHT, pixels)
 
 
 def look(pose):
     """True mask (H, W) and points seen (H, W, 3) by a camera: the ball, else the ground."""
     u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:, :3]
-    position = -pose[:, :3].T @ pose[:, 3]
+    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1) @ pose[:3, :3]
+    position = -pose[:3, :3].T @ pose[:3, 3]
     a, b = (rays**2).sum(-1), rays @ (position - CENTRE)
     root = b**2 - a * (((position - CENTRE) ** 2).sum() - RADIUS**2)
     ball = root > 0
@@ -76,7 +85,7 @@ def capture(tmp_path_factory):
         photo = np.where(ball[..., None], [50, 60, 170], [60, 130, 70]) + noise
         cv2.imwrite(str(folder / "cameras" / "images" / f"f{k}.png"), np.clip(photo, 0, 255).astype(np.uint8))
         cv2.imwrite(str(folder / "truth" / f"f{k}_mask.png"), ball.astype(np.uint8) * 255)
-        x = points @ pose[:, :3].T + pose[:, 3]
+        x = points @ pose[:3, :3].T + pose[:3, 3]
         pixels = FOCAL * x[:, :2] / x[:, 2:] + [WIDTH / 2, HEIGHT / 2]
         inside = np.flatnonzero(((pixels > 1) & (pixels < [WIDTH - 1, HEIGHT - 1])).all(1))
         u, v = pixels[inside].astype(int).T
@@ -84,7 +93,7 @@ def capture(tmp_path_factory):
         image = pycolmap.Image(
             name=f"f{k}.png", camera_id=1, image_id=k + 1, points2D=[pycolmap.Point2D(p) for p in pixels[rows]]
         )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose))
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
         for j, row in enumerate(rows):
             tracks[row].append(pycolmap.TrackElement(k + 1, j))
     for point, track in zip(points, tracks):
@@ -99,26 +108,23 @@ def capture(tmp_path_factory):
     return folder
 
 
-def run_stage(capture, output, **changes):
-    arguments = {
-        "cameras": capture / "cameras",
-        "cameras_json": capture / "cameras.json",
-        "sfm": capture / "cameras" / "sparse",
-        "photos": capture / "photos.json",
-        "method": "grabcut",
-        "prompts": capture / "prompts.tsv",
-        "supplied": None,
-        "sam2_encoder": Path("none"),
-        "sam2_decoder": Path("none"),
-        "sam2_checkpoint": None,
-        "keep": "object",
-        "settings": SETTINGS,
-        "seed": 0,
-        "masks": output / "masks",
-        "contact_sheet": output / "sheet.png",
-        "report": output / "masks.json",
-    }
-    make_masks(**(arguments | changes))
+def run_stage(capture, output, supplied=None, prompts="prompts.tsv", **changes):
+    inputs = MaskInputs(
+        workspace=capture / "cameras",
+        undistorted_json=capture / "cameras.json",
+        sparse=capture / "cameras" / "sparse",
+        photos_json=capture / "photos.json",
+        prompts=prompts and capture / prompts,
+        supplied=supplied,
+    )
+    make_masks(
+        inputs=inputs,
+        settings=dataclasses.replace(SETTINGS, **changes),
+        seed=0,
+        masks=output / "masks",
+        contact_sheet=output / "sheet.png",
+        report=output / "masks.json",
+    )
 
 
 def iou_with_truth(capture, output):
@@ -127,7 +133,7 @@ def iou_with_truth(capture, output):
         truth = cv2.imread(str(capture / "truth" / f"f{k}_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
         found = cv2.imread(str(output / "masks" / f"f{k}.png"), cv2.IMREAD_GRAYSCALE)
         assert set(np.unique(found)) <= {0, 255}
-        scores.append(agreement(truth, found > 0))
+        scores.append(mask_iou(truth, found > 0))
     return scores
 
 
@@ -153,7 +159,7 @@ def test_a_photo_whose_colours_mislead_is_repaired_or_dropped(capture, tmp_path)
     if mask is None:
         assert "IoU with the visual hull" in report["dropped"]["f3.png"]
     else:
-        assert agreement(mask > 0, truth) > 0.75
+        assert mask_iou(mask > 0, truth) > 0.75
 
 
 def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture, tmp_path):
@@ -169,6 +175,38 @@ def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture
     assert not (tmp_path / "x").exists()
 
 
+def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied)
+    (supplied / "f1_mask.png").write_bytes(b"no picture")
+    cv2.imwrite(str(supplied / "f4_mask.png"), np.full((WIDTH, HEIGHT), 255, np.uint8))
+    (supplied / "f6_mask.png").unlink()
+    run_stage(capture, tmp_path, method="supplied", prompts=None, supplied=supplied)
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "masks") == PHOTOS - 3 and value(report, "photos") == PHOTOS
+    assert list(report["dropped"]) == ["f1.png", "f4.png", "f6.png"]
+    assert "f1_mask.png cannot be read; export it again" in report["dropped"]["f1.png"]
+    assert f"f4_mask.png is {HEIGHT} x {WIDTH} pixels, its photo {WIDTH} x {HEIGHT}" in report["dropped"]["f4.png"]
+    assert report["dropped"]["f6.png"] == "no mask was supplied"
+    assert sorted(p.stem for p in (tmp_path / "masks").iterdir()) == ["f0", "f2", "f3", "f5", "f7"]
+    # All photos are on the contact sheet, those left out in a red frame.
+    sheet = read_rgb(tmp_path / "sheet.png")
+    frames = [tuple(sheet[-2, 240 * k + 120]) for k in range(PHOTOS)]
+    assert [k for k in range(PHOTOS) if frames[k] == (255, 0, 0)] == [1, 4, 6]
+
+
+def test_bad_supplied_masks_alone_are_an_error_in_one_sentence(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    supplied.mkdir()
+    for k in range(PHOTOS):
+        (supplied / f"f{k}.png").write_bytes(b"no picture")
+    with pytest.raises(
+        StageError, match="none of 8 masks in .* can be used; the supplied mask .*f0.png cannot be read"
+    ):
+        run_stage(capture, tmp_path / "x", method="supplied", prompts=None, supplied=supplied)
+    assert not (tmp_path / "x").exists()
+
+
 def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
     prompts = tmp_path / "prompts.tsv"
     prompts.write_text("point\tx\ty\tz\na\t0\t0\t20\nb\t1\t0\t20\nc\t0\t1\t21\n")
@@ -177,7 +215,7 @@ def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
     with pytest.raises(StageError, match="need a prompts file"):
         run_stage(capture, tmp_path / "x", prompts=None)
     with pytest.raises(StageError, match="9 needed"):
-        run_stage(capture, tmp_path / "x", settings=dataclasses.replace(SETTINGS, min_photos=9))
+        run_stage(capture, tmp_path / "x", min_photos=9)
     assert not (tmp_path / "x").exists()
 
 
@@ -185,11 +223,11 @@ class TrueNetwork:
     """Answers with the true mask and ever more beside it, the fifth photo at first with the ground."""
 
     def __init__(self, *_):
-        self.asked = []
+        self.segmented = []
 
     def encode(self, image):
         k = next(k for k in range(PHOTOS) if np.array_equal(image, self.images[k]))
-        self.asked.append(k)
+        self.segmented.append(k)
         return k
 
     def masks(self, k, size, points_px, box_px):
@@ -197,30 +235,37 @@ class TrueNetwork:
         assert size == ball.shape
         assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()
         assert (points_px > box_px[0]).all() and (points_px < box_px[1]).all()
-        if k == 5 and self.asked.count(5) == 1:
+        if k == 5 and self.segmented.count(5) == 1:
             return [~ball] * 3, np.ones(3)
         half = ball & (np.arange(size[1]) < points_px[:, 0].mean())
         return [half, ball, ball | np.roll(ball, 30, axis=1)], np.array([0.9, 0.8, 0.6])
 
 
-def test_a_photo_that_disagrees_is_asked_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
+def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
     network = TrueNetwork()
-    network.images = [cv2.imread(str(capture / "cameras" / "images" / f"f{k}.png")) for k in range(PHOTOS)]
-    monkeypatch.setattr(masks_module, "Sam2Onnx", lambda *_: network)
-    monkeypatch.setattr(masks_module, "check_weights", lambda path, *_: path)
+    network.images = [read_rgb(capture / "cameras" / "images" / f"f{k}.png") for k in range(PHOTOS)]
+    monkeypatch.setattr(masks_module, "load_network", lambda *_: (network, "own weights"))
     run_stage(capture, tmp_path, method="sam2")
-    assert network.asked == [*range(PHOTOS), 5]
+    assert network.segmented == [*range(PHOTOS), 5]
     assert min(iou_with_truth(capture, tmp_path)) > 0.95
+    assert value(read_json(tmp_path / "masks.json"), "weights") == "own weights"
 
 
 def test_wrong_or_missing_weights_are_named(tmp_path):
     weights = tmp_path / "encoder.ort"
     with pytest.raises(StageError, match="do not exist"):
-        check_weights(weights, "0" * 64, "encoder")
+        check_weights(weights, "0" * 64, shipped=True)
     weights.write_bytes(b"not a network")
     with pytest.raises(StageError, match="have SHA-256"):
-        check_weights(weights, "0" * 64, "encoder")
-    assert check_weights(weights, sha256(weights), "encoder") == weights
+        check_weights(weights, "0" * 64, shipped=True)
+    assert check_weights(weights, sha256(weights), shipped=True) == "encoder.ort as shipped"
+
+
+def test_weights_of_ones_own_are_not_held_against_the_shipped_ones_and_said_to_be_own(tmp_path):
+    weights = tmp_path / "mine.onnx"
+    weights.write_bytes(b"another network")
+    said = check_weights(weights, "0" * 64, shipped=False)
+    assert said.startswith("mine.onnx own weights, not checked") and sha256(weights)[:16] in said
 
 
 def test_masks_keep_what_the_expression_says(capture, tmp_path):
@@ -327,23 +372,18 @@ def test_a_checkpoint_is_run_by_transformers(tmp_path):
 
 
 def test_hull_of_true_masks_is_the_ball():
-    frames, masks = [], []
-    for k in range(PHOTOS):
-        intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-        blank = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-        frames.append(Frame(f"{k}", blank, intrinsics, camera_pose(k), np.empty((0, 2)), np.empty(0, np.int64)))
-        masks.append(look(camera_pose(k))[0])
+    views = [view(k, look(camera_pose(k))[0]) for k in range(PHOTOS)]
     box = upright_box(np.array([[-1, -1, 0], [1, 1, 2], [1, -1, 0], [-1, 1, 0]]), np.array([0, 0, 1.0]), 0.1)
-    hull = carve(box, lambda x: x[:, 2], frames, masks, 60, 0.0)
+    hull = carve(box, lambda x: x[:, 2], views, 60, 0.0)
     distance = np.linalg.norm(hull.shell - CENTRE, axis=1)
     # Eight silhouettes from one height leave edges and a cap, but nothing is inside the ball's skin.
     assert distance.min() > RADIUS - 1.5 * hull.voxel
     assert np.median(distance) < 1.15 * RADIUS
-    assert min(agreement(silhouette(hull, f), m) for f, m in zip(frames, masks)) > 0.9
+    assert min(mask_iou(silhouette(hull, v), v.pixels) for v in views) > 0.9
     # One photo that sees nothing empties a strict hull and leaves a tolerant one alone.
-    masks[0] = np.zeros_like(masks[0])
-    assert len(carve(box, lambda x: x[:, 2], frames, masks, 60, 0.0).shell) == 0
-    assert len(carve(box, lambda x: x[:, 2], frames, masks, 60, 0.2).shell) > 0.5 * len(hull.shell)
+    views[0] = view(0, np.zeros((HEIGHT, WIDTH), bool))
+    assert len(carve(box, lambda x: x[:, 2], views, 60, 0.0).shell) == 0
+    assert len(carve(box, lambda x: x[:, 2], views, 60, 0.2).shell) > 0.5 * len(hull.shell)
 
 
 def test_ground_of_a_tilted_bowl_is_measured_beside_the_object():
@@ -407,21 +447,16 @@ def test_strong_colours_overrule_hull_and_mask():
     assert trimap[0, 30] == cv2.GC_BGD
 
 
-def test_close_prompts_fill_their_part_and_points_of_two_photos_have_no_say():
+def test_close_prompts_fill_their_part_and_points_of_two_photos_count_for_nothing():
     cube = np.array([[x, y, z] for x in (-0.1, 0.1) for y in (-0.1, 0.1) for z in (0, 0.2)])
     prompts = np.concatenate([cube, [[1, 0, 2], [-1, 0, 2], [0, 1, 2], [0, -1, 2], [0, 0, 3.0]]])
     sparse = np.array([[0, 0, 2.0], [0, 0, 2.1], [0, 4, 1.0], [0, 4, 1.5]])
-    intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
-    blank = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    frames = []
-    for k in range(3):
-        rows = np.array([0, 2]) if k == 2 else np.arange(4)
-        frame = Frame(f"{k}", blank, intrinsics, camera_pose(k), np.empty((0, 2)), rows)
-        frames.append(dataclasses.replace(frame, observed=frame.project(sparse[rows])[0]))
-    target = target_from_points(prompts, frames, sparse, np.array([0, 0, 1.0]), 0.15, 0.02, 0)
+    views, seen = [view(k) for k in range(3)], [np.arange(4), np.arange(4), np.array([0, 2])]
+    seen_at = [one.project(sparse[rows])[0] for one, rows in zip(views, seen)]
+    target = target_from_points(prompts, Workspace(Path(), views, sparse, seen, seen_at), np.array([0, 0, 1.0]), 0)
     assert target.kind.tolist() == [1, 0, -1, 0]
     trimap = np.full((HEIGHT, WIDTH), cv2.GC_PR_BGD, np.uint8)
-    stamp(trimap, target, frames[0])
+    stamp(trimap, target, views[0], seen[0], seen_at[0])
     for point, label in (([0, 0, 0.1], cv2.GC_FGD), ([0.5, 0, 1.0], cv2.GC_PR_BGD), ([0, 0, 3.0], cv2.GC_FGD)):
-        x, y = frames[0].project(np.array([point]))[0][0].astype(int)
+        x, y = views[0].project(np.array([point]))[0][0].astype(int)
         assert trimap[y, x] == label

@@ -1,12 +1,15 @@
 """Metrics against hand-computed values."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.metrics.completion import local_density, surface_variation
+from scenefuse.metrics.completion import completion_metrics, local_density, surface_variation
+from scenefuse.metrics.compute_metrics import compute_metrics
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.metrics.registration import MetricSettings, compute_metrics, registration_metrics
+from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.stage import quantity, read_json, write_json
 from scenefuse.transforms import Sim3
 
@@ -118,10 +121,10 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
     compute_metrics(
         object=tmp_path / "object.ply",
         crop=tmp_path / "crop.ply",
-        reference=tmp_path / "crop.json",
-        fine=tmp_path / "fine.json",
+        crop_json=tmp_path / "crop.json",
+        fine_json=tmp_path / "fine.json",
         fused=tmp_path / "fused.ply",
-        metrics=tmp_path / "metrics.json",
+        report=tmp_path / "metrics.json",
         seed=0,
         settings=SETTINGS,
     )
@@ -137,12 +140,10 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
 
 
 def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_form(tmp_path):
-    from scenefuse.metrics.completion import CompletionSettings, completion_metrics
-
     rng = np.random.default_rng(0)
     scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
     dense = rng.uniform(0, 4, (10000, 3)) * [1, 1, 0] + [4.2, 0, 0]
-    settings = CompletionSettings(8.0, 16, 0.005, 0.01, 2, 25.0, 16, 2000)
+    settings = replace(SETTINGS, primitive_most=2)
     found = completion_metrics(Cloud(scene), Cloud(scene), Cloud(dense), 6.0, "m", settings, 0)
     assert found["nue"]["value"] == pytest.approx(5, rel=0.25)
     assert found["nue_density_invariant"]["value"] == pytest.approx(1, rel=0.2)
@@ -150,13 +151,11 @@ def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_fo
 
 def test_every_part_of_what_was_added_counts_in_the_variation_over_wide_radii():
     """A smooth part that comes first in the file does not hide a rough part behind it."""
-    from scenefuse.metrics.completion import CompletionSettings, completion_metrics
-
     rng = np.random.default_rng(0)
     scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
     smooth = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0] + [4.2, 0, 0]
     rough = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0.1] + [8.4, 0, 0]
-    settings = CompletionSettings(8.0, 16, 0.005, 0.01, 2, 25.0, 16, 4000)
+    settings = replace(SETTINGS, primitive_most=2, sample=4000)
     found = [
         completion_metrics(Cloud(scene), Cloud(scene), Cloud(np.concatenate(parts)), 10.0, "m", settings, 0)
         for parts in ([smooth, rough], [rough, smooth])

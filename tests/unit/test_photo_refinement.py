@@ -33,43 +33,43 @@ def test_wrong_depths_of_a_textured_plane_come_back():
     views, truth = plane_views(count=8, width=160, height=120)
     views = _speckled(views, truth)
     wrong = _wrong(truth)
-    asked = refine_by_photos(views, views.object_from_cam, wrong, RefinementSettings(8.0, 5, 0.6))
+    refined = refine_by_photos(views, views.object_from_cam, wrong, RefinementSettings(match_reach_px=8))
     known = truth > 0
-    error = [np.median(np.abs(d - truth)[known] / truth[known]) for d in (wrong, asked.depths)]
+    error = [np.median(np.abs(d - truth)[known] / truth[known]) for d in (wrong, refined.depths)]
     assert error[1] < 0.2 * error[0]
-    assert asked.moved[known].mean() > 0.5 and not asked.depths[~known].any()
-    assert asked.denied[known].mean() < 0.05
+    assert refined.moved[known].mean() > 0.5 and not refined.depths[~known].any()
+    assert refined.inconsistent[known].mean() < 0.05
 
 
 def test_smooth_surfaces_are_left_alone():
     views, truth = plane_views(count=8, width=160, height=120)
     depths = truth.astype(np.float32)
-    asked = refine_by_photos(views, views.object_from_cam, depths, RefinementSettings(8.0, 5, 0.6))
-    assert asked.moved[truth > 0].mean() < 0.05 and asked.denied[truth > 0].mean() < 1e-3
-    assert np.quantile(np.abs(asked.depths - depths)[truth > 0] / truth[truth > 0], 0.9) < 1e-6
+    refined = refine_by_photos(views, views.object_from_cam, depths, RefinementSettings(match_reach_px=8))
+    assert refined.moved[truth > 0].mean() < 0.05 and refined.inconsistent[truth > 0].mean() < 1e-3
+    assert np.quantile(np.abs(refined.depths - depths)[truth > 0] / truth[truth > 0], 0.9) < 1e-6
 
 
 def test_depths_stay_where_nothing_can_be_matched():
     views, truth = plane_views(count=8, width=96, height=72)
     plain = replace(views, images=np.full_like(views.images, 120))
     wrong = _wrong(truth)
-    asked = refine_by_photos(plain, plain.object_from_cam, wrong, RefinementSettings(8.0, 5, 0.6))
-    assert not (asked.moved | asked.denied).any() and np.array_equal(asked.depths, wrong)
+    refined = refine_by_photos(plain, plain.object_from_cam, wrong, RefinementSettings(match_reach_px=8))
+    assert not (refined.moved | refined.inconsistent).any() and np.array_equal(refined.depths, wrong)
 
 
 def test_no_depth_moves_farther_than_its_reach():
     views, truth = plane_views(count=8, width=160, height=120)
     views = _speckled(views, truth)
     far_off = np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
-    asked = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(1.0, 5, 0.6))
-    moved = np.abs(1 / asked.depths[truth > 0] - 1 / far_off[truth > 0])
+    refined = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(match_reach_px=1))
+    moved = np.abs(1 / refined.depths[truth > 0] - 1 / far_off[truth > 0])
     baseline = np.linalg.norm(np.diff(views.object_from_cam[:, :3, 3], axis=0), axis=1).min()
     assert moved.max() < 4.0 / (views.intrinsics[0, 0, 0] * baseline)
 
 
-def test_photos_deny_a_textured_surface_far_from_where_it_is():
+def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent():
     views, truth = plane_views(count=8, width=160, height=120)
     views = _speckled(views, truth)
     far_off = np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
-    asked = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(1.0, 5, 0.6))
-    assert asked.denied[truth > 0].mean() > 0.9
+    refined = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(match_reach_px=1))
+    assert refined.inconsistent[truth > 0].mean() > 0.9

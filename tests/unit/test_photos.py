@@ -1,10 +1,12 @@
 import hashlib
+import os
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.sfm.photos import gps_positions, list_photos, read_photos
+from scenefuse.sfm.photo_files import photo_files
+from scenefuse.sfm.photos import check_unchanged, gps_positions, list_photos, read_photos
 from scenefuse.stage import StageError, read_json, value
 
 
@@ -20,13 +22,18 @@ def save(path, size=(40, 30), gps=None, shade=100, focal_35mm=None, orientation=
     Image.new("RGB", size, (shade, shade, shade)).save(path, exif=exif)
 
 
+def listed(tmp_path, folder):
+    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    return read_photos(tmp_path / "photos.json")
+
+
 def test_sizes_hashes_positions_and_subfolders(tmp_path):
     folder = tmp_path / "photos"
     south_west = {1: "S", 2: (33.0, 30.0, 36.0), 3: "W", 4: (70.0, 15.0, 0.0), 5: b"\x00", 6: 520.25}
     save(folder / "a.jpg", gps=south_west, focal_35mm=18)
     save(folder / "sub" / "b.png", size=(20, 50), shade=7)
     (folder / "notes.txt").write_text("no photo")
-    list_photos(folder=folder, photos=tmp_path / "photos.json")
+    listed(tmp_path, folder)
     first, second = read_photos(tmp_path / "photos.json")
     assert (first.name, first.width, first.height) == ("a.jpg", 40, 30)
     assert first.sha256 == hashlib.sha256((folder / "a.jpg").read_bytes()).hexdigest()
@@ -47,7 +54,7 @@ def test_sizes_hashes_positions_and_subfolders(tmp_path):
 )
 def test_a_useless_position_is_no_position(tmp_path, gps):
     save(tmp_path / "p" / "a.jpg", gps=gps)
-    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    listed(tmp_path, tmp_path / "p")
     assert not read_photos(tmp_path / "photos.json")[0].has_gps
 
 
@@ -55,20 +62,54 @@ def test_depth_below_sea_level_and_missing_altitude(tmp_path):
     north_east = {1: "N", 2: (31.0, 0.0, 0.0), 3: "E", 4: (35.0, 0.0, 0.0)}
     save(tmp_path / "p" / "a.jpg", gps=north_east | {5: b"\x01", 6: 400.0}, shade=1)
     save(tmp_path / "p" / "b.jpg", gps=north_east, shade=2)
-    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    listed(tmp_path, tmp_path / "p")
     names, positions = gps_positions(read_photos(tmp_path / "photos.json"))
     assert names == ["a.jpg", "b.jpg"]
-    np.testing.assert_allclose(positions, [[31, 35, -400], [31, 35, -400]])
+    np.testing.assert_allclose(positions, [[31, 35, -400], [31, 35, np.nan]])
 
 
 def test_copies_and_rotations_are_noted(tmp_path):
     save(tmp_path / "p" / "a.jpg")
     save(tmp_path / "p" / "b.jpg")
     save(tmp_path / "p" / "c.jpg", orientation=6)
-    list_photos(folder=tmp_path / "p", photos=tmp_path / "photos.json")
+    listed(tmp_path, tmp_path / "p")
     notes = value(read_json(tmp_path / "photos.json"), "notes")
     assert notes[0] == "b.jpg is a copy of a.jpg"
-    assert "1 photos (c.jpg, ...) carry an EXIF rotation" in notes[1]
+    assert "1 photos (c.jpg, ...) carry an EXIF rotation; upright copies" in notes[-1]
+
+
+def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
+    folder, north_east = tmp_path / "p", {1: "N", 2: (31.0, 0.0, 0.0), 3: "E", 4: (35.0, 0.0, 0.0), 5: b"\x00", 6: 77.0}
+    save(folder / "sub" / "a.jpg", gps=north_east)
+    exif = Image.Exif()
+    exif[0x0112], exif[0x010F], exif[0x8825], exif[0x8769] = 6, "Maker", north_east, {0xA405: 18}
+    picture = Image.new("RGB", (64, 32), (0, 0, 0))
+    picture.paste((250, 0, 0), (0, 0, 16, 16))  # top left as stored, top right as seen
+    picture.save(folder / "sub" / "b.jpg", exif=exif, quality=95)
+    level, turned = listed(tmp_path, folder)
+    assert (tmp_path / "upright/sub/a.jpg").is_symlink() and level.name == "sub/a.jpg"
+    assert (tmp_path / "upright/sub/a.jpg").read_bytes() == (folder / "sub/a.jpg").read_bytes()
+    assert (turned.width, turned.height, turned.orientation, turned.camera) == (32, 64, 1, "Maker")
+    assert turned.has_gps and turned.altitude_m == 77.0 and turned.focal_px == pytest.approx(32.0)
+    with Image.open(tmp_path / "upright/sub/b.jpg") as seen:
+        assert seen.getpixel((24, 8))[0] > 200 and seen.getpixel((8, 8))[0] < 50
+    assert value(read_json(tmp_path / "photos.json"), "turned") == ["sub/b.jpg"]
+
+
+def test_a_photo_that_was_replaced_or_removed_since_it_was_listed_is_named(tmp_path):
+    folder = tmp_path / "p"
+    for index in range(3):
+        save(folder / f"{index}.png", shade=index)
+    photos = listed(tmp_path, folder)
+    check_unchanged(tmp_path / "upright", photos)
+    before = (folder / "1.png").stat()
+    save(folder / "1.png", shade=200)
+    os.utime(folder / "1.png", (before.st_atime, before.st_mtime - 1000))
+    with pytest.raises(StageError, match=r"1\.png is not the photo that was listed any more"):
+        check_unchanged(tmp_path / "upright", photos)
+    (folder / "2.png").unlink()
+    with pytest.raises(StageError, match=r"1 photos are missing .*2\.png"):
+        check_unchanged(tmp_path / "upright", photos)
 
 
 @pytest.mark.parametrize("content", [b"", b"not a photo", None])
@@ -79,14 +120,41 @@ def test_an_unreadable_photo_is_named_and_nothing_is_written(tmp_path, content):
     whole = (folder / "bad.jpg").read_bytes()
     (folder / "bad.jpg").write_bytes(whole[: len(whole) // 2] if content is None else content)
     with pytest.raises(StageError, match=r"bad\.jpg cannot be decoded .* remove it"):
-        list_photos(folder=folder, photos=tmp_path / "photos.json")
+        listed(tmp_path, folder)
     assert not (tmp_path / "photos.json").exists()
 
 
 def test_missing_and_empty_folders(tmp_path):
     with pytest.raises(StageError, match="nowhere does not exist"):
-        list_photos(folder=tmp_path / "nowhere", photos=tmp_path / "photos.json")
+        listed(tmp_path, tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
     (tmp_path / "empty" / "readme.txt").write_text("x")
     with pytest.raises(StageError, match=r"holds no photos.*1 other files"):
-        list_photos(folder=tmp_path / "empty", photos=tmp_path / "photos.json")
+        listed(tmp_path, tmp_path / "empty")
+
+
+def test_only_what_is_a_photo_is_listed(tmp_path):
+    folder = tmp_path / "p"
+    save(folder / "b.JPG")
+    save(folder / "sub" / "a.tif")
+    save(folder / ".trash" / "old.jpg")
+    for name in (".DS_Store", "Thumbs.db", "._b.JPG", "b.xmp", "b.DNG", "notes.txt"):
+        (folder / name).write_bytes(b"x")
+    assert photo_files(folder) == [folder / "b.JPG", folder / "sub" / "a.tif"]
+
+
+def test_photos_in_symlinked_folders_are_found_once(tmp_path):
+    save(tmp_path / "disk" / "card" / "a.jpg")
+    (tmp_path / "p").mkdir()
+    (tmp_path / "p" / "flight").symlink_to(tmp_path / "disk" / "card")
+    (tmp_path / "disk" / "card" / "back").symlink_to(tmp_path / "p")
+    assert photo_files(tmp_path / "p") == [tmp_path / "p" / "flight" / "a.jpg"]
+
+
+@pytest.mark.parametrize("name", ["IMG_1.HEIC", "DJI_0001.DNG", "sub/shot.NEF"])
+def test_photos_that_cannot_be_read_are_named(tmp_path, name):
+    save(tmp_path / "p" / "a.jpg")
+    save(tmp_path / "p" / "sub" / "b.jpg")
+    (tmp_path / "p" / name).write_bytes(b"x")
+    with pytest.raises(StageError, match=f"{name} cannot be read.*convert to JPEG"):
+        photo_files(tmp_path / "p")

@@ -29,6 +29,12 @@ def test_conda_files_pin_the_versions_of_the_default_environment():
         assert set(packages) <= pins, path.name
 
 
+def test_there_are_at_most_ninety_settings():
+    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    counted = [name for name, _ in leaves(schema) if name.split(".")[0] not in ("demo", "evaluation")]
+    assert len(counted) <= 90, len(counted)
+
+
 def test_every_setting_is_described():
     schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
     assert [name for name, part in leaves(schema) if not part.get("description")] == []
@@ -59,6 +65,28 @@ def test_a_script_is_the_command_line_of_the_function_of_its_name(script):
 
 
 def test_rules_and_scripts_share_their_names():
-    rules = "".join(path.read_text() for path in (ROOT / "workflow/rules").glob("*.smk"))
+    rules = "".join(path.read_text() for path in (ROOT / "workflow").rglob("*.smk"))
     used = set(re.findall(r"script\([\"'](\S+?)[\"']\)", rules))
     assert used == {str(p.relative_to(ROOT / "scripts")) for p in SCRIPTS if p.parent.name != "scripts"}
+
+
+def test_reading_the_rules_imports_nothing_heavy():
+    # Every job on a cluster reads them again. Snakemake itself imports NumPy and pandas.
+    rules = [*(ROOT / "workflow").rglob("*.smk"), ROOT / "Snakefile"]
+    lines = [line for path in rules for line in path.read_text().splitlines() if re.match(r"(from|import) ", line)]
+    heavy = "{'torch', 'open3d', 'pycolmap', 'cv2', 'numba', 'scipy', 'PIL', 'matplotlib'}"
+    source = "\n".join([*lines, "import sys", f"print(sorted({heavy} & set(sys.modules)))"])
+    done = subprocess.run(
+        [sys.executable, "-c", source], env=os.environ | {"PYTHONPATH": str(ROOT)}, capture_output=True
+    )
+    assert done.stdout.decode().strip() == "[]", done.stderr.decode()
+
+
+def test_default_profile_holds_nothing_of_a_machine_and_shows_no_commands():
+    profile = yaml.safe_load((ROOT / "profiles/default/config.yaml").read_text())
+    assert not {"cores", "jobs", "executor", "resources", "default-resources"} & set(profile)
+    assert not profile.get("printshellcmds")
+
+
+def test_no_job_asks_a_cluster_for_more_cores_than_its_smallest_node_may_have():
+    assert yaml.safe_load((ROOT / "profiles/slurm/config.yaml").read_text())["max-threads"] <= 2

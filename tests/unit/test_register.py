@@ -6,41 +6,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
-from planted import errors, plant
+from support.planted import errors, plant
 from test_formats import UTM, write_e57
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
-from scenefuse.io.settings import read_settings
-from scenefuse.registration.register import register, register_clouds
+from scenefuse.registration.coarse import CoarseSettings
+from scenefuse.registration.register import Known, RegistrationSettings, register, register_clouds
+from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
 
 ROOT = Path(__file__).resolve().parents[2]
-# Less work than shipped: fewer samples and steps.
-QUICK = {
-    "coarse": {
-        "voxel_fractions": [0.04],
-        "ransac_samples": 30000,
-        "feature_scale_steps": 3,
-        "candidates": 16,
-        "keep": 5,
-    }
-    | {"scale_steps": 9, "yaw_steps": 24, "sweep_voxel_fraction": 0.045},
-    "fine": {"fine_voxel_fraction": 0.012, "turn_steps": 18},
-}
+# Less work than shipped, where only the course of the computation matters.
+LITTLE = RegistrationSettings(
+    coarse=CoarseSettings(ransac_samples=5000, feature_scale_steps=1, scale_steps=9, candidates=4, keep=2),
+    fine=FineSettings(voxel_fraction=0.012, turn_steps=4),
+)
 
 
 @pytest.fixture(scope="module")
 def house():
     return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
-
-
-@pytest.fixture
-def quick(tmp_path):
-    (tmp_path / "quick.yaml").write_text(yaml.safe_dump({"registration": QUICK}))
-    return tmp_path / "quick.yaml"
 
 
 def in_files(content, trial, shift):
@@ -50,14 +37,14 @@ def in_files(content, trial, shift):
     return errors(found, truth, trial.object.points.mean(0), trial.diagonal)
 
 
-def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, house, quick, capsys):
+def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, house, capsys):
     middle = house.object.points.mean(0)
     still = np.array([1.0, 0, 0, 0])
     write_e57(tmp_path / "house.e57", [(house.object.points - middle, house.object.colors, still, middle)])
     write_laz(tmp_path / "scene.laz", house.scene, UTM, "EPSG:32632")
     out = tmp_path / "out"
     files = {"object": tmp_path / "house.e57", "scene": tmp_path / "scene.laz"}
-    assert register(**files, out=out, format="laz", config=quick) == 0
+    assert register(**files, out=out, format="laz") == 0
     content = read_json(out / "transform.json")
     scale, angle, shift = in_files(content, house, UTM)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
@@ -72,16 +59,18 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     assert len(printed) == 5 and printed[0].startswith("registered: ") and "whole scene" in printed[2]
 
 
-def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
+def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
     trial = plant("house", 5, noise=0.005, object_points=6000, density_ratio=1.0)
     write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
     rows = np.hstack([trial.object.points, trial.object.colors])
     np.savetxt(tmp_path / "house.xyz", rows, header="X Y Z R G B", comments="//", fmt=["%.9g"] * 3 + ["%d"] * 3)
     np.savetxt(tmp_path / "marks.txt", trial.fiducials + UTM, fmt="%.4f")
     out, true = tmp_path / "out", trial.scene_from_object.scale
-    files = {"object": tmp_path / "house.xyz", "scene": tmp_path / "scene.ply", "fiducials": tmp_path / "marks.txt"}
-    ups = {"up_object": tuple(trial.up_in_object), "up_scene": (0.0, 0.0, 1.0)}
-    assert register(**files, **ups, out=out, scale=true, config=quick) == 0
+    files = {"object": tmp_path / "house.xyz", "scene": tmp_path / "scene.ply"}
+    known = Known(
+        up_object=tuple(trial.up_in_object), up_scene=(0.0, 0.0, 1.0), scale=true, fiducials=tmp_path / "marks.txt"
+    )
+    assert register(**files, known=known, out=out) == 0
     content = read_json(out / "transform.json")
     scale, angle, shift = in_files(content, trial, UTM)
     assert abs(scale) < 1e-6 and angle < 2 and shift < 0.01
@@ -92,7 +81,7 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path, quick):
     assert np.abs(placed - pose.apply(read_cloud(tmp_path / "house.xyz").points)).max() < 1e-8
 
 
-def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_path, house, quick):
+def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_path, house):
     write_cloud(tmp_path / "house.ply", house.object)
     other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene
     write_cloud(tmp_path / "scene.ply", other)
@@ -100,7 +89,7 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     out.mkdir()
     (out / "object_in_scene.laz").write_text("of an earlier run")
     command = [sys.executable, ROOT / "scripts/register.py", "--object", "house.ply", "--scene", "scene.ply"]
-    command += ["--out", "out", "--config", quick, "--seed", "1"]
+    command += ["--out", "out", "--seed", "1"]
     done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("unregistered: ")
@@ -110,17 +99,38 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
 
 
 def test_origins_far_away_change_nothing(house):
-    settings = read_settings(None)
-    little = {"ransac_samples": 5000, "feature_scale_steps": 1, "candidates": 4, "keep": 2}
-    settings["registration"]["coarse"] |= QUICK["coarse"] | little
-    settings["registration"]["fine"] |= QUICK["fine"] | {"turn_steps": 4}
     # Coordinates of few binary digits, so that moving them rounds nothing.
     near = Cloud(np.round(house.scene.points * 2**16) / 2**16, house.scene.normals, house.scene.colors)
     far = Cloud(near.points + UTM, near.normals, near.colors)
-    here, there = (register_clouds(house.object, scene, settings, 0) for scene in (near, far))
+    here, there = (register_clouds(house.object, scene, LITTLE, 0) for scene in (near, far))
     assert np.array_equal(here.outcome.ranked[0].pose.matrix, there.outcome.ranked[0].pose.matrix)
     shift = there.scene_from_object.translation - here.scene_from_object.translation
     assert np.abs(shift - UTM).max() < 1e-8
+
+
+def test_the_transform_is_kept_when_the_object_cannot_be_written(tmp_path, house, monkeypatch):
+    def full_disk(path, cloud):
+        raise StageError(f"{path} could not be written")
+
+    write_cloud(tmp_path / "scene.ply", house.scene)
+    write_cloud(tmp_path / "house.ply", house.object)
+    monkeypatch.setattr("scenefuse.registration.register.write_cloud", full_disk)
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    with pytest.raises(StageError, match="could not be written"):
+        register(object=tmp_path / "house.ply", scene=tmp_path / "scene.ply", out=tmp_path / "out")
+    assert value(read_json(tmp_path / "out/transform.json"), "status") == "registered"
+
+
+def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypatch):
+    write_cloud(tmp_path / "scene.ply", house.scene)
+    columns = np.column_stack([house.object.points, np.arange(len(house.object))])
+    header = "x,y,z,scan angle"
+    np.savetxt(tmp_path / "house.csv", columns, header=header, comments="", delimiter=",", fmt="%.9g")
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    files = {"object": tmp_path / "house.csv", "scene": tmp_path / "scene.ply"}
+    assert register(**files, out=tmp_path / "out") == 0
+    placed = read_cloud(tmp_path / "out/object_in_scene.ply")
+    assert np.array_equal(placed.fields["scan_angle"], np.arange(len(house.object)))
 
 
 @pytest.mark.parametrize(
@@ -136,7 +146,9 @@ def test_origins_far_away_change_nothing(house):
         ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
         ({"config": Path("typo.yaml")}, "registration.fine: unknown key 'min_fscore'; did you mean 'min_f_score'"),
         ({"config": Path("none.yaml")}, "cannot be read"),
-        ({"object": Path("few.ply")}, "the object has only 3"),
+        ({"object": Path("few.ply")}, "the object has only 3 different positions; 200 or more"),
+        ({"object": Path("repeated.ply")}, "the object has only 3 different positions among its 5000 points; 200"),
+        ({"object": Path("line.ply")}, "all 500 points of the object lie along one line"),
         ({"out": Path("three.txt")}, "is a file"),
     ],
 )
@@ -144,10 +156,15 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     monkeypatch.chdir(tmp_path)
     write_cloud(Path("scene.ply"), house.scene)
     write_cloud(Path("few.ply"), Cloud(np.eye(3)))
+    write_cloud(Path("repeated.ply"), Cloud(np.eye(3)[np.arange(5000) % 3]))
+    write_cloud(Path("line.ply"), Cloud(np.outer(np.arange(500.0), [1, 2, 3])))
     Path("three.txt").write_text("0 0 0\n1 0 0\n0 1 0\n")
     np.savetxt("far.txt", np.eye(4, 3) + 1000)
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
     Path("typo.yaml").write_text("registration: {fine: {min_fscore: 0.1}}")
+    files = {"object": Path("scene.ply"), "scene": Path("scene.ply")}
+    others = {name: option for name, option in options.items() if name in ("object", "config", "out")}
+    known = Known(**{name: option for name, option in options.items() if name not in others})
     with pytest.raises(StageError, match=words):
-        register(**({"object": Path("scene.ply"), "scene": Path("scene.ply")} | options))
+        register(**(files | others), known=known)
     assert not Path("registered").exists()

@@ -4,34 +4,34 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planted import errors, plant
 from scipy.spatial.transform import Rotation
+from support.planted import errors, plant
 
 from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.io.settings import build, read_settings
+from scenefuse.registration.candidates import match, ransac_similarities, upright_candidates
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
-from scenefuse.registration.evidence import Alignment, Evidence
-from scenefuse.registration.features import match, ransac_similarities
-from scenefuse.registration.fine import FineSettings, refine_hypotheses, register_finely, scale_ledger
+from scenefuse.registration.fine import register_finely, scale_ledger
 from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
-from scenefuse.registration.refine import ScaleRange, Uncertainty, refine_planes, refine_points, uncertainty
-from scenefuse.registration.scale import estimate_scale, estimates, prior_centre
+from scenefuse.registration.icp import ScaleRange, refine_planes, refine_points
+from scenefuse.registration.paper import register_as_paper
+from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem
+from scenefuse.registration.refinement import refine_hypotheses
+from scenefuse.registration.scale import ScaleSettings, estimate_scale, estimates, prior
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
-from scenefuse.registration.upright import upright_hypotheses
-from scenefuse.registration.verify import tilt_deg
+from scenefuse.registration.uncertainty import Uncertainty, half_sampling
+from scenefuse.registration.verify import FineSettings, tilt_deg
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
-SHIPPED = read_settings(None)["registration"]
-COARSE, FINE = build(CoarseSettings, SHIPPED["coarse"]), build(FineSettings, SHIPPED["fine"])
+COARSE, FINE = CoarseSettings(), FineSettings()
 
 
 # Little work, where only the course of the computation matters.
 LITTLE = (
     replace(COARSE, ransac_samples=5000, feature_scale_steps=1, scale_steps=3, yaw_steps=8, candidates=4, keep=2),
-    replace(FINE, turn_steps=6, fine_voxel_fraction=0.02),
+    replace(FINE, turn_steps=6, voxel_fraction=0.02),
 )
 
 
@@ -43,17 +43,16 @@ def house():
 def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
     scene = trial.scene if scene is None else scene
     ups = (trial.up_in_object, Z)
-    prior = ScaleRange(prior_centre(estimates(trial.object, scene, ups)), 0.5)
-    found = find_hypotheses(trial.object, scene, prior, ups, settings[0], seed)
-    return refine_hypotheses(
-        trial.object,
-        scene,
-        [(h.pose, h.source) for h in found],
-        prior,
-        Evidence(ups, trial.free_space),
-        settings[1],
-        seed,
-    )
+    scales = prior(estimates(trial.object, scene, ups), ScaleSettings())
+    problem = Problem(trial.object, scene, scales, Evidence(ups, trial.free_space), seed)
+    found = find_hypotheses(problem, settings[0])
+    return refine_hypotheses(problem, [(h.pose, h.source) for h in found], settings[1])
+
+
+def refined(trial, start, *, evidence=None, settings=LITTLE[1]):
+    """The outcome of the fine registration of a trial from one pose."""
+    problem = Problem(trial.object, trial.scene, ScaleRange(trial.scene_from_object.scale, 0.3), evidence or Evidence())
+    return refine_hypotheses(problem, [(start, "planted")], settings)
 
 
 @pytest.mark.parametrize("name", ["house", "balloon"])
@@ -103,7 +102,7 @@ def test_the_true_pose_scores_higher_than_a_turned_one(house):
     centre = truth.apply(house.object.points.mean(0))
     half_turn = np.diag([-1.0, -1.0, 1.0])
     turned = Sim3(1.0, half_turn, centre - half_turn @ centre) @ truth
-    right, wrong = (score(obj, scene, p, 0.3, 2.0, truth.scale) for p in (truth, turned))
+    right, wrong = (score(obj, scene, p, 0.3, truth.scale) for p in (truth, turned))
     assert right.f_score > wrong.f_score and right.total > wrong.total
     assert right.color > 0.9 > wrong.color
 
@@ -114,9 +113,9 @@ def test_refinement_recovers_a_disturbed_similarity(house):
     turn = Rotation.from_rotvec(np.radians([3, -2, 4])).as_matrix()
     middle = truth.apply(centre)
     start = Sim3(1.04, turn, middle - 1.04 * turn @ middle + 0.2) @ truth
-    prior = ScaleRange(truth.scale, 0.2)
-    pose = refine_points(obj, scene, start, prior, (0.7, 0.25), 25)
-    pose = refine_planes(obj, scene, pose, prior, 0.25, 10, 0.3)
+    scales = ScaleRange(truth.scale, 0.2)
+    pose = refine_points(obj, scene, start, scales, (0.7, 0.25), 25)
+    pose = refine_planes(obj, scene, pose, scales, 0.25, 10, 0.3)
     scale, angle, shift = errors(pose, truth, centre, house.diagonal)
     assert abs(scale) < 1 and angle < 1 and shift < 0.005
 
@@ -140,9 +139,8 @@ def test_a_prior_of_no_width_holds_the_scale(house):
 def test_upright_sweep_proposes_the_true_yaw_and_scale(house):
     obj, scene = surfaces(house, 0.35)
     truth = house.scene_from_object
-    proposed = upright_hypotheses(
-        obj, scene, house.up_in_object, ScaleRange(truth.scale * 1.1, 0.3), 11, 24, 0.6, 2.0, 8
-    )
+    scales = ScaleRange(truth.scale * 1.1, 0.3)
+    proposed = upright_candidates(obj, scene, house.up_in_object, scales, 11, 24, 0.6, 8)
     centre = house.object.points.mean(0)
     found = [errors(p, truth, centre, house.diagonal) for p in proposed]
     assert any(abs(scale) < 6 and angle < 12 and shift < 0.06 for scale, angle, shift in found)
@@ -179,35 +177,78 @@ def test_tilt_is_the_angle_between_the_ups():
     assert tilt_deg(Sim3(2.0, turn, np.zeros(3)), (Z, Z)) == pytest.approx(30)
 
 
-def test_stages_write_their_files_and_refuse_honestly(tmp_path, house):
-    write_cloud(tmp_path / "object.ply", house.object)
-    write_cloud(tmp_path / "crop.ply", house.scene)
-    write_json(tmp_path / "crop.json", {"up_in_scene": quantity(Z, ""), "diagonal": quantity(1.0, "m")})
-    write_json(tmp_path / "cameras.json", {"up_in_camera_frame": quantity(house.up_in_object, "")})
-    files = {"object": tmp_path / "object.ply", "crop": tmp_path / "crop.ply", "crop_report": tmp_path / "crop.json"}
-    scale, coarse, fine = (tmp_path / f"{n}.json" for n in ("scale", "coarse", "fine"))
-    estimate_scale(**files, cameras=tmp_path / "cameras.json", report=scale, method="rms", width_log=0.35)
-    assert value(read_json(scale), "width_log") == 0.0
-    paper = {"recipe": "paper", "seed": 0}
-    from dataclasses import replace
+def stage_inputs(folder, obj, scene, up_in_object=None):
+    """The files of two clouds as the stages read them; gravity is known when the object's up is given."""
+    write_cloud(folder / "object.ply", obj)
+    write_cloud(folder / "crop.ply", scene)
+    write_json(folder / "crop.json", {"up_in_scene": quantity(Z, ""), "diagonal": quantity(1.0, "m")})
+    write_json(folder / "cameras.json", {"up_in_camera_frame": quantity(up_in_object, "")})
+    return Inputs(folder / "object.ply", folder / "crop.ply", folder / "crop.json", folder / "cameras.json")
 
-    settings = replace(COARSE, ransac_samples=20000)
-    register_coarsely(**files, scale=scale, report=coarse, **paper, settings=settings)
-    register_finely(
-        **files,
-        scale=scale,
-        coarse=coarse,
-        fine=fine,
-        picture=tmp_path / "fine.png",
-        **paper,
-        voxel_fraction=0.04,
-        settings=FINE,
-    )
+
+def test_stages_hand_their_files_on_and_register(tmp_path, house):
+    inputs = stage_inputs(tmp_path, house.object, house.scene, house.up_in_object)
+    scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
+    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
+    assert value(read_json(scale), "width_log") == 0.5
+    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=COARSE)
+    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
     content = read_json(fine)
-    assert value(content, "status") == "registered" and value(content, "tilt_deg") is None
+    assert value(content, "status") == "registered" and value(content, "tilt_deg") < 5
+    assert content["translation_sd"]["unit"] == "m" and value(content, "free_space_violation") is None
+
+
+def test_the_papers_recipe_writes_the_same_files_and_is_called_ungated(tmp_path, house):
+    inputs = stage_inputs(tmp_path, house.object, house.scene)
+    scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
+    register_as_paper(
+        inputs=inputs, scale_report=scale, coarse_report=coarse, report=fine, picture=tmp_path / "fine.png", seed=0
+    )
+    assert value(read_json(scale), "width_log") == 0.0 and value(read_json(scale), "method") == "rms"
+    assert len(value(read_json(coarse), "hypotheses")) == 1
+    content = read_json(fine)
+    assert value(content, "status") == "ungated" and value(content, "reason") == "the paper's recipe has no gate"
+    assert value(content, "tilt_deg") is None and value(content, "margin") is None
     matrix = np.array(value(content, "scene_from_object"))
     assert Sim3.from_matrix(matrix).scale == pytest.approx(value(content, "scale"))
+    assert value(content, "scale") == pytest.approx(value(read_json(scale), "scale"))
     assert (tmp_path / "fine.png").stat().st_size > 1000
+
+
+def plate(size, seed=0):
+    """Points on a horizontal rectangle, without any thickness."""
+    return Cloud(np.random.default_rng(seed).uniform(-0.5, 0.5, (3000, 3)) * [*size, 0.0])
+
+
+@pytest.mark.parametrize("scene_thickness", [0.0, 1e-9, 0.3])
+def test_a_flat_object_keeps_a_sane_scale_prior(scene_thickness):
+    flat, rough = plate((4, 3)), np.random.default_rng(1).uniform(-1, 1, 3000) * scene_thickness
+    scene = plate((8, 6), 1).points
+    scene[:, 2] += rough
+    for ups in (None, (Z, Z)):
+        found = estimates(flat, Cloud(scene), ups)
+        assert all(0.5 < e.scale < 8 for e in found)
+        assert prior(found, ScaleSettings()).centre == pytest.approx(2.0, rel=0.1)
+
+
+def test_a_flat_object_ends_in_a_decision(tmp_path):
+    inputs = stage_inputs(tmp_path, plate((4, 3)), plate((8, 6), 1), Z)
+    scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
+    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
+    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=LITTLE[0])
+    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
+    assert value(read_json(fine), "status") in ("registered", "unregistered")
+
+
+@pytest.mark.parametrize("size, where", [((4, 0), "along one line"), ((0, 0), "in one place")])
+def test_a_line_and_a_point_are_one_sentence(tmp_path, house, size, where):
+    for inputs in (
+        stage_inputs(tmp_path, plate(size), house.scene),
+        stage_inputs(tmp_path, house.object, plate(size)),
+    ):
+        with pytest.raises(StageError, match=f"all 3000 points of .*ply lie {where}"):
+            estimate_scale(inputs=inputs, report=tmp_path / "scale.json", settings=ScaleSettings())
+    assert not (tmp_path / "scale.json").exists()
 
 
 def test_frame_ledger_inverts_every_transform(tmp_path):
@@ -216,29 +257,22 @@ def test_frame_ledger_inverts_every_transform(tmp_path):
     write_json(
         tmp_path / "f.json", {"scene_from_object": quantity(pose.matrix, ""), "status": quantity("registered", "")}
     )
-    write_frame_ledger(object_report=tmp_path / "o.json", fine=tmp_path / "f.json", frames=tmp_path / "frames.json")
+    write_frame_ledger(object_json=tmp_path / "o.json", fine_json=tmp_path / "f.json", report=tmp_path / "frames.json")
     ledger = read_json(tmp_path / "frames.json")
     assert np.allclose(value(ledger, "scene_from_nerf"), (pose @ Sim3(2.0, np.eye(3), np.zeros(3))).matrix)
     assert value(ledger, "world_from_scene") is None
     assert round_trip(pose) < 1e-8
     write_json(tmp_path / "f.json", {"scene_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
     with pytest.raises(StageError, match="not a similarity"):
-        write_frame_ledger(object_report=tmp_path / "o.json", fine=tmp_path / "f.json", frames=tmp_path / "x.json")
+        write_frame_ledger(object_json=tmp_path / "o.json", fine_json=tmp_path / "f.json", report=tmp_path / "x.json")
 
 
 def test_a_scale_at_the_edge_of_its_prior_is_refused(house):
     truth = house.scene_from_object
-    prior = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
-    outcome = refine_hypotheses(
-        house.object,
-        house.scene,
-        [(truth, "planted")],
-        prior,
-        Evidence(),
-        replace(FINE, turn_steps=2, min_f_score=0.0),
-        0,
-    )
-    assert not outcome.decision.registered
+    scales = ScaleRange(truth.scale * np.exp(-0.3), 0.1)
+    settings = replace(FINE, turn_steps=2, min_f_score=0.0)
+    problem = Problem(house.object, house.scene, scales)
+    assert not refine_hypotheses(problem, [(truth, "planted")], settings).decision.registered
 
 
 def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
@@ -248,8 +282,8 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
 
     turned = Sim3(1.0, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.zeros(3))
     poses = [(Sim3.identity(), "one"), (turned, "other")]
-    settings = replace(FINE, turn_steps=6, fine_voxel_fraction=0.02, score_fraction=0.04)
-    outcome = refine_hypotheses(egg(0), egg(1), poses, ScaleRange(1.0, 0.2), Evidence((Z, Z)), settings, 0)
+    settings = replace(FINE, turn_steps=6, voxel_fraction=0.02, score_fraction=0.04)
+    outcome = refine_hypotheses(Problem(egg(0), egg(1), ScaleRange(1.0, 0.2), Evidence((Z, Z))), poses, settings)
     assert outcome.decision.registered, outcome.decision.reason
     assert abs(outcome.decision.free_axis @ Z) > 0.99
 
@@ -260,37 +294,33 @@ def shared(pose: Sim3) -> Alignment:
 
 def test_photos_that_agree_settle_the_pose(house):
     truth = house.scene_from_object
-    prior = ScaleRange(truth.scale, 0.3)
     settings = replace(LITTLE[1], min_margin=1.0)
     alone, linked = (
-        refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, settings, 0).decision
-        for evidence in (Evidence(), Evidence(alignment=shared(truth)))
+        refined(house, truth, evidence=evidence, settings=settings).decision
+        for evidence in (None, Evidence(alignment=shared(truth)))
     )
     assert not alone.registered and "margin" in alone.reason
     assert linked.registered and linked.decided_by == "both"
 
 
-def test_the_surer_of_photos_and_clouds_has_the_last_word(house):
+def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house):
     truth = house.scene_from_object
-    prior = ScaleRange(truth.scale, 0.3)
     near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
-    for sd, won in ((1e-4, True), (0.02, False)):
+    for sd, by_photos in ((1e-4, True), (0.02, False)):
         alignment = Alignment(near, Uncertainty.even(sd, 100 * sd, 10 * sd), 40, None)
-        evidence = Evidence((house.up_in_object, Z), None, alignment)
-        outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
+        outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), None, alignment))
         assert outcome.decision.decided_by == "both"
-        assert (outcome.ranked[0].pose.scale == near.scale) == won
+        assert (outcome.ranked[0].pose.scale == near.scale) == by_photos
 
 
-def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_surer(house):
+def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncertain(house):
     truth = house.scene_from_object
     beside = Sim3(1.0, np.eye(3), np.array([0.03 * house.diagonal, 0, 0])) @ truth
-    prior, centre = ScaleRange(truth.scale, 0.3), house.object.points.mean(0)
-    alone = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, Evidence(), LITTLE[1], 0)
+    centre, alone = house.object.points.mean(0), refined(house, truth)
     for share, by_photos in ((0.9, False), (0.05, True)):
-        sd = share * alone.spread.size(house.scene.diagonal) * house.scene.diagonal
+        sd = share * alone.uncertainty.size(house.scene.diagonal) * house.scene.diagonal
         evidence = Evidence(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd), 40, None))
-        outcome = refine_hypotheses(house.object, house.scene, [(truth, "planted")], prior, evidence, LITTLE[1], 0)
+        outcome = refined(house, truth, evidence=evidence)
         assert outcome.decision.decided_by == "both"
         assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
 
@@ -299,25 +329,22 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     truth, centre = house.scene_from_object, house.object.points.mean(0)
     half_turn, middle = np.diag([-1.0, -1.0, 1.0]), truth.apply(centre)
     turned = Sim3(1.0, half_turn, middle - half_turn @ middle) @ truth
-    prior = ScaleRange(truth.scale, 0.3)
     evidence = Evidence((house.up_in_object, Z), None, shared(truth))
-    outcome = refine_hypotheses(
-        house.object, house.scene, [(turned, "planted")], prior, evidence, replace(LITTLE[1], turn_steps=1), 0
-    )
+    outcome = refined(house, turned, evidence=evidence, settings=replace(LITTLE[1], turn_steps=1))
     assert outcome.decision.registered and outcome.decision.decided_by == "photos"
     scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
 
 
-def test_an_object_where_the_cameras_saw_through_is_refused(house):
+def test_an_object_in_the_scenes_free_space_is_refused(house):
     truth = house.scene_from_object
-    assert house.free_space.blocked_share(truth.apply(house.object.points)) < 0.05
+    assert house.free_space.violation(truth.apply(house.object.points)) < 0.05
     lifted = Sim3(truth.scale, truth.rotation, truth.translation + [0, 0, 0.5 * house.diagonal])
-    assert house.free_space.blocked_share(lifted.apply(house.object.points)) > 0.5
-    evidence = Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
-    prior = ScaleRange(truth.scale, 0.3)
-    outcome = refine_hypotheses(house.object, house.scene, [(lifted, "planted")], prior, evidence, LITTLE[1], 0)
-    assert not outcome.decision.registered and "saw through" in outcome.decision.reason
+    assert house.free_space.violation(lifted.apply(house.object.points)) > 0.5
+    decision = refined(
+        house, lifted, evidence=Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
+    ).decision
+    assert not decision.registered and "free space" in decision.reason
 
 
 def test_spread_of_a_pose_grows_with_noise():
@@ -325,7 +352,8 @@ def test_spread_of_a_pose_grows_with_noise():
         trial = plant("urn", 3, ground=False, noise=noise, object_points=6000, density_ratio=1.0)
         obj, scene = surfaces(trial, 0.01 * trial.diagonal)
         truth = trial.scene_from_object
-        return uncertainty([(obj, scene)], truth, ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal, 0.0, 10, 0)
+        scales, tau = ScaleRange(truth.scale, 0.2), 0.02 * trial.diagonal
+        return half_sampling([(obj, scene)], truth, scales, tau, resamplings=10, seed=0, color_weight=0.0)
 
     fine, rough = spread(0.002), spread(0.01)
     assert fine.scale_sd_log < rough.scale_sd_log
@@ -334,8 +362,8 @@ def test_spread_of_a_pose_grows_with_noise():
 
 def test_scale_ledger_names_every_estimate_and_the_winner(house):
     outcome = register(house, settings=LITTLE)
-    prior = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
+    content = {"ledger": quantity([{"name": "rms", "scale": 1.0, "used": False}], "")}
     alignment = shared(house.scene_from_object)
-    rows = scale_ledger(prior, alignment, outcome.ranked[0], outcome.spread, outcome.decision)
+    rows = scale_ledger(content, alignment, outcome.ranked[0], outcome.uncertainty, outcome.decision.decided_by)
     assert [r["name"] for r in rows] == ["rms", "shared points", "clouds"]
-    assert rows[-1]["use"].startswith("won") and rows[-1]["scale"] == outcome.ranked[0].pose.scale
+    assert rows[-1]["use"].startswith("taken") and rows[-1]["scale"] == outcome.ranked[0].pose.scale

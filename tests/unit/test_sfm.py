@@ -1,25 +1,30 @@
+from dataclasses import replace
+
 import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from scenefuse.sfm.features import FeatureSettings, MatchSettings, camera_groups, extract_features, match_features
+from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MapSettings, map_photos
-from scenefuse.sfm.pairs import PairSettings, choose_pairs, sequential_pairs, spatial_pairs
+from scenefuse.sfm.matches import match_features
+from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
 from scenefuse.sfm.photos import Photo, list_photos, write_photos
-from scenefuse.sfm.undistort import UndistortSettings, undistort_photos
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import fit_sim3
+from scenefuse.workspace import View, write_model
 
-PAIRS = PairSettings("auto", 10, 20, 3, 2, 4, 2.0)
-FEATURES = FeatureSettings(1000, 800, 0, "SIMPLE_RADIAL", "auto")
-MATCHES = MatchSettings(0.7, 0.7, True, True, 15)
-MAPPING = MapSettings(50, 200, 0.0, 4.0, 50, 0.8)
+PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
+FEATURES = FeatureSettings(max_image_size_px=1000, max_features=800, first_octave=0, camera_mode="auto")
+MAPPING = MapSettings(min_registered_share=0.8)
 FRAME = LocalFrame(47.0, 8.0, 400.0)
+# COLMAP's lists separate by blanks and take # for a comment.
+NAMES = ["# 0.png", "1 {1}.png", "2 Süd.png", "3.png", "4.png", "5.png"]
 
 
 def photo(name, position=None, size=(640, 480), camera="", focal=None):
@@ -39,7 +44,7 @@ def test_pairs_are_chosen_by_what_is_known():
     assert choose_pairs(without[:20], False, PAIRS)[0] == "exhaustive"
     assert choose_pairs(without[:20], True, PAIRS)[0] == "sequential"
     assert choose_pairs(without, False, PAIRS)[0] == "sequential"
-    kind, reason, pairs = choose_pairs(without[:5], False, PairSettings("spatial", 10, 20, 3, 2, 4, 2.0))
+    kind, reason, pairs = choose_pairs(without[:5], False, replace(PAIRS, pairs="spatial"))
     assert (kind, len(pairs)) == ("exhaustive", 10) and "too few photos" in reason
 
 
@@ -106,9 +111,9 @@ def capture(tmp_path_factory):
             best = np.where(valid & (distance < best), distance, best)
         hit = centre + np.where(np.isfinite(best), best, 0)[..., None] * directions
         u, v = (hit[..., 0] * 75 + 256) % 512, (hit[..., 1] * 75 + 128) % 256
-        Image.fromarray(texture[v.astype(int), u.astype(int)]).save(folder / "photos" / f"{index}.png")
+        Image.fromarray(texture[v.astype(int), u.astype(int)]).save(folder / "photos" / NAMES[index])
         centres.append(centre)
-    list_photos(folder=folder / "photos", photos=folder / "photos.json")
+    list_photos(folder=folder / "photos", upright=folder / "upright", photos=folder / "photos.json")
     return folder, np.array(centres)
 
 
@@ -117,7 +122,7 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     monkeypatch.setenv("OMP_NUM_THREADS", "1")
     folder, truth = capture
     extract_features(
-        folder=folder / "photos",
+        folder=folder / "upright",
         photos=folder / "photos.json",
         features=tmp_path / "features.db",
         settings=FEATURES,
@@ -128,12 +133,11 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
             features=tmp_path / "features.db",
             database=tmp_path / f"{name}.db",
             matches=tmp_path / "matches.json",
-            pair_settings=PAIRS,
-            settings=MATCHES,
+            settings=PAIRS,
             seed=0,
         )
         map_photos(
-            folder=folder / "photos",
+            folder=folder / "upright",
             photos=folder / "photos.json",
             database=tmp_path / f"{name}.db",
             sparse=tmp_path / name,
@@ -148,31 +152,125 @@ def test_features_matches_and_mapping_recover_the_cameras(capture, tmp_path, mon
     assert value(report, "mean_reprojection_error_px") < 1.0
     model = pycolmap.Reconstruction(tmp_path / "first")
     names, _, centres = camera_poses(model)
-    assert names == [f"{i}.png" for i in range(6)]
+    assert names == NAMES
     assert np.linalg.norm(fit_sim3(centres, truth).apply(centres) - truth, axis=1).max() < 0.15
     again = camera_poses(pycolmap.Reconstruction(tmp_path / "second"))[2]
     np.testing.assert_array_equal(centres, again)
     assert sorted(p.name for p in tmp_path.iterdir() if p.name.startswith(".")) == []
 
     undistort_photos(
-        folder=folder / "photos",
+        folder=folder / "upright",
+        photos=folder / "photos.json",
         sparse=tmp_path / "first",
-        dense=tmp_path / "dense",
+        workspace=tmp_path / "dense",
         report=tmp_path / "dense.json",
-        settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+        settings=UndistortSettings(max_size_px=120),
     )
     dense = pycolmap.Reconstruction(tmp_path / "dense" / "sparse")
     assert {c.model_name for c in dense.cameras.values()} == {"PINHOLE"}
-    assert max(value(read_json(tmp_path / "dense.json"), "sizes_px")[0]) <= 120
-    with pytest.raises(StageError, match=r"6 photos of the model .* are missing"):
+    report = read_json(tmp_path / "dense.json")
+    assert max(value(report, "sizes_px")[0]) <= 120 and value(report, "photos") == 6
+    assert sorted(p.name for p in (tmp_path / "dense").iterdir()) == ["images", "sparse"]
+    # The arc is level: up is the direction orthogonal to the plane of the camera centres.
+    plane = np.linalg.svd(centres[::2] - centres[::2].mean(0))[2][2]
+    assert abs(plane @ value(report, "up_in_camera_frame")) > 0.99
+    with pytest.raises(StageError, match="6 photos are missing in"):
         undistort_photos(
             folder=tmp_path,
+            photos=folder / "photos.json",
             sparse=tmp_path / "first",
-            dense=tmp_path / "none",
+            workspace=tmp_path / "none",
             report=tmp_path / "none.json",
-            settings=UndistortSettings(max_size_px=120, jpeg_quality=95),
+            settings=UndistortSettings(max_size_px=120),
         )
     assert not (tmp_path / "none").exists()
+
+
+def test_a_model_that_is_upright_already_says_so_in_its_workspace(capture, tmp_path):
+    folder, _ = capture
+    views = [View(name, np.array([[200.0, 0, 120], [0, 200, 90], [0, 0, 1]]), np.eye(4), 240, 180) for name in NAMES]
+    (tmp_path / "sparse").mkdir()
+    write_model(tmp_path / "sparse", views)
+    write_json(tmp_path / "georeference.json", {"up_cue": quantity("GPS", "")})
+    undistort_photos(
+        folder=folder / "upright",
+        photos=folder / "photos.json",
+        sparse=tmp_path / "sparse",
+        georeference=tmp_path / "georeference.json",
+        workspace=tmp_path / "workspace",
+        report=tmp_path / "undistorted.json",
+        settings=UndistortSettings(max_size_px=240),
+    )
+    report = read_json(tmp_path / "undistorted.json")
+    assert value(report, "up_in_camera_frame") == [0, 0, 1] and value(report, "up_cue") == "GPS"
+
+
+def test_a_photo_that_was_replaced_is_named_by_those_who_read_it(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for index in range(3):
+        Image.new("RGB", (40, 30), (index, 0, 0)).save(tmp_path / "photos" / f"{index}.png")
+    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    Image.new("RGB", (40, 30), (200, 0, 0)).save(tmp_path / "photos" / "1.png")
+    reading = {"folder": tmp_path / "upright", "photos": tmp_path / "photos.json"}
+    with pytest.raises(StageError, match=r"1\.png is not the photo that was listed any more"):
+        extract_features(**reading, features=tmp_path / "features.db", settings=FEATURES)
+    with pytest.raises(StageError, match=r"1\.png is not the photo that was listed any more"):
+        undistort_photos(
+            **reading,
+            sparse=tmp_path / "sparse",
+            workspace=tmp_path / "workspace",
+            report=tmp_path / "undistorted.json",
+            settings=UndistortSettings(),
+        )
+
+
+def test_a_portrait_photo_of_a_scene_has_a_portrait_camera(tmp_path):
+    (tmp_path / "photos").mkdir()
+    noise = np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for index in range(3):
+        Image.fromarray(noise).save(tmp_path / "photos" / f"{index}.jpg", exif=exif)
+    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    extract_features(
+        folder=tmp_path / "upright",
+        photos=tmp_path / "photos.json",
+        features=tmp_path / "features.db",
+        settings=FEATURES,
+    )
+    with pycolmap.Database.open(tmp_path / "features.db") as database:
+        assert {(c.width, c.height) for c in database.read_all_cameras()} == {(120, 160)}
+
+
+LENSES = {
+    "OPENCV": [180.0, 182, 118, 92, -0.12, 0.02, 0.001, -0.001],
+    "SIMPLE_RADIAL": [190.0, 120, 90, 0.05],
+    "PINHOLE": [180.0, 182, 118, 92],
+}
+
+
+@pytest.mark.parametrize("shrink", [1.0, 0.4])
+@pytest.mark.parametrize("lens", LENSES)
+def test_a_picture_is_undistorted_as_colmap_does_it(lens, shrink):
+    camera = pycolmap.Camera(model=lens, width=240, height=180, params=LENSES[lens])
+    noise = gaussian_filter(np.random.default_rng(0).uniform(0, 255, (180, 240, 3)), (2, 2, 0))
+    picture = ((noise - noise.min()) / np.ptp(noise) * 255).astype(np.uint8)
+    options = pycolmap.UndistortCameraOptions(max_image_size=round(240 * shrink))
+    bitmap, target = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(picture), camera)
+    view = View("", target.calibration_matrix(), np.eye(4), target.width, target.height)
+    mine = undistort_picture(picture, camera, view)
+    inner = (slice(3, -3), slice(3, -3))
+    difference = np.abs(mine.astype(float) - bitmap.to_array())[inner]
+    assert mine.shape == bitmap.to_array().shape and difference.mean() < (1 if shrink == 1 else 3)
+    half = picture[::2, ::2, 0].astype(np.float32)
+    assert undistort_picture(half, camera, view).shape == mine.shape[:2]
+
+
+def test_a_fine_pattern_is_averaged_not_sampled_where_the_view_is_much_smaller():
+    camera = pycolmap.Camera(model="PINHOLE", width=400, height=400, params=[400, 400, 200, 200])
+    checks = (np.indices((400, 400)).sum(0) % 2 * 255).astype(np.uint8)
+    view = View("", np.array([[100.0, 0, 50], [0, 100, 50], [0, 0, 1]]), np.eye(4), 100, 100)
+    assert undistort_picture(checks, camera, view).std() < 2
 
 
 def test_photos_that_show_different_things(tmp_path):
@@ -182,9 +280,9 @@ def test_photos_that_show_different_things(tmp_path):
         noise = gaussian_filter(rng.uniform(0, 255, (120, 160)), 1.5)
         noise = (noise - noise.min()) / np.ptp(noise) * 255
         Image.fromarray(noise.astype(np.uint8)).save(tmp_path / "photos" / f"{index}.png")
-    list_photos(folder=tmp_path / "photos", photos=tmp_path / "photos.json")
+    list_photos(folder=tmp_path / "photos", upright=tmp_path / "upright", photos=tmp_path / "photos.json")
     extract_features(
-        folder=tmp_path / "photos",
+        folder=tmp_path / "upright",
         photos=tmp_path / "photos.json",
         features=tmp_path / "features.db",
         settings=FEATURES,
@@ -195,8 +293,7 @@ def test_photos_that_show_different_things(tmp_path):
             features=tmp_path / "features.db",
             database=tmp_path / "database.db",
             matches=tmp_path / "matches.json",
-            pair_settings=PAIRS,
-            settings=MATCHES,
+            settings=PAIRS,
             seed=0,
         )
     assert not (tmp_path / "database.db").exists() and not (tmp_path / "matches.json").exists()

@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -7,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from scenefuse.stage import StageError, atomic_directory, atomic_file, manifest, quantity, read_json, write_json
+from scenefuse.stage import StageError, atomic_directory, atomic_file, manifest, quantity, read_json, run, write_json
 
 SCRIPT = """
 import time
@@ -50,6 +52,39 @@ def test_atomic_directory_keeps_the_old_result_when_it_fails(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
 
 
+def test_what_a_killed_job_left_is_removed_by_the_next_run_and_a_living_one_keeps_its_own(tmp_path):
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    (tmp_path / f".model.tmp-{dead.pid}").mkdir()
+    (tmp_path / f".model.tmp-{dead.pid}" / "half").write_text("x")
+    for ending in (".db", ".db-wal", ".db-shm"):
+        (tmp_path / f".model.tmp-{dead.pid}{ending}").write_text("x")
+    kept = [f".model.tmp-{os.getppid()}.db", f".other.tmp-{dead.pid}.db", f".model.tmp-{dead.pid}.json"]
+    for name in kept:
+        (tmp_path / name).write_text("x")
+    with atomic_file(tmp_path / "model.db") as temporary:
+        temporary.write_text("new")
+        temporary.with_name(f"{temporary.name}-wal").write_text("journal")
+    with atomic_directory(tmp_path / "model"):
+        pass
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*kept, "model", "model.db"])
+
+
+def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch, capsys):
+    def stage() -> None:
+        """Write more than fits."""
+        with atomic_file(tmp_path / "a.txt") as temporary:
+            temporary.write_text("half")
+            raise OSError(errno.ENOSPC, "No space left on device", "a.txt")
+
+    monkeypatch.setattr(sys, "argv", ["stage"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit, match="1"):
+        run(stage)
+    assert capsys.readouterr().err == "error: the disk is full (a.txt); free some space and run this again\n"
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_json_holds_values_with_units_and_refuses_nan(tmp_path):
     write_json(tmp_path / "a.json", {"length": quantity(np.float64(1.5), "m"), "point": quantity(np.zeros(3), "m")})
     assert json.loads((tmp_path / "a.json").read_text())["length"] == {"value": 1.5, "unit": "m"}
@@ -73,7 +108,7 @@ def test_manifest_names_contents_and_ignores_snakemake(tmp_path):
     assert list(manifest(tmp_path)) == ["d/a"]
 
 
-def test_stage_error_is_one_sentence_and_a_signal_leaves_no_partial_output(tmp_path):
+def test_an_error_is_one_sentence_a_log_begins_with_the_command_and_a_signal_leaves_nothing(tmp_path):
     script = tmp_path / "stage.py"
     script.write_text(SCRIPT)
     out = tmp_path / "out"
@@ -81,8 +116,11 @@ def test_stage_error_is_one_sentence_and_a_signal_leaves_no_partial_output(tmp_p
     failed = subprocess.run([*command, "True"], capture_output=True, text=True)
     assert failed.returncode == 1
     assert failed.stderr == "error: the folder x is empty; give one with photos\n"
-    process = subprocess.Popen([*command, "False"], stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    workflow = os.environ | {"SCENEFUSE": str(tmp_path)}
+    process = subprocess.Popen([*command, "False"], stdout=subprocess.PIPE, text=True, env=workflow)
+    assert process.stdout is not None
+    assert process.stdout.readline() == f"python {script} --out {out} --fail False\n"
+    assert process.stdout.readline() == "ready\n"
     time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 128 + signal.SIGTERM

@@ -7,7 +7,8 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from scenefuse.report.tables import last_error, runtime_table
+from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, load, number
 from scenefuse.report.write_report import write_report
 from scenefuse.report.write_summary import write_summary
@@ -73,8 +74,7 @@ def summarise(results, names=("house", "balloon", "sculpture")):
         objects=[results / "objects" / name for name in names],
         scene_of=["demo"] * len(names),
         variants=["full", "paper"],
-        benchmarks=results / "benchmarks",
-        logs=results / "logs",
+        jobs=JobRecords(results / "logs", results / "benchmarks"),
         summary=results / "summary",
     )
     return results / "summary"
@@ -84,22 +84,22 @@ def read(summary, name, **options):
     return pd.read_csv(summary / f"{name}.tsv", sep="\t", na_values=["-"], **options)
 
 
-def test_registration_holds_every_object_and_arm(results):
+def test_registration_holds_every_object_and_variant(results):
     table = read(summarise(results), "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "registered"
     assert table.loc[("house", "paper"), "fitness_source"] == pytest.approx(0.6)
     assert table.loc[("house", "paper"), "scale_error_pct"] == 1.5
     assert table.loc[("balloon", "full"), "reason"] == "weak"
-    assert table.loc[("sculpture", "full"), "status"] == "missing"
+    assert table.loc[("sculpture", "full"), "status"] == "failed"
     assert "no <mask> matches a frame" in table.loc[("sculpture", "full"), "reason"]
     assert np.isnan(table.loc[("sculpture", "full"), "scale"])
 
 
-def test_ablation_sets_the_arms_side_by_side(results):
+def test_ablation_sets_the_variants_side_by_side(results):
     table = read(summarise(results), "ablation").set_index(["object", "measure"])
     assert table.loc[("house", "scale"), "unit"] == "m per object unit"
     assert [float(table.loc[("house", "scale"), variant]) for variant in ("full", "paper")] == [2.0, 3.0]
-    assert table.loc[("sculpture", "status"), "full"] == "missing"
+    assert table.loc[("sculpture", "status"), "full"] == "failed"
 
 
 def test_completion_sets_value_null_and_scene_side_by_side(results):
@@ -159,15 +159,15 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     assert "no dense cloud: only 3 photos [scene_sparse/demo.log]" in text and "5000" not in text
     assert "completed.ply" not in text
     table = read(summary, "registration").set_index(["object", "variant"])
-    assert table.loc[("house", "full"), "status"] == "missing" and np.isnan(table.loc[("house", "full"), "scale"])
+    assert table.loc[("house", "full"), "status"] == "failed" and np.isnan(table.loc[("house", "full"), "scale"])
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
 
 
-def test_the_text_says_what_the_photos_alone_say(results):
+def test_the_text_says_where_shared_features_put_the_object(results):
     said = {"found": quantity(True, ""), "reason": quantity("9 of 12 points agree", ""), "scale": quantity(2.5, "")}
     write_json(results / "objects/house/alignment.json", said | {"scale_sd_log": quantity(0.0123, "1")})
-    denied = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
-    write_json(results / "objects/balloon/alignment.json", denied)
+    not_found = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
+    write_json(results / "objects/balloon/alignment.json", not_found)
     text = (summarise(results) / "summary.txt").read_text()
     assert re.search(r"alignment +scale 2.5 \(standard deviation 1.23 %\), 9 of 12", text)
     assert re.search(r"alignment +not found: 3 of 12", text)
@@ -182,7 +182,7 @@ def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
     assert "F-score 0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
 
 
-def test_a_failed_variant_leaves_the_verdict_of_the_full_one(results):
+def test_a_failed_variant_leaves_the_decision_of_the_full_one(results):
     (results / "objects/house/registration/paper/coarse.json").unlink()
     table = read(summarise(results), "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "registered"
@@ -196,25 +196,72 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
         objects=[tmp_path / "objects/house"],
         scene_of=["demo"],
         variants=["full"],
-        benchmarks=tmp_path / "benchmarks",
-        logs=tmp_path / "logs",
+        jobs=JobRecords(tmp_path / "logs", tmp_path / "benchmarks"),
         summary=tmp_path / "summary",
     )
     text = (tmp_path / "summary/summary.txt").read_text()
     assert "it has not run yet" in text and "no benchmark files yet" in text
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
     with pytest.raises(StageError, match="no registration variant"):
-        nothing = {"benchmarks": tmp_path, "logs": tmp_path, "summary": tmp_path}
+        nothing = {"jobs": JobRecords(tmp_path, tmp_path), "summary": tmp_path}
         write_summary(scenes=[], chunks=1, objects=[], scene_of=[], variants=[], **nothing)
 
 
 def test_the_last_error_is_that_of_the_named_object(tmp_path):
+    jobs = JobRecords(tmp_path, tmp_path / "benchmarks")
     (tmp_path / "fine").mkdir()
     (tmp_path / "fine/house-full.log").write_text("error: one\nerror: two\ndone\n")
     (tmp_path / "fine/greenhouse-full.log").write_text("ValueError: other\n")
-    assert last_error(tmp_path, "house") == "two [fine/house-full.log]"
-    assert last_error(tmp_path, "greenhouse") == "ValueError: other [fine/greenhouse-full.log]"
-    assert last_error(tmp_path, "hous") == ""
+    assert why_unfinished(jobs, "house") == "two [fine/house-full.log]"
+    assert why_unfinished(jobs, "greenhouse") == "ValueError: other [fine/greenhouse-full.log]"
+    assert why_unfinished(jobs, "hous") == ""
+
+
+def test_a_killed_job_is_named_with_its_log(results):
+    """Its log ends without an error; the jobs before it have finished: their benchmarks are newer than their logs."""
+    for rule in ("make_masks", "train_depth"):
+        (results / f"logs/{rule}").mkdir()
+        (results / f"logs/{rule}/barn.log").write_text("epoch 3 of 20\n")
+    (results / "benchmarks/make_masks").mkdir()
+    (results / "benchmarks/make_masks/barn.tsv").write_text(f"{HEADER}1\t0:01:00\t1\t1\t1\t1\t0\t0\t99\t1\n")
+    summary = summarise(results, ["barn"])
+    text = " ".join((summary / "summary.txt").read_text().split())
+    assert "object barn: failed" in text and "it has not run yet" not in text
+    assert (
+        "its job ended without a message: perhaps killed (out of memory?); see the log [train_depth/barn.log]" in text
+    )
+    assert read(summary, "registration").set_index(["object", "variant"]).loc[("barn", "full"), "status"] == "failed"
+
+
+def test_a_pose_that_nothing_checked_is_shown_as_such(results):
+    fine = {"status": quantity("ungated", ""), "reason": quantity("", ""), "scale": quantity(3.0, "")}
+    for name, variant in (("house", "paper"), ("balloon", "full")):
+        write_json(results / f"objects/{name}/registration/{variant}/fine.json", fine)
+    summary = summarise(results, ["house", "balloon"])
+    text = (summary / "summary.txt").read_text()
+    assert re.search(r"paper +ungated", text) and "object balloon: ungated" in text
+    assert "1 of 2 objects registered and fused, 1 fused without a check of the pose" in text
+    table = read(summary, "registration").set_index(["object", "variant"])
+    assert table.loc[("house", "paper"), "status"] == table.loc[("balloon", "full"), "status"] == "ungated"
+
+
+def test_each_failed_variant_has_its_own_reason(results):
+    for variant in ("full", "paper"):
+        (results / f"objects/house/registration/{variant}/coarse.json").unlink()
+        (results / f"logs/{variant}").mkdir()
+        (results / f"logs/{variant}/house-{variant}.log").write_text(f"error: {variant} is wrong\n")
+    table = read(summarise(results), "registration").set_index(["object", "variant"])
+    for variant in ("full", "paper"):
+        assert table.loc[("house", variant), "status"] == "failed"
+        assert table.loc[("house", variant), "reason"].startswith(f"{variant} is wrong")
+
+
+def test_a_completed_scene_without_a_failed_object_is_shown_and_one_from_before_it_failed_is_not(results):
+    completed = {"points": quantity(5030, "points"), "added_points": quantity({"house": 30}, "points")}
+    write_json(results / "scenes/demo/completed.json", completed | {"failed": quantity({"sculpture": "no mask"}, "")})
+    text = " ".join((summarise(results) / "summary.txt").read_text().split())
+    assert "completed.ply, completed.laz, points 5030, house adds 30, without sculpture, which failed" in text
+    assert "completed.ply" not in (summarise(results, ["house"]) / "summary.txt").read_text()
 
 
 def test_values():
@@ -261,7 +308,7 @@ def test_the_page_is_offline_and_escapes_text(results):
     assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<h2")[0]
 
 
-def test_the_page_names_the_completed_scene_once_every_object_has_a_verdict(results):
+def test_the_page_names_the_completed_scene_once_every_object_has_a_decision(results):
     Image.fromarray(np.zeros((3, 4, 3), dtype=np.uint8)).save(results / "scenes/demo/scene.png")
     page = report(results, ["house", "balloon"])
     assert "completed.ply" in page and "registered objects in it (house), 5030 points" in page

@@ -1,6 +1,7 @@
 """Errors against truth: planted values come back."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -13,7 +14,8 @@ from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.metrics import truth as tr
-from scenefuse.metrics.evaluation import evaluate_object, evaluate_scene
+from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
+from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_between
 
@@ -95,8 +97,9 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     posed = tr.read_posed(root / "cameras/sparse", orbit)
     (root / "masks").mkdir()
     (root / "truth/thing/masks").mkdir()
-    for k, name in enumerate(posed.names):
-        depth, hit = tr.true_depth(caster, posed, k, TRUTH_FROM_OBJECT, (96, 72))
+    for view, _ in posed:
+        name = view.name
+        depth, hit = tr.true_depth(caster, view, TRUTH_FROM_OBJECT, (96, 72))
         mask = (hit == 0).astype(np.uint8) * 255
         cv2.imwrite(str(root / f"masks/{Path(name).stem}.png"), mask)
         cv2.imwrite(str(root / f"truth/thing/masks/{Path(name).stem}.png"), mask)
@@ -122,8 +125,9 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def scene_of(root: Path, out: Path) -> None:
     evaluate_scene(
-        model=root / "scene", georeference=root / "georeference.json", cloud=root / "before.ply",
-        truth=root / "truth/scene", evaluation=out, samples=20000, seed=0,
+        model=root / "scene", georeference_json=root / "georeference.json", cloud=root / "before.ply",
+        truth=root / "truth/scene", report=out, seed=0,
+        settings=SceneEvaluationSettings(samples=20000),
     )  # fmt: skip
 
 
@@ -139,13 +143,14 @@ def test_a_perfect_scene_has_no_errors(planted: Path, tmp_path: Path) -> None:
     assert np.allclose(value(result, "truth_from_scene"), TRUTH_FROM_SCENE.matrix, atol=1e-6)
 
 
-def test_georeferencing_is_judged_with_nothing_fitted(planted: Path, tmp_path: Path) -> None:
+def test_georeferencing_is_measured_with_nothing_fitted(planted: Path, tmp_path: Path) -> None:
     origin = {"origin_latitude_deg": 47.5, "origin_longitude_deg": 8.5, "origin_altitude_m": 428.0}
     write_json(tmp_path / "g.json", {k: quantity(v, "") for k, v in origin.items()})
     model_of(ring(7, 9.0, 9.0), Sim3.identity(), tmp_path / "model")
     evaluate_scene(
-        model=tmp_path / "model", georeference=tmp_path / "g.json", cloud=planted / "before.ply",
-        truth=planted / "truth/scene", evaluation=tmp_path / "s.json", samples=2000, seed=0,
+        model=tmp_path / "model", georeference_json=tmp_path / "g.json", cloud=planted / "before.ply",
+        truth=planted / "truth/scene", report=tmp_path / "s.json", seed=0,
+        settings=SceneEvaluationSettings(samples=2000),
     )  # fmt: skip
     assert value(read_json(tmp_path / "s.json"), "georeference_error_median") == pytest.approx(2.0, abs=1e-3)
 
@@ -153,13 +158,23 @@ def test_georeferencing_is_judged_with_nothing_fitted(planted: Path, tmp_path: P
 def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Path) -> None:
     scene_of(planted, tmp_path / "s.json")
     evaluate_object(
-        cameras=planted / "cameras", masks=planted / "masks", stages=[planted / "stage1", planted / "stage2"],
-        cloud=planted / "object.ply",
-        variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
-        alignment=planted / "no_scale/fine.json", before=planted / "before.ply", after=planted / "after.ply",
-        scene_evaluation=tmp_path / "s.json", truth_scene=planted / "truth/scene",
-        truth_object=planted / "truth/thing", evaluation=tmp_path / "o.json", max_photos=5, samples=20000, seed=0,
-    )  # fmt: skip
+        inputs=EvaluationInputs(
+            workspace=planted / "cameras",
+            masks=planted / "masks",
+            stages=[planted / "stage1", planted / "stage2"],
+            cloud=planted / "object.ply",
+            variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
+            alignment_json=planted / "no_scale/fine.json",
+            before=planted / "before.ply",
+            after=planted / "after.ply",
+            scene_json=tmp_path / "s.json",
+            truth_scene=planted / "truth/scene",
+            truth_object=planted / "truth/thing",
+        ),
+        report=tmp_path / "o.json",
+        seed=0,
+        settings=ObjectEvaluationSettings(samples=20000, max_photos=5),
+    )
     result = read_json(tmp_path / "o.json")
     assert value(result, "mask_iou_min") == 1.0
     assert value(result, "stage1_depth_error") < 1e-5
@@ -198,7 +213,10 @@ def test_one_lost_camera_does_not_spoil_the_fit(tmp_path: Path) -> None:
     cameras = ring(9, 5.0, 2.0)
     model_of(cameras, TRUTH_FROM_OBJECT.inverse(), tmp_path / "model")
     posed = tr.read_posed(tmp_path / "model", cameras)
-    posed.centres[4] += 3.0
+    lost, true = posed[4]
+    pose = lost.cam_from_world.copy()
+    pose[:3, 3] -= pose[:3, :3] @ np.full(3, 3.0)
+    posed[4] = replace(lost, cam_from_world=pose), true
     fit = tr.fit_cameras(posed, cameras)
     assert fit.truth_from_model.scale == pytest.approx(2.5, abs=1e-6)
     assert np.median(fit.position) < 1e-6 and fit.position.max() > 5.0
@@ -233,6 +251,7 @@ def test_bad_input_is_named(planted: Path, tmp_path: Path) -> None:
     with pytest.raises(StageError, match="is not a truth file"):
         scene_of_bad = tmp_path
         evaluate_scene(
-            model=planted / "scene", georeference=planted / "georeference.json", cloud=planted / "before.ply",
-            truth=scene_of_bad, evaluation=tmp_path / "s.json", samples=10, seed=0,
+            model=planted / "scene", georeference_json=planted / "georeference.json", cloud=planted / "before.ply",
+            truth=scene_of_bad, report=tmp_path / "s.json", seed=0,
+        settings=SceneEvaluationSettings(samples=10),
         )  # fmt: skip

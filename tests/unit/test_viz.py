@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.maps import write_depth
-from scenefuse.report.figures import draw_object, draw_scene
+from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
 from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
 from scenefuse.report.sheets import save_png
 from scenefuse.stage import StageError, quantity, write_json
@@ -129,7 +129,7 @@ def capture(tmp_path_factory):
     pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
     write_cloud(folder / "dense.ply", scene)
     write_cloud(folder / "fused_scene.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
-    write_cloud(folder / "crop.ply", half)
+    write_cloud(folder / "box/registration/full/crop.ply", half)
     write_cloud(folder / "object.ply", whole.transformed(pose.inverse()))
     write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], "")})
     write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
@@ -158,23 +158,20 @@ def capture(tmp_path_factory):
 
 def draw(capture, fine, figures):
     write_json(capture / "fine.json", fine)
-    draw_object(
+    inputs = FigureInputs(
         name="box",
         scene=capture / "dense.ply",
         fused_scene=capture / "fused_scene.ply",
-        crop=capture / "crop.ply",
-        crop_report=capture / "crop.json",
+        crop=capture / "box/registration/full/crop.ply",
+        crop_json=capture / "crop.json",
         object_cloud=capture / "object.ply",
-        fine=capture / "fine.json",
-        metrics=capture / "metrics.json",
-        cameras=capture / "cameras",
+        fine_json=capture / "fine.json",
+        metrics_json=capture / "metrics.json",
+        workspace=capture / "cameras",
         masks=capture / "masks",
-        stage1=capture / "stage1",
-        stage2=capture / "stage2",
-        stage3=capture / "stage3",
-        stage4=capture / "stage4",
-        figures=figures,
+        stages=[capture / f"stage{stage}" for stage in (1, 2, 3, 4)],
     )
+    draw_object(inputs=inputs, figures=figures)
 
 
 def test_figures_show_what_was_added(capture, tmp_path):
@@ -204,12 +201,13 @@ def test_an_object_far_from_the_scene_is_named(capture, tmp_path):
     assert not (tmp_path / "figures").exists()
 
 
-def test_scene_figure(capture, tmp_path):
+def test_scene_figure_with_a_failed_object(capture, tmp_path):
     figure = tmp_path / "scene.png"
-    arguments = {"name": "demo", "dense": capture / "dense.ply", "georeferenced": capture / "cameras/sparse"}
-    draw_scene(**arguments, crops=[capture / "crop.ply"], objects=["box"], figure=figure)
+    objects = [capture / "box", capture / "failed"]
+    files = {"dense": capture / "dense.ply", "georeferenced": capture / "cameras/sparse"}
+    draw_scene(name="demo", **files, objects=objects, failed=("failed",), figure=figure)
     picture = cv2.imread(str(figure)).astype(int)
     # Camera markers are red on a grey scene.
     assert ((picture[..., 2] > 180) & (picture[..., 1] < 70)).sum() > 50
-    with pytest.raises(StageError, match="1 crops but 2 object names"):
-        draw_scene(**arguments, crops=[capture / "crop.ply"], objects=["a", "b"], figure=figure)
+    with pytest.raises(StageError, match="failed/registration/full/crop.ply"):
+        draw_scene(name="demo", **files, objects=objects, figure=figure)

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from scenefuse.stage import StageError
-from scenefuse.workspace import View, read_workspace
+from scenefuse.workspace import View, read_workspace, write_model
 
 POINTS = np.array([[0.1, -0.2, 4.0], [0.4, 0.3, 5.0], [-0.5, 0.1, 6.0], [0.0, 0.0, -3.0], [9.0, 0.0, 4.0]])
 
@@ -101,3 +101,16 @@ def test_a_model_with_distortion_is_no_workspace(folder):
 def test_views_are_values():
     view = View("x", np.eye(3), np.eye(4), 4, 3)
     assert replace(view, name="y").name == "y" and view.pixels is None
+
+
+def test_a_written_model_is_read_back_and_shares_its_cameras(folder, tmp_path):
+    views = read_workspace(folder).views
+    views.append(replace(views[0], name="c.png", width=40))
+    (tmp_path / "again/sparse").mkdir(parents=True)
+    write_model(tmp_path / "again/sparse", views)
+    again = read_workspace(tmp_path / "again").views
+    assert [(v.name, v.width, v.height) for v in again] == [("a.png", 80, 60), ("b.png", 80, 60), ("c.png", 40, 60)]
+    for view, before in zip(again, views):
+        np.testing.assert_allclose(view.cam_from_world, before.cam_from_world, atol=1e-12)
+        np.testing.assert_array_equal(view.intrinsics, before.intrinsics)
+    assert pycolmap.Reconstruction(tmp_path / "again/sparse").num_cameras() == 2

@@ -91,11 +91,11 @@ rule click_fiducials:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in the flight's photos"
     shell:
         "exec python {params.script} --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
-        " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"
+        " --seed {params.seed} {params.options} &> {log}"
 
 
-rule click_prompts:
-    """Click the object in a few of its own photos; these points prompt the masks."""
+# Clicks in the object's own photos, which prompt the masks.
+use rule click_fiducials as click_prompts with:
     input:
         "results/demo/{scene}/truth/{object}",
     output:
@@ -104,13 +104,6 @@ rule click_prompts:
         "results/logs/click_prompts/{scene}-{object}.log",
     benchmark:
         "results/benchmarks/click_prompts/{scene}-{object}.tsv"
-    wildcard_constraints:
-        object=DEMO_OBJECTS,
-    conda:
-        "../../envs/reconstruction.yaml"
-    resources:
-        mem_mb=2000,
-        runtime=10,
     params:
         options=flags(config["demo"]["prompts"]),
         seed=config["seed"],
@@ -118,6 +111,3 @@ rule click_prompts:
         code=code("demo/click_points.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
-    shell:
-        "exec python {params.script} --name {wildcards.object} --cameras {input}/cameras.json --clicks {output}"
-        " --seed {params.seed} --click-seed {params.seed} {params.options} &> {log}"

@@ -16,8 +16,8 @@ HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 rule train_depth:
     """Self-supervised depth and pose networks (paper 3.2 and 4.2.2, stage 1)."""
     input:
-        cameras=POSED,
-        cameras_json=f"{POSED}.json",
+        workspace=POSED,
+        workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
     output:
@@ -43,15 +43,15 @@ rule train_depth:
     message:
         "{wildcards.object}: stage 1, depth and pose networks"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stage {output.stage} --report {output.report}"
+        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --stage {output.stage} --report {output.report}"
         " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
 
 
 rule refine_depth:
     """Feedback: depth rendered by the NeRF refines the networks (stage 3)."""
     input:
-        cameras=POSED,
-        cameras_json=f"{POSED}.json",
+        workspace=POSED,
+        workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
         previous="results/objects/{object}/stage1",
@@ -81,6 +81,6 @@ rule refine_depth:
     message:
         "{wildcards.object}: stage 3, feedback"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --previous {input.previous}"
+        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --previous {input.previous}"
         " --rendered {input.rendered} --stage {output.stage} --report {output.report}"
         " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"

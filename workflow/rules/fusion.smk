@@ -5,6 +5,11 @@
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 
 
+def object_folders(wildcards):
+    """The result folders of the objects of a scene."""
+    return [f"results/objects/{name}" for name in objects_in(wildcards)]
+
+
 rule fuse_object:
     """Add the registered object to the scene; an unregistered one leaves the scene as it is (F1, F2)."""
     input:
@@ -36,8 +41,8 @@ rule fuse_object:
     message:
         "{wildcards.object}: fusion"
     shell:
-        "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-report {input.crop_json}"
-        " --fine {input.fine} --georeference {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
+        "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-json {input.crop_json}"
+        " --fine-json {input.fine} --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
         " --fused-laz {output.laz} --report {output.report} {params.options} &> {log}"
 
 
@@ -64,12 +69,12 @@ rule complete_scene:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=flags(config["fusion"]),
-        names=objects_in,
+        objects=object_folders,
         script=script("fusion/complete_scene.py"),
         code=code("fusion/complete_scene.py"),
     message:
         "Scene {wildcards.scene}: all objects in it"
     shell:
-        "exec python {params.script} --scene {input.scene} --names {params.names} --objects {input.objects}"
-        " --crops {input.crops} --fines {input.fines} --georeference {input.georeference} --completed {output.cloud}"
-        " --completed-laz {output.laz} --report {output.report} {params.options} &> {log}"
+        "exec python {params.script} --scene {input.scene} --objects {params.objects} --georeference-json {input.georeference}"
+        " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-laz {output.laz}"
+        " --report {output.report} {params.options} &> {log}"

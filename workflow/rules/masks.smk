@@ -5,8 +5,11 @@
 #           results/weights/                                                SAM 2's, for masks by it
 
 
+include: "../functions/masks.smk"
+
+
 rule fetch_sam2_weights:
-    """SAM 2's weights for ONNX Runtime; not asked for where the config names others."""
+    """SAM 2's weights for ONNX Runtime; needed only by masks that use them."""
     output:
         encoder="results/weights/sam2_encoder.ort",
         decoder="results/weights/sam2_decoder.onnx",
@@ -16,33 +19,22 @@ rule fetch_sam2_weights:
     conda:
         "../../envs/reconstruction.yaml"
     params:
-        options=flags(
-            {
-                "package": config["object"]["masks"]["sam2_package"],
-                "sam2_encoder_sha256": config["object"]["masks"][
-                    "sam2_encoder_sha256"
-                ],
-                "sam2_decoder_sha256": config["object"]["masks"][
-                    "sam2_decoder_sha256"
-                ],
-            }
-        ),
         script=script("masks/fetch_sam2_weights.py"),
         code=code("masks/fetch_sam2_weights.py"),
     message:
         "SAM 2's weights"
     shell:
-        "exec python {params.script} --sam2-encoder {output.encoder} --sam2-decoder {output.decoder} {params.options} &> {log}"
+        "exec python {params.script} --sam2-encoder {output.encoder} --sam2-decoder {output.decoder} &> {log}"
 
 
 rule make_masks:
     """Where the object is in each frame: SAM 2, GrabCut, or your own masks (paper 3.2)."""
     input:
         mask_inputs,
-        photos="results/objects/{object}/photos.json",
-        sfm="results/objects/{object}/sparse",
-        cameras="results/objects/{object}/undistorted",
-        cameras_json="results/objects/{object}/undistorted.json",
+        photos_json="results/objects/{object}/photos.json",
+        sparse="results/objects/{object}/sparse",
+        workspace="results/objects/{object}/undistorted",
+        undistorted_json="results/objects/{object}/undistorted.json",
     output:
         masks=directory("results/objects/{object}/masks"),
         report="results/objects/{object}/masks.json",
@@ -65,9 +57,11 @@ rule make_masks:
         options=mask_options,
         seed=config["seed"],
         script=script("masks/make_masks.py"),
+        files=state_of(mask_inputs),
         code=code("masks/make_masks.py"),
     message:
         "{wildcards.object}: masks"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --cameras-json {input.cameras_json} --sfm {input.sfm} --photos {input.photos}"
+        "exec python {params.script} --workspace {input.workspace} --undistorted-json {input.undistorted_json}"
+        " --sparse {input.sparse} --photos-json {input.photos_json}"
         " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"

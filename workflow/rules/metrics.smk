@@ -5,6 +5,9 @@
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
 
 
+include: "../functions/metrics.smk"
+
+
 rule compute_metrics:
     """Registration and completion metrics, each with its null value (paper 3.3.1 and 3.3.2; G1 to G5)."""
     input:
@@ -26,6 +29,7 @@ rule compute_metrics:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
+        fused=lambda wildcards, input: input.get("fused", "None"),
         options=flags(config["metrics"]),
         seed=config["seed"],
         script=script("metrics/compute_metrics.py"),
@@ -33,12 +37,12 @@ rule compute_metrics:
     message:
         "{wildcards.object}: metrics"
     shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
-        " --fused {input.fused} --metrics {output} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json} --fine-json {input.fine}"
+        " --fused {params.fused} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
-rule compute_variant_metrics:
-    """Registration metrics of one variant, at the full variant's thresholds and on its crop."""
+use rule compute_metrics as compute_variant_metrics with:
+    # Registration metrics of one variant, at the full variant's thresholds and on its crop.
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
@@ -51,30 +55,17 @@ rule compute_variant_metrics:
         "results/logs/compute_variant_metrics/{object}-{variant}.log",
     benchmark:
         "results/benchmarks/compute_variant_metrics/{object}-{variant}.tsv"
-    conda:
-        "../../envs/registration.yaml"
-    resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
-    params:
-        options=flags(config["metrics"]),
-        seed=config["seed"],
-        script=script("metrics/compute_metrics.py"),
-        code=code("metrics/compute_metrics.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: metrics"
-    shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --reference {input.crop_json} --fine {input.fine}"
-        " --fused None --metrics {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule evaluate_scene:
-    """Judge a scene whose truth is known: cameras, georeferencing, dense cloud (G8)."""
+    """Compare a scene with its truth, where it is known: cameras, georeferencing, dense cloud (G8)."""
     input:
         model="results/scenes/{scene}/georeferenced",
         georeference="results/scenes/{scene}/georeference.json",
         cloud="results/scenes/{scene}/dense.ply",
-        truth=lambda wildcards: scene_truth(wildcards.scene),
+        truth=scene_truth,
     output:
         "results/scenes/{scene}/truth.json",
     log:
@@ -90,18 +81,19 @@ rule evaluate_scene:
         options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
         script=script("metrics/evaluate_scene.py"),
+        files=state_of(scene_truth),
         code=code("metrics/evaluate_scene.py"),
     message:
         "Scene {wildcards.scene}: comparing with the truth"
     shell:
-        "exec python {params.script} --model {input.model} --georeference {input.georeference} --cloud {input.cloud}"
-        " --truth {input.truth:q} --evaluation {output} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --model {input.model} --georeference-json {input.georeference} --cloud {input.cloud}"
+        " --truth {input.truth:q} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule evaluate_object:
-    """Judge an object whose truth is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
+    """Compare an object with its truth, where it is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
     input:
-        cameras=POSED,
+        workspace=POSED,
         masks="results/objects/{object}/masks",
         stages=expand(
             "results/objects/{object}/stage{stage}",
@@ -118,8 +110,7 @@ rule evaluate_object:
         before=in_scene("dense.ply"),
         after="results/objects/{object}/fused_scene.ply",
         scene=in_scene("truth.json"),
-        truth_scene=lambda wildcards: scene_truth(object_row(wildcards.object)["scene"]),
-        truth_object=lambda wildcards: object_row(wildcards.object)["truth"],
+        truth=object_truth,
     output:
         "results/objects/{object}/truth.json",
     log:
@@ -135,11 +126,12 @@ rule evaluate_object:
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
+        files=state_of(object_truth),
         code=code("metrics/evaluate_object.py"),
     message:
         "{wildcards.object}: comparing with the truth"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --masks {input.masks} --stages {input.stages}"
-        " --cloud {input.cloud} --variants {input.variants} --alignment {input.alignment} --before {input.before} --after {input.after}"
-        " --scene-evaluation {input.scene} --truth-scene {input.truth_scene:q} --truth-object {input.truth_object:q}"
-        " --evaluation {output} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
+        " --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --before {input.before} --after {input.after}"
+        " --scene-json {input.scene} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
+        " --report {output} --seed {params.seed} {params.options} &> {log}"

@@ -44,11 +44,11 @@ rule fuse_depth_maps:
     """Fuse the depth maps into one cloud by COLMAP's stereo fusion."""
     input:
         workspace="results/scenes/{scene}/undistorted",
-        georeference="results/scenes/{scene}/georeference.json",
+        georeference_json="results/scenes/{scene}/georeference.json",
         depth=expand(
             "results/scenes/{scene}/depth/{chunk}", chunk=CHUNKS, allow_missing=True
         ),
-        reports=expand(
+        depth_json=expand(
             "results/scenes/{scene}/depth/{chunk}.json",
             chunk=CHUNKS,
             allow_missing=True,
@@ -73,5 +73,5 @@ rule fuse_depth_maps:
     message:
         "Scene {wildcards.scene}: dense cloud"
     shell:
-        "exec python {params.script} --workspace {input.workspace} --depth {input.depth} --depth-reports {input.reports}"
-        " --georeference {input.georeference} --cloud {output.cloud} --report {output.report} {params.options} &> {log}"
+        "exec python {params.script} --workspace {input.workspace} --depth {input.depth} --depth-json {input.depth_json}"
+        " --georeference-json {input.georeference_json} --cloud {output.cloud} --report {output.report} {params.options} &> {log}"

@@ -7,8 +7,8 @@
 rule find_poses:
     """Camera poses without SfM, for pose_source network (paper 3.2; N11)."""
     input:
-        cameras="results/objects/{object}/undistorted",
-        cameras_json="results/objects/{object}/undistorted.json",
+        workspace="results/objects/{object}/undistorted",
+        workspace_json="results/objects/{object}/undistorted.json",
     output:
         posed=directory("results/objects/{object}/poses"),
         report="results/objects/{object}/poses.json",
@@ -31,5 +31,5 @@ rule find_poses:
     message:
         "{wildcards.object}: poses without SfM"
     shell:
-        "exec python {params.script} --cameras {input.cameras} --posed {output.posed} --report {output.report}"
+        "exec python {params.script} --workspace {input.workspace} --posed {output.posed} --report {output.report}"
         " --seed {params.seed} {params.options} &> {log}"

@@ -1,21 +1,25 @@
 # Where the object lies in the scene.
 #
 # INPUTS    config/objects.tsv: fiducials, where there are any; the scene's cloud and model; the object's cloud; config: registration
-# OUTPUTS   results/objects/{object}/alignment.json                          where shared features of the photos alone put the object
+# OUTPUTS   results/objects/{object}/alignment.json                          the pose that shared features of the photos give
 #           results/objects/{object}/registration/{variant}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png
 #           results/objects/{object}/frames.json
 #
-# `full` is the variant that is fused; the others (`paper`, `clouds_only`, `no_scale`, `no_crop`) run beside it by the same scripts and are
-# measured at the same thresholds.
+# `full` is the variant that is fused; the others run beside it by the same scripts, with other options, and are measured at the same
+# thresholds. `paper` shares the crop only: the paper's recipe is a stage of its own.
+ruleorder: register_as_paper > estimate_scale > register_coarsely > register_finely
+
+
+include: "../functions/registration.smk"
 
 
 rule align_models:
     """Find the object in the scene by features that their photos share (R14)."""
     input:
-        object_model="results/objects/{object}/sparse",
+        object_sparse="results/objects/{object}/sparse",
         object_json="results/objects/{object}/sparse.json",
         object_features="results/objects/{object}/features.db",
-        scene_model=in_scene("georeferenced"),
+        scene_sparse=in_scene("georeferenced"),
         scene_json=in_scene("georeference.json"),
         scene_features=in_scene("features.db"),
     output:
@@ -38,8 +42,8 @@ rule align_models:
     message:
         "{wildcards.object}: alignment from shared features"
     shell:
-        "exec python {params.script} --object-model {input.object_model} --object-features {input.object_features}"
-        " --scene-model {input.scene_model} --scene-features {input.scene_features} --alignment {output}"
+        "exec python {params.script} --object-sparse {input.object_sparse} --object-features {input.object_features}"
+        " --scene-sparse {input.scene_sparse} --scene-features {input.scene_features} --report {output}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
@@ -48,8 +52,8 @@ rule crop_scene:
     input:
         crop_inputs,
         scene=in_scene("dense.ply"),
-        model=in_scene("georeferenced"),
-        model_json=in_scene("georeference.json"),
+        sparse=in_scene("georeferenced"),
+        georeference_json=in_scene("georeference.json"),
     output:
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         report="results/objects/{object}/registration/{variant}/crop.json",
@@ -65,11 +69,12 @@ rule crop_scene:
     params:
         options=crop_options,
         script=script("registration/crop_scene.py"),
+        files=state_of(crop_inputs),
         code=code("registration/crop_scene.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: crop"
     shell:
-        "exec python {params.script} --scene {input.scene} --model {input.model} --georeference {input.model_json}"
+        "exec python {params.script} --scene {input.scene} --sparse {input.sparse} --georeference-json {input.georeference_json}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
@@ -99,8 +104,8 @@ rule estimate_scale:
     message:
         "{wildcards.object}, variant {wildcards.variant}: scale"
     shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
-        " --report {output} {params.options} &> {log}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
+        " --cameras-json {input.cameras} --report {output} {params.options} &> {log}"
 
 
 rule register_coarsely:
@@ -132,12 +137,12 @@ rule register_coarsely:
     message:
         "{wildcards.object}, variant {wildcards.variant}: coarse registration"
     shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
-        " --scale {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
+        " --cameras-json {input.cameras} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule register_finely:
-    """Refine the hypotheses, judge them, and register or refuse (R8, R9, R12)."""
+    """Refine the hypotheses into one pose, and register or reject it (R8, R9, R12)."""
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
@@ -176,9 +181,50 @@ rule register_finely:
     message:
         "{wildcards.object}, variant {wildcards.variant}: fine registration"
     shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-report {input.crop_json} --cameras {input.cameras}"
-        " --scale {input.scale} --coarse {input.coarse} --alignment {input.alignment} --workspace {input.workspace} --depth {input.depth} --fine {output.fine} --picture {output.picture}"
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
+        " --cameras-json {input.cameras} --scale-json {input.scale} --coarse-json {input.coarse} --alignment-json {input.alignment}"
+        " --workspace {input.workspace} --depth {input.depth} --report {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
+
+
+rule register_as_paper:
+    """The paper's recipe: RMS-ratio scale, rigid FPFH RANSAC, point-to-point ICP; nothing is rejected (paper 3.3; R1, R5 to R8)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        cloud_json="results/objects/{object}/object.json",
+        crop="results/objects/{object}/registration/paper/crop.ply",
+        crop_json="results/objects/{object}/registration/paper/crop.json",
+        cameras="results/objects/{object}/undistorted.json",
+    output:
+        scale="results/objects/{object}/registration/paper/scale.json",
+        coarse="results/objects/{object}/registration/paper/coarse.json",
+        fine="results/objects/{object}/registration/paper/fine.json",
+        picture=report(
+            "results/objects/{object}/registration/paper/fine.png",
+            category="Objects",
+            subcategory="{object}",
+            caption="../report/fine.rst",
+        ),
+    log:
+        "results/logs/register_as_paper/{object}.log",
+    benchmark:
+        "results/benchmarks/register_as_paper/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: 2
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        seed=config["seed"],
+        script=script("registration/register_as_paper.py"),
+        code=code("registration/register_as_paper.py"),
+    message:
+        "{wildcards.object}: registration by the paper's recipe"
+    shell:
+        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
+        " --cameras-json {input.cameras} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
+        " --picture {output.picture} --seed {params.seed} &> {log}"
 
 
 rule write_frame_ledger:
@@ -204,5 +250,5 @@ rule write_frame_ledger:
     message:
         "{wildcards.object}: frame ledger"
     shell:
-        "exec python {params.script} --object-report {input.cloud} --fine {input.fine} --georeference {input.georeference}"
-        " --frames {output} &> {log}"
+        "exec python {params.script} --object-json {input.cloud} --fine-json {input.fine} --georeference-json {input.georeference}"
+        " --report {output} &> {log}"

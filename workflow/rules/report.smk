@@ -3,6 +3,11 @@
 # INPUTS    everything before
 # OUTPUTS   results/scenes/{scene}/scene.png, results/objects/{object}/figures/
 #           results/summary/*.tsv, summary.txt, report.html
+
+
+include: "../functions/report.smk"
+
+
 TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects"]
 
 
@@ -28,14 +33,14 @@ rule draw_scene:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        objects=objects_in,
+        objects=object_folders,
         script=script("report/draw_scene.py"),
         code=code("report/draw_scene.py"),
     message:
         "Scene {wildcards.scene}: figure"
     shell:
         "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} --georeferenced {input.model}"
-        " --crops {input.crops} --objects {params.objects} --figure {output} &> {log}"
+        " --objects {params.objects} --figure {output} &> {log}"
 
 
 rule draw_object:
@@ -48,12 +53,13 @@ rule draw_object:
         cloud="results/objects/{object}/object.ply",
         fine="results/objects/{object}/registration/full/fine.json",
         metrics="results/objects/{object}/metrics.json",
-        cameras="results/objects/{object}/undistorted",
+        workspace="results/objects/{object}/undistorted",
         masks="results/objects/{object}/masks",
-        stage1="results/objects/{object}/stage1",
-        stage2="results/objects/{object}/stage2",
-        stage3="results/objects/{object}/stage3",
-        stage4="results/objects/{object}/stage4",
+        stages=expand(
+            "results/objects/{object}/stage{stage}",
+            stage=[1, 2, 3, 4],
+            allow_missing=True,
+        ),
     output:
         report(
             directory("results/objects/{object}/figures"),
@@ -78,9 +84,9 @@ rule draw_object:
         "{wildcards.object}: figures"
     shell:
         "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
-        " --crop {input.crop} --crop-report {input.crop_json} --object-cloud {input.cloud} --fine {input.fine}"
-        " --metrics {input.metrics} --cameras {input.cameras} --masks {input.masks} --stage1 {input.stage1}"
-        " --stage2 {input.stage2} --stage3 {input.stage3} --stage4 {input.stage4} --figures {output} &> {log}"
+        " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
+        " --metrics-json {input.metrics} --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
+        " --figures {output} &> {log}"
 
 
 rule write_summary:
@@ -141,12 +147,53 @@ rule write_report:
         " --title scenefuse --report {output} &> {log}"
 
 
+def held_up(rule):
+    """The jobs of a rule that have not run, because of what failed before them. An object that fails holds up those that
+    wait for all objects; under --keep-going they run at the end without it."""
+    jobs = set(workflow.dag.needrun_jobs()) - workflow.scheduler.failed
+    return [job for job in jobs if job.rule.name == rule]
+
+
+def run_anyway(job, options=""):
+    """Run a job whose inputs are not all there. Its outputs stay marked as incomplete: the next run makes them anew."""
+    workflow.persistence.started(job)
+    folders = {str(Path(file).parent) for file in (*job.log, job.benchmark)}
+    command = f"{job.shellcmd.removeprefix('exec ')}{options}"
+    # The benchmark says that the job has ended well.
+    shell(f"mkdir -p {' '.join(folders)}; {command} && touch {job.benchmark} || true")
+
+
+def without_the_failed(job):
+    """The option that names the objects that a job has to do without; None when the scene itself is missing."""
+    missing = [
+        Path(file).parts
+        for other, files in workflow.dag.dependencies[job].items()
+        if not workflow.dag.noneedrun_finished(other)
+        for file in files
+    ]
+    if any(parts[:2] != ("results", "objects") for parts in missing):
+        return None
+    return f" --failed {' '.join(sorted({parts[2] for parts in missing}))}"
+
+
 onerror:
+    stopped = getattr(workflow.scheduler, "_user_kill", None)
+    keep_going = workflow.execution_settings.keep_going and not stopped
+    for job in held_up("draw_scene") + held_up("complete_scene"):
+        options = without_the_failed(job)
+        if keep_going and options:
+            run_anyway(job, options)
+    for job in held_up("write_summary"):
+        workflow.persistence.started(job)
     shell(
-        "mkdir -p results/logs/summary; "
+        "mkdir -p results/logs/write_summary; "
         + summary_command("results/logs/write_summary/onerror.log")
         + " || true"
     )
+    for job in held_up("write_report") if keep_going else []:
+        run_anyway(job)
     print(
-        "Some jobs failed; results/summary/summary.txt names them.", file=sys.stderr
+        "Some jobs failed; results/summary/summary.txt names them."
+        + ("" if keep_going else " With --keep-going the other objects go on."),
+        file=sys.stderr,
     )

@@ -1,20 +1,24 @@
 # Structure from motion: from photos to cameras, the same steps for a scene and for an object.
 #
 # INPUTS    config/scenes.tsv, config/objects.tsv: photos; config: scene, object, seed
-# OUTPUTS   results/scenes/{scene}/photos.json                              the photos, checked, with GPS
-#           results/objects/{object}/frames/, photos.json                   the photos, checked and at most a given width
+# OUTPUTS   results/scenes/{scene}/photos/, photos.json                     the photos, checked and upright, with GPS
+#           results/objects/{object}/frames/, photos.json                   the same, at most a given width
 #           .../features.db, database.db, matches.json                      COLMAP databases
 #           .../sparse/, sparse.json                                        cameras and sparse points
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
 
+include: "../functions/sfm.smk"
+
+
 rule list_photos:
-    """List the flight's photos, and stop at one that cannot be read."""
+    """List the flight's photos, turn rotated ones upright, and stop at one that cannot be read."""
     input:
         scene_photos,
     output:
-        "results/scenes/{scene}/photos.json",
+        upright=directory("results/scenes/{scene}/photos"),
+        photos="results/scenes/{scene}/photos.json",
     log:
         "results/logs/list_photos/{scene}.log",
     benchmark:
@@ -27,11 +31,12 @@ rule list_photos:
     params:
         folder=scene_folder,
         script=script("sfm/list_photos.py"),
+        files=state_of(scene_photos),
         code=code("sfm/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
     shell:
-        "exec python {params.script} --folder {params.folder} --photos {output} &> {log}"
+        "exec python {params.script} --folder {params.folder} --upright {output.upright} --photos {output.photos} &> {log}"
 
 
 rule extract_frames:
@@ -54,6 +59,7 @@ rule extract_frames:
         source=object_source,
         options=flags(config["object"]["frames"]),
         script=script("sfm/extract_frames.py"),
+        files=state_of(object_photos),
         code=code("sfm/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
@@ -62,9 +68,9 @@ rule extract_frames:
 
 
 rule extract_scene_features:
-    """SIFT features and GPS priors (paper 3.1)."""
+    """SIFT features (paper 3.1)."""
     input:
-        scene_photos,
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
         "results/scenes/{scene}/features.db",
@@ -79,20 +85,18 @@ rule extract_scene_features:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        folder=scene_folder,
         options=flags(config["scene"]["features"]),
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
     shell:
-        "exec python {params.script} --folder {params.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
+        "exec python {params.script} --folder {input.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
 
 
-rule extract_object_features:
-    """SIFT features."""
+use rule extract_scene_features as extract_object_features with:
     input:
-        frames="results/objects/{object}/frames",
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
         "results/objects/{object}/features.db",
@@ -100,9 +104,6 @@ rule extract_object_features:
         "results/logs/extract_object_features/{object}.log",
     benchmark:
         "results/benchmarks/extract_object_features/{object}.tsv"
-    conda:
-        "../../envs/reconstruction.yaml"
-    threads: 8
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -112,12 +113,10 @@ rule extract_object_features:
         code=code("sfm/extract_features.py"),
     message:
         "{wildcards.object}: features"
-    shell:
-        "exec python {params.script} --folder {input.frames} --photos {input.photos} --features {output} {params.options} &> {log}"
 
 
 rule match_scene_features:
-    """Match pairs of photos that GPS says are near each other (paper 3.1)."""
+    """Match pairs of photos that are near each other by GPS or in time, or all pairs (paper 3.1)."""
     input:
         photos="results/scenes/{scene}/photos.json",
         features="results/scenes/{scene}/features.db",
@@ -146,8 +145,7 @@ rule match_scene_features:
         " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
-rule match_object_features:
-    """Match pairs of frames."""
+use rule match_scene_features as match_object_features with:
     input:
         photos="results/objects/{object}/photos.json",
         features="results/objects/{object}/features.db",
@@ -158,9 +156,6 @@ rule match_object_features:
         "results/logs/match_object_features/{object}.log",
     benchmark:
         "results/benchmarks/match_object_features/{object}.tsv"
-    conda:
-        "../../envs/reconstruction.yaml"
-    threads: 8
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
@@ -171,15 +166,12 @@ rule match_object_features:
         code=code("sfm/match_features.py"),
     message:
         "{wildcards.object}: matching"
-    shell:
-        "exec python {params.script} --photos {input.photos} --features {input.features} --database {output.database}"
-        " --matches {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
 rule map_scene_photos:
-    """Incremental mapping and bundle adjustment (paper 3.1)."""
+    """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
-        scene_photos,
+        folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
     output:
@@ -196,7 +188,6 @@ rule map_scene_photos:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
     params:
-        folder=scene_folder,
         options=flags(config["scene"]["sparse"]),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
@@ -204,14 +195,13 @@ rule map_scene_photos:
     message:
         "Scene {wildcards.scene}: cameras and sparse points"
     shell:
-        "exec python {params.script} --folder {params.folder} --photos {input.photos} --database {input.database}"
+        "exec python {params.script} --folder {input.folder} --photos {input.photos} --database {input.database}"
         " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
-rule map_object_photos:
-    """Cameras and sparse points by incremental mapping."""
+use rule map_scene_photos as map_object_photos with:
     input:
-        frames="results/objects/{object}/frames",
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
     output:
@@ -221,9 +211,6 @@ rule map_object_photos:
         "results/logs/map_object_photos/{object}.log",
     benchmark:
         "results/benchmarks/map_object_photos/{object}.tsv"
-    conda:
-        "../../envs/reconstruction.yaml"
-    threads: 8
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
@@ -234,9 +221,6 @@ rule map_object_photos:
         code=code("sfm/map_photos.py"),
     message:
         "{wildcards.object}: cameras and sparse points"
-    shell:
-        "exec python {params.script} --folder {input.frames} --photos {input.photos} --database {input.database}"
-        " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
 rule georegister:
@@ -272,7 +256,8 @@ rule georegister:
 rule undistort_scene_photos:
     """Undistort the photos into a COLMAP workspace."""
     input:
-        scene_photos,
+        folder="results/scenes/{scene}/photos",
+        photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/georeferenced",
         report="results/scenes/{scene}/georeference.json",
     output:
@@ -289,42 +274,38 @@ rule undistort_scene_photos:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        folder=scene_folder,
+        upright=lambda wildcards, input: f"--georeference {input.report}",
         options=flags(config["scene"]["undistort"]),
         script=script("sfm/undistort_photos.py"),
         code=code("sfm/undistort_photos.py"),
     message:
         "Scene {wildcards.scene}: undistorting"
     shell:
-        "exec python {params.script} --folder {params.folder} --sparse {input.model} --dense {output.workspace}"
-        " --report {output.report} {params.options} &> {log}"
+        "exec python {params.script} --folder {input.folder} --photos {input.photos} --sparse {input.model} {params.upright}"
+        " --workspace {output.workspace} --report {output.report} {params.options} &> {log}"
 
 
-rule undistort_object_photos:
-    """Undistort the frames, and find which way is up."""
+use rule undistort_scene_photos as undistort_object_photos with:
     input:
-        frames="results/objects/{object}/frames",
+        folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         model="results/objects/{object}/sparse",
         report="results/objects/{object}/sparse.json",
     output:
-        cameras=directory("results/objects/{object}/undistorted"),
+        workspace=directory("results/objects/{object}/undistorted"),
         report="results/objects/{object}/undistorted.json",
     log:
         "results/logs/undistort_object_photos/{object}.log",
     benchmark:
         "results/benchmarks/undistort_object_photos/{object}.tsv"
-    conda:
-        "../../envs/reconstruction.yaml"
+    threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
+        upright="",
         options=flags(config["object"]["undistort"]),
-        script=script("sfm/undistort_object.py"),
-        code=code("sfm/undistort_object.py"),
+        script=script("sfm/undistort_photos.py"),
+        code=code("sfm/undistort_photos.py"),
     message:
         "{wildcards.object}: undistorting"
-    shell:
-        "exec python {params.script} --folder {input.frames} --photos {input.photos} --sparse {input.model}"
-        " --cameras {output.cameras} --report {output.report} {params.options} &> {log}"

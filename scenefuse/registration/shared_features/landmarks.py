@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
+from scenefuse.workspace import posed_images, read_model
 
+# Points matched at once, and of each model at most: both bound memory.
 BLOCK = 4096
+MOST_POINTS = 100_000
+# Views of a point whose descriptors are compared.
+DESCRIPTORS_PER_POINT = 3
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,9 @@ class Landmarks:
         return size
 
 
-def read_landmarks(model: Path, database: Path, most_points: int, descriptors_per_point: int) -> Landmarks:
+def read_landmarks(
+    model: Path, database: Path, most_points: int = MOST_POINTS, descriptors_per_point: int = DESCRIPTORS_PER_POINT
+) -> Landmarks:
     """Read a sparse model and the descriptors of its points.
 
     Args:
@@ -78,8 +85,8 @@ def read_landmarks(model: Path, database: Path, most_points: int, descriptors_pe
     Raises:
         StageError: the database does not belong to the model.
     """
-    reconstruction = pycolmap.Reconstruction(model)
-    images = {i: reconstruction.images[i] for i in sorted(reconstruction.reg_image_ids())}
+    reconstruction = read_model(model)
+    images = {image.image_id: image for image in sorted(posed_images(reconstruction), key=lambda i: i.image_id)}
     view_of = {image_id: k for k, image_id in enumerate(images)}
     ids = sorted(reconstruction.points3D, key=lambda p: (-reconstruction.points3D[p].track.length(), p))[:most_points]
     ids.sort()

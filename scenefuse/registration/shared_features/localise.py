@@ -9,14 +9,17 @@ from numpy.typing import NDArray
 from scenefuse.registration.shared_features.landmarks import Landmarks
 from scenefuse.transforms import Array, Sim3, fit_sim3_robust
 
+# Matches, and inliers, that localise a photo.
 MIN_LOCALISED = 10
+# RANSAC's inlier distance of the camera centres, as a share of their distance from the object.
 CENTRE_SHARE = 0.05
+# Camera centres along a line fix no similarity: least ratio of the second to the first singular value.
 MIN_BREADTH = 0.05
 
 
 @dataclass(frozen=True)
 class Centres:
-    """What the object's photos say once each is localised in the scene by its own.
+    """The similarity from the object's photos, each localised in the scene by its own.
 
     Attributes:
         pose: scene_from_object that fits the camera centres, or None.

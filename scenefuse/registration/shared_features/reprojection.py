@@ -7,26 +7,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.shared_features.landmarks import Landmarks
-from scenefuse.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.registration.uncertainty import Uncertainty
+from scenefuse.transforms import Array, Sim3
 
 BEHIND_PX = 1e4
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """Standard deviations of a similarity: log scale, rotation, position of one point in scene units."""
-
-    scale_log: float
-    rotation_deg: float
-    shift: float
-
-    def beside(self, pose: Sim3, other: Sim3, at: Array) -> "Deviation":
-        """With the difference of two estimates of the pose, judged at (3,) in the object's frame, added in squares."""
-        return Deviation(
-            float(np.hypot(self.scale_log, np.log(other.scale / pose.scale))),
-            float(np.hypot(self.rotation_deg, rotation_angle_deg(other.rotation @ pose.rotation.T))),
-            float(np.hypot(self.shift, np.linalg.norm(other.apply(at) - pose.apply(at)))),
-        )
 
 
 @dataclass(frozen=True)
@@ -124,7 +108,7 @@ def match_errors(seen: Observations, scene_from_object: Sim3) -> Array:
     return np.sqrt(np.maximum(*sides))
 
 
-def refine(seen: Observations, start: Sim3, width_px: float, rounds: int) -> Sim3:
+def minimise_reprojection(seen: Observations, start: Sim3, width_px: float, rounds: int) -> Sim3:
     """Gauss-Newton over the seven parameters with Cauchy weights of `width_px`, damped where it does not improve."""
     pose, damping = start, 1e-6
     cost = _cost(seen, pose, width_px)
@@ -144,7 +128,7 @@ def refine(seen: Observations, start: Sim3, width_px: float, rounds: int) -> Sim
     return pose
 
 
-def bootstrap(seen: Observations, pose: Sim3, width_px: float, at: Array, draws: int, seed: int) -> Deviation:
+def bootstrap(seen: Observations, pose: Sim3, width_px: float, at: Array, draws: int, seed: int) -> Uncertainty:
     """Standard deviations of a refined pose when photos and matches are drawn again with replacement.
 
     An observation counts as often as its match was drawn times its photo was drawn, because observations of one point
@@ -155,7 +139,7 @@ def bootstrap(seen: Observations, pose: Sim3, width_px: float, at: Array, draws:
         seen: the inliers.
         pose: the refined scene_from_object.
         width_px: of the Cauchy weights.
-        at: (3,) where the position is judged, in the object's frame.
+        at: (3,) where the position is taken, in the object's frame.
         draws: number of draws.
         seed: of the draws.
     """
@@ -176,7 +160,7 @@ def bootstrap(seen: Observations, pose: Sim3, width_px: float, at: Array, draws:
         steps.append(np.concatenate([step[:4], step[0] * lever + np.cross(step[1:4], lever) + step[4:]]))
     deviation = np.std(steps, axis=0)
     turn, shift = np.linalg.norm(deviation[1:4]), np.linalg.norm(deviation[4:])
-    return Deviation(float(deviation[0]), float(np.degrees(turn)), float(shift))
+    return Uncertainty.even(float(deviation[0]), float(np.degrees(turn)), float(shift))
 
 
 def _gain(seen: Observations, scale: float) -> Array:
@@ -202,11 +186,11 @@ def _linearise(seen: Observations, pose: Sim3, width_px: float) -> tuple[Array, 
     error, in_cam = residuals(seen, pose)
     # A step moves the scene's copy of a point by sigma (p - c) + omega x (p - c) + tau; seen from the object, the
     # scene's point moves the other way.
-    variant = np.concatenate([pose.apply(seen.x)[seen.match[:n]], seen.y[seen.match[n:]]]) - pivot
-    motion = np.zeros((len(variant), 3, 7))
-    motion[:, :, 0] = variant
+    lever = np.concatenate([pose.apply(seen.x)[seen.match[:n]], seen.y[seen.match[n:]]]) - pivot
+    motion = np.zeros((len(lever), 3, 7))
+    motion[:, :, 0] = lever
     for axis in range(3):
-        motion[:, :, 1 + axis] = np.cross(np.eye(3)[axis], variant)
+        motion[:, :, 1 + axis] = np.cross(np.eye(3)[axis], lever)
     motion[:, :, 4:] = np.eye(3)
     motion[n:] = -(pose.rotation.T / pose.scale) @ motion[n:]
     in_camera = seen.pose[:, :, :3] @ motion

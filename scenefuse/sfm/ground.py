@@ -1,4 +1,4 @@
-"""The ground under an object, fitted to what surrounds it."""
+"""The ground under an object, fitted to what surrounds it: a parabolic height field."""
 
 from dataclasses import dataclass
 
@@ -6,7 +6,14 @@ import numpy as np
 
 from scenefuse.transforms import Array
 
+# Cells along each side of the square around the ring; one low point stands for each.
 CELLS = 40
+# Fewer points, or cells, than these fix no ground.
+MIN_POINTS, MIN_CELLS = 50, 20
+# Triples of cells drawn; the plane must hold this share of the cells, and rise by less than 45 degrees.
+TRIPLES, MIN_SHARE = 400, 0.3
+# Rounds of Tukey weights for the plane and for the parabola, twice.
+ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -32,8 +39,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     """Fit the ground on a ring around a box, never inside it, so that the object itself cannot pass for ground.
 
     The lowest points of cells of the ring are fitted by a plane (RANSAC over triples), then by a parabolic height
-    field with Tukey weights. The parabola is kept only where it stays near the plane in the middle, of which a ring
-    says little.
+    field with Tukey weights.
 
     Args:
         points: (N, 3), z up.
@@ -50,40 +56,16 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
     inside = ((xy >= low[:2]) & (xy <= high[:2])).all(1)
     around = points[near & ~inside]
-    if len(around) < 50:
+    if len(around) < MIN_POINTS:
         return None
-    edge = float((high[:2] - low[:2] + 2 * ring).max()) / CELLS
-    cell = np.floor((around[:, :2] - (low[:2] - ring)) / edge).astype(np.int64)
-    key = cell[:, 0] * (2 * CELLS) + cell[:, 1]
-    order = np.lexsort((around[:, 2], key))
-    first = np.concatenate([[True], key[order][1:] != key[order][:-1]])
-    starts = np.flatnonzero(first)
-    # The tenth percentile of a cell, not its lowest point: dense clouds have strays below the ground.
-    counts = np.diff(np.concatenate([starts, [len(order)]]))
-    lowest = around[order[starts + (0.1 * counts).astype(int)]]
-    if len(lowest) < 20:
+    lowest = _lowest(around, low[:2] - ring, float((high[:2] - low[:2] + 2 * ring).max()) / CELLS)
+    if len(lowest) < MIN_CELLS:
         return None
     centre = (low[:2] + high[:2]) / 2
-    x = lowest[:, :2] - centre
-    plane = _plane_by_triples(x, lowest[:, 2], 2 * tolerance, seed)
+    plane = _plane_by_triples(lowest[:, :2] - centre, lowest[:, 2], 2 * tolerance, seed)
     if plane is None:
         return None
-    terms = _terms(x)
-    coefficients = np.concatenate([plane, np.zeros(3)])
-    for columns in (3, 6, 6):
-        for _ in range(10):
-            residual = lowest[:, 2] - terms @ coefficients
-            weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
-            root = np.sqrt(weight)[:, None]
-            if (weight > 0).sum() < 20:
-                break
-            solved = np.linalg.lstsq(root * terms[:, :columns], root[:, 0] * lowest[:, 2], rcond=None)[0]
-            coefficients = np.concatenate([solved, np.zeros(6 - columns)])
-        if columns == 3:
-            flat = coefficients
-    bulge = abs(float(coefficients[0] - flat[0]))
-    if bulge > 3 * tolerance:
-        coefficients = flat
+    coefficients = _height_field(lowest[:, :2] - centre, lowest[:, 2], plane, tolerance)
     # A noisy cloud's ground is thick: its own spread about the surface widens the tolerance.
     off = around[:, 2] - _terms(around[:, :2] - centre) @ coefficients
     off = off[np.abs(off) < 4 * tolerance]
@@ -93,10 +75,45 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
     return Ground(coefficients, centre, tolerance)
 
 
+def _lowest(points: Array, corner: Array, edge: float) -> Array:
+    """(M, 3) one low point of each cell of `edge` from a corner (2,).
+
+    The tenth percentile of a cell, not its lowest point: dense clouds have strays below the ground.
+    """
+    cell = np.floor((points[:, :2] - corner) / edge).astype(np.int64)
+    key = cell[:, 0] * (2 * CELLS) + cell[:, 1]
+    order = np.lexsort((points[:, 2], key))
+    first = np.concatenate([[True], key[order][1:] != key[order][:-1]])
+    starts = np.flatnonzero(first)
+    counts = np.diff(np.concatenate([starts, [len(order)]]))
+    return points[order[starts + (0.1 * counts).astype(int)]]
+
+
+def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
+    """The (6,) coefficients fitted to heights from a first plane (3,): a plane, then a parabola, by Tukey weights.
+
+    The parabola is kept only where it stays near the plane in the middle, of which a ring says little.
+    """
+    terms, coefficients = _terms(xy), np.concatenate([plane, np.zeros(3)])
+    flat = coefficients
+    for columns in (3, 6, 6):
+        for _ in range(ROUNDS):
+            residual = z - terms @ coefficients
+            weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
+            root = np.sqrt(weight)[:, None]
+            if (weight > 0).sum() < MIN_CELLS:
+                break
+            solved = np.linalg.lstsq(root * terms[:, :columns], root[:, 0] * z, rcond=None)[0]
+            coefficients = np.concatenate([solved, np.zeros(6 - columns)])
+        if columns == 3:
+            flat = coefficients
+    return flat if abs(float(coefficients[0] - flat[0])) > 3 * tolerance else coefficients
+
+
 def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array | None:
     """The (3,) plane a + b x + c y with most points within `tolerance`, or None."""
     rng = np.random.default_rng(seed)
-    triples = rng.integers(0, len(xy), (400, 3))
+    triples = rng.integers(0, len(xy), (TRIPLES, 3))
     terms = _terms(xy)[:, :3]
     matrices = terms[triples]
     good = np.abs(np.linalg.det(matrices)) > 1e-6 * np.ptp(xy, axis=0).max() ** 2
@@ -108,7 +125,7 @@ def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array
         return None
     counts = (np.abs(planes @ terms.T - z) <= tolerance).sum(1)
     best = int(counts.argmax())
-    return planes[best] if counts[best] >= 0.3 * len(z) else None
+    return planes[best] if counts[best] >= MIN_SHARE * len(z) else None
 
 
 def _terms(xy: Array) -> Array:

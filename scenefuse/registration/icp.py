@@ -1,18 +1,21 @@
-"""Similarity refinement on two-way pairs: Tukey-weighted points first, then planes and colours."""
+"""ICP for similarities on two-way pairs: Tukey-weighted points first, then planes and colours."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.score import Pairs, color_gain, pair
 from scenefuse.registration.surface import Surface
 from scenefuse.transforms import Array, Sim3, fit_sim3
 
+# Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
 POINT_WEIGHT = 0.1
-SETTLED = 0.005
-OFF_SCALE = 1.03
-HALF_ROUNDS = 30
+# A step that moves the points by less than this share of the pairing distance is the last.
+CONVERGED = 0.005
+# Weight of colour rows against geometry in the polish; both are in units of their own spread.
+COLOR_WEIGHT = 0.3
+# Fewer pairs than this in either direction fix no similarity.
+MIN_PAIRS = 10
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ def refine_points(
         threshold = tau[0] * (tau[1] / tau[0]) ** (step / max(rounds - 1, 1))
         pairs = pair(obj, scene, pose, threshold)
         backward = len(pairs.distance) - pairs.forward
-        if pairs.forward < 10 or backward < 10:
+        if min(pairs.forward, backward) < MIN_PAIRS:
             return pose
         weights = _two_way_weights(pairs, threshold)
         x, y = obj.points[pairs.object_index], scene.points[pairs.scene_index]
@@ -90,7 +93,7 @@ def refine_planes(
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
         pose = _apply_step(pose, step, rows.centre, scales)
-        if _motion(step, rows) < SETTLED * tau:
+        if _motion(step, rows) < CONVERGED * tau:
             break
     return pose
 
@@ -98,98 +101,6 @@ def refine_planes(
 def _motion(step: Array, rows: "_Rows") -> float:
     """How far a step moves the paired points, scene units."""
     return float(np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])))
-
-
-@dataclass(frozen=True)
-class Uncertainty:
-    """Spread of a pose over resampled surfaces.
-
-    Attributes:
-        scale_sd_log: standard deviation of the scale, natural logarithm.
-        rotation_sd_deg: standard deviation of the rotation about its least certain axis, degrees.
-        rotation_axis: (3,) that axis, in the scene.
-        translation_sd: standard deviation of the object's centre along its least certain direction, scene units.
-        covariance: (7, 7) of rotation vector (radians), translation (scene units) and log scale, about that centre.
-    """
-
-    scale_sd_log: float
-    rotation_sd_deg: float
-    rotation_axis: Array
-    translation_sd: float
-    covariance: Array
-
-    @classmethod
-    def even(cls, scale_sd_log: float, rotation_sd_deg: float, translation_sd: float) -> "Uncertainty":
-        """The same spread in all directions."""
-        variances = np.array([np.radians(rotation_sd_deg)] * 3 + [translation_sd] * 3 + [scale_sd_log]) ** 2
-        return cls(scale_sd_log, rotation_sd_deg, np.array([0.0, 0.0, 1.0]), translation_sd, np.diag(variances))
-
-    def size(self, diagonal: float) -> float:
-        """One number to compare spreads by: how far it moves a point half a diagonal off the centre, over it."""
-        turn, shift = np.radians(self.rotation_sd_deg) / 2, self.translation_sd / diagonal
-        return float(np.sqrt((self.scale_sd_log / 2) ** 2 + turn**2 + shift**2))
-
-
-def uncertainty(
-    surfaces: list[tuple[Surface, Surface]],
-    pose: Sim3,
-    scales: ScaleRange,
-    tau: float,
-    color_weight: float,
-    resamplings: int,
-    seed: int,
-) -> Uncertainty | None:
-    """Half-sampling (Politis, Romano 1994): refine again and again with half of the surface's pieces, drawn at random.
-
-    Pieces are a sixth of the scene crop's diagonal wide, so that what is correlated stays together. The deviation of a
-    half's pose from the whole's has the spread that the whole's has from the truth. New pairs are made each time; a
-    bootstrap of fixed pairs is some five times too sure of itself. Taking turns with differently thinned clouds lets
-    a pose that hangs on the thinning show it, and beginning 3 % too small or too large lets one show that stays where
-    it is put.
-
-    Args:
-        surfaces: object and scene at one or more spacings, in turn.
-        pose: scene_from_object of the whole.
-        scales: bounds of the scale.
-        tau: see `refine_planes`.
-        color_weight: see `refine_planes`.
-        resamplings: halves drawn.
-        seed: of the halves.
-
-    Returns:
-        The spread, or None with fewer than eight pieces to draw from.
-    """
-    centre = surfaces[0][0].points.mean(0)
-    edge = float(np.linalg.norm(np.ptp(surfaces[0][1].points, axis=0))) / 6
-    rng = np.random.default_rng(seed)
-    deviations = np.zeros((resamplings, 7))
-    for k in range(resamplings):
-        obj, scene = surfaces[k % len(surfaces)]
-        places = np.concatenate([scene.points, pose.apply(obj.points)])
-        piece = np.unique(np.floor(places / edge).astype(np.int64), axis=0, return_inverse=True)[1].ravel()
-        in_scene, in_object = piece[: len(scene)], piece[len(scene) :]
-        pieces = np.unique(in_scene)
-        if len(pieces) < 8:
-            return None
-        chosen = np.zeros(piece.max() + 1, dtype=bool)
-        chosen[rng.permutation(pieces)[: len(pieces) // 2]] = True
-        half_object = replace(obj, probe=obj.probe[chosen[in_object[obj.probe]]])
-        half_scene = replace(scene, probe=scene.probe[chosen[in_scene[scene.probe]]])
-        factor = OFF_SCALE if k // len(surfaces) % 2 else 1 / OFF_SCALE
-        start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
-        other = refine_planes(half_object, half_scene, start, scales, tau, HALF_ROUNDS, color_weight)
-        deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()
-        deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
-        deviations[k, 6] = np.log(other.scale / pose.scale)
-    covariance = deviations.T @ deviations / resamplings
-    turn, axes = np.linalg.eigh(covariance[:3, :3])
-    return Uncertainty(
-        float(np.sqrt(covariance[6, 6])),
-        float(np.degrees(np.sqrt(max(turn[-1], 0)))),
-        axes[:, -1],
-        float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1], 0))),
-        covariance,
-    )
 
 
 @dataclass(frozen=True)
@@ -218,7 +129,7 @@ def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: fl
     """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
     planes leave free, and colours where both sides have them."""
     pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
-    if min(pairs.forward, len(pairs.distance) - pairs.forward) < 10:
+    if min(pairs.forward, len(pairs.distance) - pairs.forward) < MIN_PAIRS:
         return None
     p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
     centre = p.mean(0)

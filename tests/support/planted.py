@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from scenefuse.demo import objects
 from scenefuse.demo.meshes import Part, blob, box, grid, join, lathe, tube
 from scenefuse.io.clouds import Cloud
-from scenefuse.registration.free_space import DepthView, FreeSpace
+from scenefuse.registration.free_space import FreeSpace, without_edges
 from scenefuse.transforms import Sim3, rotation_angle_deg
+from scenefuse.workspace import View
 
 OUTER_POINTS = 60000
 
@@ -254,7 +255,7 @@ def plant(
     free_space = None
     if depth_maps:
         views = _depth_maps(rays, own, cameras, points[shown], centre, diagonal, noise, rng)
-        free_space = FreeSpace([v.cautious() for v in views], 0.03 * diagonal)
+        free_space = FreeSpace([without_edges(v) for v in views], 0.03 * diagonal)
     shape = SHAPES[name]
     return Trial(
         Cloud(object_cloud, normals[chosen].astype(np.float32), _bytes(colors[chosen] * gain)).transformed(
@@ -335,7 +336,9 @@ def _depth_maps(rays, own, cameras, shown, centre, diagonal, noise, rng):
         depth = np.where(lost | (depth <= 0), 0, depth + rng.normal(0, noise * diagonal, depth.shape)).astype(
             np.float32
         )
-        views.append(DepthView(depth, intrinsics, rotation, -rotation @ camera))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, -rotation @ camera
+        views.append(View(f"{len(views)}.jpg", intrinsics, pose, width, height, depth))
     return views
 
 

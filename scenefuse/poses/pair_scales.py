@@ -1,15 +1,13 @@
-"""How long each pair's baseline is: the depth network learns one depth for every photo that all its pairs agree on.
+"""The scale of each pair, the length of its baseline: a depth network learns depths that all pairs of a photo share.
 
 A pair of photos knows the depths d of its matches in units of its own baseline b. Of the network's depth D,
 
     log D(x) - log d(x) = log b  for all matches x of the pair, in both photos                      (1)
 
-so the loss is the spread of the left side within each pair, and b its mean: what the pairs of a photo disagree on, the
-network settles, and lengths go from pair to pair through depth (as in FlowMap, Smith et al. 2024, poses are not free
-variables but follow from depth and matches).
+so the loss is the spread of the left side within each pair, and b its mean. Pairs of one photo share its depths, so
+their scales become consistent (as in FlowMap, Smith et al. 2024, poses are not free variables but follow from depth
+and matches).
 """
-
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,55 +15,51 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
+from scenefuse.checkpoints import learning_rate_factor
 from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
 from scenefuse.depth.self_supervision import masked_mean, points_in_cam, sample, smoothness
-from scenefuse.depth.training import warmup_then_cosine
-from scenefuse.poses.correspondences import Features, Pair
+from scenefuse.poses.correspondences import PhotoFeatures, TwoViewPair
+from scenefuse.workspace import View
 
-# Depths in units of the typical one: all that the network can say.
+# Nearest and farthest depth of the network, in units of the typical one.
 NEAR, FAR = 0.2, 20.0
+# Highest rate of Adam, and the share of the steps in which it rises.
+LEARNING_RATE, WARMUP = 0.005, 0.1
+# Weight of the edge-aware smoothness of disparity, as in Monodepth2.
+SMOOTHNESS_WEIGHT = 0.001
+MAX_GRADIENT = 1.0
+PRINT_EVERY = 20
 # Disagreement (relative depth) at which a match loses half its weight. Smaller, and two groups of photos that few
 # pairs join keep the lengths that they began with.
 ROBUST = 0.3
 
 
-@dataclass(frozen=True)
-class ScaleTraining:
-    """How the lengths are learned.
-
-    Attributes:
-        steps: of Adam, each over all photos.
-        learning_rate: maximum, after a short warm-up; then a cosine.
-        smoothness_weight: of the edge-aware smoothness of disparity.
-    """
-
-    steps: int
-    learning_rate: float
-    smoothness_weight: float
-
-
-def learn_lengths(
-    images: list[NDArray[np.uint8]],
-    intrinsics: NDArray[np.float64],
-    features: list[Features],
-    pairs: list[Pair],
-    training: ScaleTraining,
+def learn_pair_scales(
+    views: list[View],
+    features: list[PhotoFeatures],
+    pairs: list[TwoViewPair],
+    steps: int,
     device: torch.device,
 ) -> tuple[NDArray[np.float64], float]:
     """Train a depth network on the pairs' depths.
 
     Args:
-        images: V small photos (h, w, 3), uint8 RGB.
-        intrinsics: (V, 3, 3) of these.
+        views: V small photos of one size, (h, w, 3) uint8 RGB.
         features: of the photos at their full size.
         pairs: of the photos.
-        training: the schedule.
+        steps: of Adam, each over all photos.
         device: where to train.
 
     Returns:
         (P,) baseline of each pair, in units of the typical depth; and the median relative disagreement of depths.
     """
-    photos = torch.as_tensor(np.stack(images), dtype=torch.float32, device=device).permute(0, 3, 1, 2) / 255.0
+    intrinsics = np.array([view.intrinsics for view in views])
+    photos = (
+        torch.as_tensor(np.stack([view.pixels for view in views]), dtype=torch.float32, device=device).permute(
+            0, 3, 1, 2
+        )
+        / 255.0
+    )
     count, _, height, width = photos.shape
     cameras = torch.as_tensor(intrinsics, dtype=torch.float32, device=device)
     one = torch.ones(count, 1, height, width, device=device)
@@ -73,19 +67,19 @@ def learn_lengths(
     first = disparity_from_depth(one, NEAR, FAR)
     points = _Matches(features, intrinsics, pairs, device)
     network = DepthNetwork(inputs.shape[1]).to(device)
-    optimizer = torch.optim.Adam(network.parameters(), lr=training.learning_rate)
-    for step in range(training.steps):
+    optimizer = torch.optim.Adam(network.parameters(), lr=LEARNING_RATE)
+    for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = training.learning_rate * warmup_then_cosine(step, training.steps, 0.1 * training.steps)
+            group["lr"] = LEARNING_RATE * learning_rate_factor(step, steps, WARMUP * steps)
         disparity = network(inputs, first)
         residual, _, weight = points.disagreement(depth_from_disparity(disparity, NEAR, FAR))
         loss = masked_mean(functional.huber_loss(residual, torch.zeros_like(residual), "none", ROBUST), weight)
-        total = loss + training.smoothness_weight * smoothness(disparity, photos, one)
+        total = loss + SMOOTHNESS_WEIGHT * smoothness(disparity, photos, one)
         optimizer.zero_grad(set_to_none=True)
         total.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT)
         optimizer.step()
-        if step % 20 == 0 or step == training.steps - 1:
+        if step % PRINT_EVERY == 0 or step == steps - 1:
             print(f"step {step}: disagreement {float(residual.detach().abs().median()):.4f}", flush=True)
     with torch.no_grad():
         residual, length, _ = points.disagreement(depth_from_disparity(network(inputs, first), NEAR, FAR))
@@ -96,7 +90,11 @@ class _Matches:
     """All matches of all pairs, once for each of their two photos."""
 
     def __init__(
-        self, features: list[Features], intrinsics: NDArray[np.float64], pairs: list[Pair], device: torch.device
+        self,
+        features: list[PhotoFeatures],
+        intrinsics: NDArray[np.float64],
+        pairs: list[TwoViewPair],
+        device: torch.device,
     ) -> None:
         most = max(len(f.pixels) for f in features)
         pixels = np.zeros((len(features), most, 2), np.float32)

@@ -1,0 +1,81 @@
+"""What a run of the workflow works on: settings, scenes, objects and registration variants, all checked.
+
+Imported whenever the workflow is read: nothing here takes long to import.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scenefuse.io.settings import ROOT, merge, problem, schema_of, with_defaults
+from scenefuse.io.tables import Row, read_table
+from scenefuse.stage import StageError
+
+
+@dataclass(frozen=True)
+class Project:
+    """All that the rules need to know of a project.
+
+    Attributes:
+        settings: as shipped, with the user's laid over them.
+        scenes: rows of the table of scenes by name.
+        objects: rows of the table of objects by name.
+        variants: settings of `registration` for each variant that runs.
+    """
+
+    settings: dict[str, Any]
+    scenes: dict[str, Row]
+    objects: dict[str, Row]
+    variants: dict[str, dict[str, Any]]
+
+
+def read_project(config: Mapping[str, Any]) -> Project:
+    """The project that a configuration describes; relative paths are the working directory's, then the repository's.
+
+    Raises:
+        StageError: the first thing that is wrong, with its file and place.
+    """
+    schema = schema_of("config")
+    wrong = problem(config, schema)
+    if wrong:
+        raise StageError(f"config, {wrong}")
+    settings = with_defaults(config, schema)
+    scenes, objects = (_checked_table(settings[f"{kind}s"], kind) for kind in ("scene", "object"))
+    if not scenes:
+        raise StageError(f"{settings['scenes']} has no rows; add one for each scene")
+    for name, row in objects.items():
+        if row["scene"] not in scenes:
+            raise StageError(
+                f"{settings['objects']}: object '{name}' lies in scene '{row['scene']}',"
+                f" which {settings['scenes']} does not list"
+            )
+    return Project(settings, scenes, objects, _variants(settings["registration"]))
+
+
+def _checked_table(name: str, kind: str) -> dict[str, Row]:
+    path = Path(name) if Path(name).is_file() else ROOT / name
+    if not path.is_file():
+        raise StageError(f"{name} does not exist; write it as config/README.md describes")
+    rows = read_table(path, kind)
+    for number, row in enumerate(rows.values(), 1):
+        wrong = problem(row, schema_of(f"{kind}s"))
+        if wrong:
+            raise StageError(f"{name}, row {number}, {wrong}")
+    return rows
+
+
+def _variants(registration: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
+    chosen = registration["variants"]
+    unknown = next((name for name in chosen if name not in defined), None)
+    if unknown is not None:
+        raise StageError(
+            f"config, registration.variants: unknown variant '{unknown}';"
+            f" workflow/variants.yaml defines: {', '.join(defined)}"
+        )
+    if "full" not in chosen:
+        raise StageError("config, registration.variants: 'full' is missing; it is the one that is fused")
+    return {name: merge(dict(registration), defined[name]) for name in chosen}

@@ -1,0 +1,59 @@
+"""Tables of a user: tab-separated text from an editor or a spreadsheet. Standard library only."""
+
+import codecs
+import csv
+import io
+from pathlib import Path
+
+from scenefuse.stage import StageError
+
+Row = dict[str, str]
+
+
+def read_table(path: Path, key: str) -> dict[str, Row]:
+    """Rows of a tab-separated table by the column `key`; every cell is text, an empty one is ''.
+
+    Lines that begin with # and empty lines are left out.
+
+    Raises:
+        StageError: the file is missing, is no text, has no such column or a column twice, a row has too few or too many
+            cells, or two rows have the same key.
+    """
+    lines = [line for line in io.StringIO(read_text(path), newline=None) if not line.startswith("#")]
+    header, *cells = [row for row in csv.reader(lines, delimiter="\t") if row] or [[]]
+    if key not in header:
+        raise StageError(f"{path} has no column '{key}'; its first line names: {', '.join(header) or 'nothing'}")
+    twice = next((name for name in header if header.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"{path} has two columns '{twice}'; remove one")
+    rows: dict[str, Row] = {}
+    for number, row in enumerate(cells, 1):
+        if len(row) != len(header):
+            raise StageError(
+                f"{path}, row {number}: {len(row)} columns, and the header has {len(header)}; separate them by tabs"
+            )
+        content = dict(zip(header, row))
+        if content[key] in rows:
+            raise StageError(f"{path}: '{content[key]}' stands in two rows; names must differ")
+        rows[content[key]] = content
+    return rows
+
+
+def read_text(path: Path) -> str:
+    """A text file in UTF-8, or in UTF-16 with a byte order mark, as spreadsheets write it.
+
+    Raises:
+        StageError: the file is missing, or has another encoding.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError:
+        raise StageError(f"{path} does not exist or cannot be read; write it, or correct its path") from None
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if b"\0" in content and not marked:
+        raise StageError(f"{path} is not UTF-8 text (it looks like UTF-16); save the file as UTF-8")
+    try:
+        return content.decode("utf-16" if marked else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise StageError(f"{path}, line {line}: not {'UTF-16' if marked else 'UTF-8'} text; save it as UTF-8") from None

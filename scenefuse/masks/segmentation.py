@@ -1,0 +1,131 @@
+"""Masks of all photos of an object by GrabCut or SAM 2, and their agreement with the visual hull of all of them."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
+from scenefuse.masks.sam2 import Sam2, segment
+from scenefuse.masks.sam2_weights import DECODER, ENCODER
+from scenefuse.masks.target import Target
+from scenefuse.mvs.visual_hull import Hull, Mask, carve, mask_iou, silhouette
+from scenefuse.stage import StageError, setting
+from scenefuse.workspace import View, Workspace
+
+HULL_TOLERANCE = 0.1
+"""Share of the photos that may contradict a voxel of the hull: some masks are wrong somewhere."""
+FIRST_TOLERANCE = 2 * HULL_TOLERANCE
+"""The same for the first masks, which are made photo by photo."""
+TRUST_TOLERANCE = 0.34
+"""The same for the hull that tells which masks count for the final one: a third of them may be wrong all over."""
+
+
+@dataclass(frozen=True)
+class MaskSettings:
+    """How masks are made."""
+
+    method: Literal["grabcut", "sam2", "supplied"] = setting("grabcut")
+    """Where masks come from; a folder in the column `masks` of the objects' table goes before."""
+    keep: str = setting("object")
+    """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
+    brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
+    shows nothing of that."""
+    sam2_encoder: str = setting(ENCODER)
+    """For sam2: weights of the encoder (.ort or .onnx). The shipped path is fetched by a rule."""
+    sam2_decoder: str = setting(DECODER)
+    """For sam2: weights of the decoder (.onnx), likewise."""
+    sam2_checkpoint: str | None = setting(None)
+    """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
+    is one (`pip install transformers==5.23.0`); nothing is downloaded."""
+    band_px: float = setting(5, unit="px", least=0)
+    """For grabcut: half width of the band along the hull's outline where a photo's own evidence decides, at a photo
+    width of 640."""
+    min_agreement: float = setting(0.6, least=0, most=1)
+    """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
+    max_click_residual_px: float = setting(4, unit="px", least=0)
+    """Largest reprojection error of a clicked prompt."""
+    min_photos: int = 5
+    """Fewest good masks to go on with."""
+    hull_voxels: int = 96
+    """Voxels of the visual hull along the longest side of the box."""
+    grabcut_width_px: int = 320
+    """The first cut runs on photos at most this wide, in pixels."""
+
+
+@dataclass(frozen=True)
+class ScoredMasks:
+    """Masks and how well they agree, by the name of their photo.
+
+    Attributes:
+        masks: (H, W) each.
+        scores: IoU of each with the outline of the hull, 0..1.
+        dropped: why a photo has no usable mask.
+        hull: of all masks.
+    """
+
+    masks: dict[str, Mask]
+    scores: dict[str, float]
+    dropped: dict[str, str]
+    hull: Hull
+
+
+def segment_by_grabcut(target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
+    """GrabCut photo by photo, then twice more along the visual hull: masks (H, W) of V views with RGB pixels."""
+    masks = first_cuts(target, photos, settings.grabcut_width_px)
+    for tolerance in (FIRST_TOLERANCE, HULL_TOLERANCE):
+        hull = carve_trusted(target, photos.views, masks, settings, tolerance)
+        masks = second_cuts(target, masks, photos, hull, settings.band_px)
+    return masks
+
+
+def segment_by_sam2(network: Sam2, target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
+    """SAM 2 photo by photo, and once more, with the visual hull's box, where a mask disagrees with the hull."""
+    masks = [segment(network, target, view, None) for view in photos.views]
+    hull = carve_trusted(target, photos.views, masks, settings, FIRST_TOLERANCE)
+    for k, view in enumerate(photos.views):
+        outline = silhouette(hull, view)
+        if mask_iou(masks[k], outline) < settings.min_agreement:
+            again = segment(network, target, view, outline)
+            if mask_iou(again, outline) > mask_iou(masks[k], outline):
+                masks[k] = again
+            print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
+    return masks
+
+
+def score_masks(masks: list[Mask], target: Target, views: list[View], settings: MaskSettings) -> ScoredMasks:
+    """The masks of V views with their agreement with their visual hull; empty and contradicting ones are dropped."""
+    hull = carve_trusted(target, views, masks, settings, HULL_TOLERANCE)
+    scores = {view.name: mask_iou(mask, silhouette(hull, view)) for view, mask in zip(views, masks)}
+    dropped = {}
+    for view, mask in zip(views, masks):
+        if not mask.any():
+            dropped[view.name] = "empty mask"
+        elif scores[view.name] < settings.min_agreement:
+            dropped[view.name] = (
+                f"IoU with the visual hull is {scores[view.name]:.2f}, below {settings.min_agreement} (min_agreement)"
+            )
+    return ScoredMasks({view.name: mask for view, mask in zip(views, masks)}, scores, dropped, hull)
+
+
+def carve_trusted(
+    target: Target, views: list[View], masks: list[Mask], settings: MaskSettings, tolerance: float
+) -> Hull:
+    """The visual hull of the masks (H, W) that a tolerant hull of all of them does not contradict.
+
+    Raises:
+        StageError: the masks have nothing in common.
+    """
+    trusted = [replace(view, pixels=mask) for view, mask in zip(views, masks) if mask.any()]
+    hull: Hull | None = None
+    for share in (max(tolerance, TRUST_TOLERANCE), tolerance):
+        if hull is not None:
+            trusted = [v for v in trusted if mask_iou(v.pixels, silhouette(hull, v)) >= settings.min_agreement]
+        if len(trusted) < 2:
+            hull = None
+            break
+        hull = carve(target.box, target.ground.height_of, trusted, settings.hull_voxels, share)
+    if hull is None or len(hull.shell) == 0:
+        raise StageError(
+            "the masks of the photos have no common object; check that the prompts lie on one object and span it, "
+            "or supply masks"
+        )
+    return hull

@@ -1,0 +1,184 @@
+"""The demo's objects compared with the demo's truth; only the evaluation reads the truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.io.clouds import read_cloud
+from scenefuse.io.pictures import read_gray
+from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.registration import sampled
+from scenefuse.metrics.truth import (
+    HIDDEN,
+    Posed,
+    belongs_to_object,
+    camera_results,
+    distances,
+    f_score,
+    mask_iou,
+    nearest,
+    print_results,
+    registration_error,
+)
+from scenefuse.stage import quantity, read_json, setting, value, write_json
+from scenefuse.transforms import Array, Sim3
+
+
+@dataclass(frozen=True)
+class ObjectEvaluationSettings:
+    """Evaluation of an object."""
+
+    samples: int = setting(60000, least=1)
+    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
+    max_photos: int = setting(8, least=1)
+    """Photos whose depth maps are compared, spread evenly."""
+
+
+@dataclass(frozen=True)
+class EvaluationInputs:
+    """What is compared, and the truth."""
+
+    workspace: Path
+    """The object's undistorted COLMAP workspace."""
+    masks: Path
+    """Folder of masks of its photos."""
+    stages: list[Path]
+    """Folders that hold depth_maps/, in order; empty for none."""
+    cloud: Path
+    """The object's cloud in its own frame."""
+    variants: list[Path]
+    """fine.json of every variant, in a folder named for it; `full` first gives the main results."""
+    scene_json: Path
+    """What `evaluate_scene` wrote."""
+    truth_scene: Path
+    """The flight's truth folder."""
+    truth_object: Path
+    """The orbit's truth folder."""
+    alignment_json: Path | None = None
+    """JSON of the alignment from shared features, measured like a variant, or nothing."""
+    before: Path | None = None
+    """Scene cloud before fusion, scene frame; the whole scene or the object's surroundings."""
+    after: Path | None = None
+    """The same after fusion; absent when nothing was fused."""
+
+
+def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settings: ObjectEvaluationSettings) -> None:
+    """Compare an object with its truth: masks, cameras, depth after each stage, cloud, registration, completed scene.
+
+    Definitions. Every length is over the diagonal of the object's true bounding box. The surface to be found is what
+    of the object's true surface any photo of its orbit sees (for the scene's scores: any photo of the orbit or of the
+    flight). `scene_f_score_before` and `_after` compare clouds in the scene's frame; of a cloud, the points count that
+    lie in the object's true box, widened by 5 %, nearer to the object than to the terrain and the clutter. The error of
+    each variant is that of its scene_from_object against the one that follows from the true cameras on both sides.
+
+    Args:
+        inputs: see EvaluationInputs.
+        report: output JSON.
+        seed: of the drawing.
+        settings: see ObjectEvaluationSettings.
+
+    Raises:
+        StageError: a truth file is missing, or knows fewer than three of the model's photos.
+    """
+    known = read_object_truth(inputs.workspace, inputs.truth_scene, inputs.truth_object, settings.samples, seed)
+    truth_from_scene = Sim3.from_matrix(np.array(value(read_json(inputs.scene_json), "truth_from_scene")))
+    points = read_cloud(inputs.cloud).points
+    position = float(np.median(known.fit.position)) / known.diagonal
+    result: dict[str, Any] = {
+        "diagonal": quantity(known.diagonal, "m"),
+        **_mask_results(inputs.masks, known.posed, inputs.truth_object / "masks", known.orbit),
+        **camera_results(known.fit, len(known.orbit.names)),
+        "camera_position_over_diagonal": quantity(position, "1"),
+        **depth_results(inputs.stages, known, settings.max_photos),
+        **cloud_results(known.fit.truth_from_model.apply(points), known, settings.samples, seed),
+    }
+
+    def errors_of(path: Path) -> dict[str, Any]:
+        return _registration_results(read_json(path), known, truth_from_scene, points, settings.samples, seed)
+
+    variants = {path.parent.name: errors_of(path) for path in inputs.variants}
+    result |= next(iter(variants.values()), {})
+    if inputs.alignment_json is not None:
+        errors = errors_of(inputs.alignment_json)
+        result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
+    flight = read_cameras(inputs.truth_scene / "cameras.json")
+    seen = known.seen | visible(known.everything, flight, known.surface, HIDDEN)[1].any(0)
+    for label, path in (("before", inputs.before), ("after", inputs.after)):
+        if path is not None:
+            result |= _scene_results(label, read_cloud(path).points, truth_from_scene, known, known.surface[seen])
+    result |= {"tau": quantity(0.01 * known.diagonal, "m"), "variants": variants}
+    write_json(report, result)
+    print_results(result)
+
+
+def _mask_results(masks: Path, posed: Posed, true_masks: Path, orbit: Cameras) -> dict[str, Any]:
+    """IoU of every mask; the true mask is brought into the undistorted photo by the two pinhole cameras."""
+    scores = {}
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    for view, _ in posed:
+        path = masks / f"{Path(view.name).stem}.png"
+        true = read_gray(true_masks / path.name)
+        if not path.is_file():
+            continue
+        mask = read_gray(path)
+        warp = half @ view.intrinsics @ np.linalg.inv(half @ orbit.intrinsics)
+        warped = cv2.warpPerspective(true, warp, mask.shape[::-1], flags=cv2.INTER_LINEAR)
+        scores[view.name] = mask_iou(mask > 127, warped > 127)
+    ious = list(scores.values())
+    return {
+        "mask_iou_mean": quantity(float(np.mean(ious)) if ious else None, "1"),
+        "mask_iou_min": quantity(min(ious, default=None), "1"),
+        "mask_iou_worst": quantity(min(scores, key=lambda n: scores[n], default=None), ""),
+        "masks_missing": quantity(len(posed) - len(ious), "1"),
+    }
+
+
+def _registration_results(
+    fine: dict[str, Any], known: ObjectTruth, truth_from_scene: Sim3, points: Array, samples: int, seed: int
+) -> dict[str, Any]:
+    """Errors of one registration of the cloud's points (N, 3), own frame; empty values where it holds no transform."""
+    matrix = fine.get("scene_from_object", {}).get("value")
+    result = {"status": quantity(fine.get("status", {}).get("value"), "")}
+    if matrix is None:
+        for key in ("scale_error_pct", "rotation_error_deg", "translation_error_over_diagonal", "object_f_score"):
+            result[key] = quantity(None, "")
+        return result
+    estimated, truth_from_object = Sim3.from_matrix(np.array(matrix)), known.fit.truth_from_model
+    true = truth_from_scene.inverse() @ truth_from_object
+    middle = truth_from_object.inverse().apply(known.middle)
+    error = registration_error(estimated, true, middle, known.diagonal / truth_from_scene.scale)
+    placed = (truth_from_scene @ estimated).apply(points)
+    to_mesh = distances(known.mesh.caster(), sampled(placed, samples, seed))
+    score = f_score(to_mesh, nearest(known.surface[known.seen], placed), 0.01 * known.diagonal)[2]
+    return result | {
+        "scale_error_pct": quantity(error.scale_pct, "%"),
+        "rotation_error_deg": quantity(error.rotation_deg, "deg"),
+        "translation_error_over_diagonal": quantity(error.translation_over_diagonal, "1"),
+        "object_f_score": quantity(score, "1"),
+    }
+
+
+def _scene_results(
+    label: str, points: Array, truth_from_scene: Sim3, known: ObjectTruth, surface: Array
+) -> dict[str, Any]:
+    """F-score, precision and recall of a scene's points around the object, before or after fusion, at 1 % and 2 %."""
+    low, high, margin = surface.min(0), surface.max(0), 0.05 * known.diagonal
+    points = truth_from_scene.apply(points)
+    points = points[((points >= low - margin) & (points <= high + margin)).all(1)]
+    own, other = (
+        distances(mesh.caster(), points) if len(points) else np.empty(0, dtype=np.float32)
+        for mesh in (known.mesh, known.rest)
+    )
+    of_object = belongs_to_object(points, own, other, low, high, margin)
+    to_cloud = nearest(surface, points[of_object])
+    result: dict[str, Any] = {}
+    for share, suffix in ((0.01, ""), (0.02, "_2pct")):
+        precision, recall, score = f_score(own[of_object], to_cloud, share * known.diagonal)
+        result[f"scene_f_score_{label}{suffix}"] = quantity(score, "1")
+        result[f"scene_precision_{label}{suffix}"] = quantity(precision, "1")
+        result[f"scene_recall_{label}{suffix}"] = quantity(recall, "1")
+    return result

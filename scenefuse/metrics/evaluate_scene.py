@@ -1,0 +1,119 @@
+"""The demo's scene compared with the demo's truth; only the evaluation reads the truth."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.io.clouds import read_cloud
+from scenefuse.metrics.registration import sampled
+from scenefuse.metrics.truth import (
+    HIDDEN,
+    Mesh,
+    Posed,
+    camera_results,
+    cast_together,
+    distances,
+    fit_cameras,
+    nearest,
+    print_results,
+    read_mesh,
+    read_posed,
+    sample_surface,
+)
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.stage import quantity, read_json, setting, value, write_json
+from scenefuse.transforms import Array
+
+
+@dataclass(frozen=True)
+class SceneEvaluationSettings:
+    """Evaluation of a scene."""
+
+    samples: int = setting(60000, least=1)
+    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
+
+
+def evaluate_scene(
+    *,
+    model: Path,
+    georeference_json: Path,
+    cloud: Path,
+    truth: Path,
+    report: Path,
+    seed: int,
+    settings: SceneEvaluationSettings,
+) -> None:
+    """Compare a scene of the demo with its truth: cameras, georeferencing, dense cloud.
+
+    The terrain counted for coverage is the surface of terrain and clutter inside the mapped area that at least three
+    photos of the flight see; a sample is covered when the cloud has a point within three ground sampling distances.
+
+    Args:
+        model: georeferenced COLMAP model.
+        georeference_json: its JSON; with an origin in it, the georeferencing itself is measured too.
+        cloud: dense cloud in the model's frame, PLY.
+        truth: the flight's truth folder.
+        report: output JSON; holds `truth_from_scene` (4x4), which the objects' evaluation reads.
+        seed: of the drawing.
+        settings: see SceneEvaluationSettings.
+
+    Raises:
+        StageError: the truth is missing, or knows fewer than three of the model's photos.
+    """
+    cameras = read_cameras(truth / "cameras.json")
+    content = read_json(truth / "cameras.json")
+    meshes = [read_mesh(truth / "meshes" / f"{name}.ply") for name in ["world", *content["objects"]]]
+    posed = read_posed(model, cameras)
+    fit = fit_cameras(posed, cameras)
+    points = fit.truth_from_model.apply(read_cloud(cloud).points)
+    georeference_error = _georeference_error(read_json(georeference_json), content, posed, cameras)
+    result = {
+        **camera_results(fit, len(cameras.names)),
+        "georeference_error_median": quantity(georeference_error, "m"),
+        "georeference_scale_error_pct": quantity(100 * abs(fit.truth_from_model.scale - 1), "%"),
+        **_cloud_results(points, content, meshes, cameras, settings.samples, seed),
+        "truth_from_scene": quantity(fit.truth_from_model.matrix, "m"),
+    }
+    write_json(report, result)
+    print_results(result)
+
+
+def _cloud_results(
+    points: Array, content: dict[str, Any], meshes: list[Mesh], cameras: Cameras, samples: int, seed: int
+) -> dict[str, Any]:
+    """Distance of the cloud (N, 3) in the truth's frame from the surface, and the share of the terrain it covers."""
+    gsd = float(value(content, "ground_sampling_distance"))
+    scene = cast_together(meshes)
+    to_truth = distances(scene, sampled(points, samples, seed))
+    low, high = (np.array(corner) for corner in value(content, "mapped_area"))
+    ground = sample_surface(_within(meshes[0], low, high), samples, seed)
+    seen = visible(scene, cameras, ground, HIDDEN)[1].sum(0) >= 3
+    covered = nearest(ground[seen], points) <= 3 * gsd
+    return {
+        "ground_sampling_distance": quantity(gsd, "m"),
+        "cloud_distance_median": quantity(float(np.median(to_truth)), "m"),
+        "cloud_distance_90": quantity(float(np.quantile(to_truth, 0.9)), "m"),
+        "cloud_distance_median_over_gsd": quantity(float(np.median(to_truth)) / gsd, "1"),
+        "terrain_covered": quantity(float(covered.mean()), "1"),
+    }
+
+
+def _georeference_error(report: dict[str, Any], truth: dict[str, Any], posed: Posed, cameras: Cameras) -> float | None:
+    """Median distance of the georeferenced cameras from the true ones, nothing fitted; None without an origin."""
+    keys = ("origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
+    if not all(key in report and value(report, key) is not None for key in keys):
+        return None
+    true_frame = LocalFrame(*(float(v) for v in value(truth, "origin")))
+    scene_frame = LocalFrame(*(float(value(report, key)) for key in keys))
+    expected = scene_frame.apply(true_frame.inverse(cameras.centres[[true for _, true in posed]]))
+    centres = np.array([view.centre for view, _ in posed])
+    return float(np.median(np.linalg.norm(centres - expected, axis=1)))
+
+
+def _within(mesh: Mesh, low: Array, high: Array) -> Mesh:
+    """The triangles whose middle lies in a rectangle on the ground."""
+    middles = mesh.vertices[mesh.triangles].mean(1)[:, :2]
+    return Mesh(mesh.vertices, mesh.triangles[((middles >= low) & (middles <= high)).all(1)])

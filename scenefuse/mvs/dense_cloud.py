@@ -1,0 +1,188 @@
+"""The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.maps import read_depth
+from scenefuse.io.units import length_unit
+from scenefuse.mvs.colmap_workspace import MAPS, linked_workspace
+from scenefuse.sfm.interrupt import cancellable
+from scenefuse.stage import StageError, quantity, read_json, setting, threads, value, write_json
+from scenefuse.transforms import Array
+
+FEW_FUSED = 0.01
+"""Share of the measured pixels below which the cameras or the limits are probably wrong."""
+MAX_TRAVERSAL_DEPTH = 100
+"""Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
+OUTLIER_NEIGHBOURS = 8
+"""Neighbours whose mean distance tells a point far from all others."""
+OUTLIER_RATIO = 4.0
+"""Such a point is dropped when that distance is more than so many times the cloud's median."""
+
+
+@dataclass(frozen=True)
+class DenseCloudSettings:
+    """How depth maps become one cloud."""
+
+    min_photos: int = setting(3, least=0)
+    """Photos that must agree on a point."""
+    max_reprojection_px: float = setting(2, unit="px", least=0)
+    """Largest distance between a pixel and the point of another photo projected into it."""
+    max_depth_error: float = setting(0.01, least=0)
+    """Largest relative difference of two photos' depths of a point."""
+    max_normal_error_deg: float = setting(90, unit="deg", least=0)
+    """Largest angle between two photos' normals of a point."""
+
+
+def fuse_depth_maps(
+    *,
+    workspace: Path,
+    depth: list[Path],
+    depth_json: list[Path],
+    georeference_json: Path | None = None,
+    settings: DenseCloudSettings,
+    cloud: Path,
+    report: Path,
+) -> None:
+    """Fuse the depth maps of all chunks into one cloud by COLMAP's stereo fusion.
+
+    Args:
+        workspace: the undistorted COLMAP workspace that the maps belong to.
+        depth: the chunks' folders, each with depth_maps/ and normal_maps/. Maps may be smaller than the photos.
+        depth_json: the chunks' reports, in the same order.
+        georeference_json: of the scene, for the unit of its lengths, or nothing.
+        settings: see DenseCloudSettings.
+        cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
+            that agree on the point).
+        report: output JSON: number of points, spacing, backend, what was dropped, the share of the pixels with a depth
+            that are in the cloud, and a note where it is small.
+
+    Raises:
+        StageError: no depth maps, or no point on which enough photos agree.
+    """
+    maps = {
+        path.relative_to(folder / "depth_maps").as_posix()[: -len(".bin")]: folder
+        for folder in depth
+        for path in sorted((folder / "depth_maps").rglob("*.bin"))
+    }
+    if not maps:
+        raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
+    stages = [read_json(path) for path in depth_json]
+    print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
+    fused = _fuse(workspace, maps, settings, cloud)
+    # COLMAP counts pixels, of which one photo may bring several; we count photos.
+    agreed = fused[fused.fields["views"] >= settings.min_photos]
+    if len(agreed) == 0:
+        raise _no_points(settings)
+    kept = agreed[_near_others(agreed.points)]
+    print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
+    measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
+    content = {
+        "points": quantity(len(kept), "1"),
+        "dropped_outliers": quantity(len(agreed) - len(kept), "1"),
+        "spacing": quantity(spacing(kept.points), length_unit(georeference_json)),
+        "median_views": quantity(float(np.median(kept.fields["views"])), "1"),
+        "depth_maps": quantity(len(maps), "1"),
+        **_fused_share(kept, measured),
+        "backend": quantity(_all(stages, "backend"), ""),
+        "device": quantity(_all(stages, "device"), ""),
+        "reason": quantity(value(stages[0], "reason") if stages else "", ""),
+    }
+    write_cloud(cloud, kept)
+    write_json(report, content)
+
+
+def _all(stages: list[dict[str, Any]], name: str) -> str:
+    """A word of all chunks' reports."""
+    return ", ".join(sorted({value(stage, name) for stage in stages}))
+
+
+def _path(folder: Path, part: str, name: str) -> Path:
+    return folder / part / f"{name}.bin"
+
+
+def _fused_share(cloud: Cloud, measured: int) -> dict[str, Any]:
+    """Which share of the measured pixels is in the cloud, and a note where it is small."""
+    share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
+    if share < FEW_FUSED:
+        notes.append(
+            f"only {share:.2%} of the pixels with a depth are in the cloud: the photos' depths disagree; look at"
+            " the cameras, or raise max_depth_error, max_reprojection_px or max_normal_error_deg"
+        )
+        print(f"note: {notes[0]}", flush=True)
+    return {"fused_share": quantity(share, "1"), "notes": quantity(notes, "")}
+
+
+def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSettings, beside: Path) -> Cloud:
+    """COLMAP's fusion as a cloud with `views`.
+
+    Args:
+        workspace: that the maps belong to.
+        maps: photo -> folder that its maps lie below.
+        settings: see DenseCloudSettings.
+        beside: path that COLMAP works beside.
+
+    Raises:
+        StageError: no point at all.
+    """
+    options = pycolmap.StereoFusionOptions()
+    options.num_threads = 1  # With more, which thread comes first decides the points.
+    options.min_num_pixels = settings.min_photos
+    options.max_reproj_error = settings.max_reprojection_px
+    options.max_depth_error = settings.max_depth_error
+    options.max_normal_error = settings.max_normal_error_deg
+    options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
+    widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
+    with linked_workspace(workspace, beside, widths) as folder:
+        for name, source in maps.items():
+            for part in MAPS:
+                link = folder / "stereo" / part / f"{name}.geometric.bin"
+                link.parent.mkdir(parents=True, exist_ok=True)
+                link.symlink_to(_path(source, part, name).resolve())
+        (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
+        path = folder / "fused.ply"
+        fused = cancellable(pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", options, "PLY")
+        if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
+            raise _no_points(settings)
+        cloud, views = read_cloud(path), _read_visibility(path.with_suffix(".ply.vis"))
+    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views})
+
+
+def _no_points(settings: DenseCloudSettings) -> StageError:
+    """The error for maps that do not agree anywhere."""
+    return StageError(
+        f"no point is seen alike by {settings.min_photos} photos; lower min_photos or min_score, or check the cameras"
+    )
+
+
+def _map_width(path: Path) -> int:
+    """Width of a COLMAP map, from its header `width&height&channels&`."""
+    with open(path, "rb") as file:
+        return int(file.read(64).split(b"&")[0])
+
+
+def _read_visibility(path: Path) -> NDArray[np.uint16]:
+    """Photos per point, (N,), from COLMAP's .vis file: uint64 N, then per point uint32 n and n uint32 indices."""
+    words = np.fromfile(path, dtype=np.uint32)
+    count, position = int(words[:2].view(np.uint64)[0]), 2
+    views = np.empty(count, dtype=np.uint16)
+    for k in range(count):
+        views[k] = words[position]
+        position += 1 + int(words[position])
+    return views
+
+
+def _near_others(points: Array) -> NDArray[np.bool_]:
+    """(N,) True where a point's neighbours are about as near as they are for the others."""
+    if len(points) <= OUTLIER_NEIGHBOURS:
+        return np.ones(len(points), dtype=bool)
+    distance = cKDTree(points).query(points, k=OUTLIER_NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+    return distance <= OUTLIER_RATIO * np.median(distance)

@@ -1,0 +1,144 @@
+"""Photo-consistency in PyTorch: how well a depth per pixel of one photo matches the other photos.
+
+Source: Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
+"""
+
+import cv2
+import numpy as np
+import torch
+import torch.nn.functional as F
+from numpy.typing import NDArray
+from torch import Tensor
+
+from scenefuse.mvs.matching_kernel import keep_best as keep_best_on_cpu
+from scenefuse.workspace import View
+
+HIGH_PASS_PX = 12.0
+"""Slower changes of brightness are taken away before matching, so that sums over a window stay small and exact."""
+FLAT = 1.5e-5
+"""One grey level of 255, squared: keeps windows without texture from matching anything."""
+OUTSIDE = -0.5
+"""Score of a hypothesis outside a source photo: worse than a window that does not match."""
+
+
+class Matcher:
+    """Scores inverse-depth hypotheses of one reference photo by the mean NCC of its best sources.
+
+    Attributes:
+        reference: (h, w) float32 the photo, high-passed.
+        mean, variance: (h, w) of its windows.
+        window: their side.
+        best: sources that count.
+    """
+
+    def __init__(
+        self,
+        reference: View,
+        sources: list[View],
+        best_sources: int,
+        window_px: int,
+        device: torch.device | str,
+        high_pass_px: float = HIGH_PASS_PX,
+    ) -> None:
+        """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
+
+        Small photos may keep their slow changes of brightness: `high_pass_px` 0.
+        """
+        height, width = reference.height, reference.width
+        self.window, self.best = window_px, min(best_sources, len(sources))
+        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
+        rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
+        self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
+        self.mean = box(self.reference, self.window)
+        self.variance = (box(self.reference**2, self.window) - self.mean**2).clamp(min=0)
+        self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
+        for source in sources:
+            turn = source.cam_from_world[:3, :3] @ rotation.T
+            move = source.cam_from_world[:3, 3] - turn @ shift
+            # From pixels to grid_sample's -1..1, where 0.5 px is the first pixel's centre.
+            to_grid = np.array([[2 / source.width, 0, -1], [0, 2 / source.height, -1], [0, 0, 1]]) @ source.intrinsics
+            directions = (to_grid @ turn @ rays).reshape(3, height, width)
+            self.sources.append(
+                (
+                    torch.from_numpy(_high_pass(source.pixels, high_pass_px))[None, None].to(device),
+                    torch.from_numpy(directions.astype(np.float32)).to(device),
+                    torch.from_numpy((to_grid @ move).astype(np.float32)).to(device),
+                )
+            )
+
+    def score(self, inverse: Tensor) -> Tensor:
+        """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
+        best = inverse.new_full((self.best, *inverse.shape), OUTSIDE)
+        keep = self._keep_best_on_cpu if inverse.device.type == "cpu" else self.keep_best
+        for source in self.sources:
+            keep(inverse, best, *source)
+        return best.mean(0)
+
+    def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
+        """The same as `keep_best`, by the CPU's kernel."""
+        photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
+        keep_best_on_cpu(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
+
+    def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
+        """Put the scores of one of `sources` among the best (K, D, h, w), the largest first."""
+        score = self._ncc(inverse, gray, directions, move)
+        for k in range(self.best):
+            best[k], score = torch.maximum(best[k], score), torch.minimum(best[k], score)
+
+    def seen_by(self, inverse: Tensor) -> Tensor:
+        """Number (h, w) of source photos in which a hypothesis per pixel (h, w) lies."""
+        return sum(self._place(inverse[None], *source[1:])[1][0].int() for source in self.sources)  # type: ignore[return-value]
+
+    @staticmethod
+    def _place(inverse: Tensor, directions: Tensor, move: Tensor) -> tuple[Tensor, Tensor]:
+        """Where D hypotheses per pixel lie in a source photo, (D, h, w, 2) in -1..1, and whether they do, (D, h, w)."""
+        z = directions[2] + move[2] * inverse
+        scale = 1 / z.clamp(min=1e-6)
+        grid = torch.stack(
+            [(directions[0] + move[0] * inverse) * scale, (directions[1] + move[1] * inverse) * scale], dim=-1
+        )
+        return grid, (z > 1e-6) & (grid.abs().amax(-1) < 1)
+
+    def _ncc(self, inverse: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> Tensor:
+        """NCC of one source, (D, h, w); OUTSIDE where the hypothesis lies outside the source photo."""
+        grid, inside = self._place(inverse, directions, move)
+        count, height, width = inverse.shape
+        grid = grid.reshape(1, count * height, width, 2)
+        warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)
+        warped = warped.reshape(count, height, width)
+        mean = box(warped, self.window)
+        variance = (box(warped * warped, self.window) - mean * mean).clamp(min=0)
+        covariance = box(warped * self.reference, self.window) - mean * self.mean
+        ncc = covariance / torch.sqrt((variance + FLAT) * (self.variance + FLAT))
+        return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE))
+
+    def shift_per_inverse_depth(self, low: float, high: float) -> float:
+        """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
+        shifts = [0.0]
+        for gray, directions, move in self.sources:
+            half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
+            thinned = directions[:, ::8, ::8]
+            ends = []
+            for inverse in (low, high):
+                p = thinned + move[:, None, None] * inverse
+                ends.append(p[:2] / p[2].clamp(min=1e-6))
+            inside = (ends[0].abs().amax(0) < 1) & (ends[1].abs().amax(0) < 1)
+            if inside.any():
+                length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
+                shifts.append(float(length[inside].median()))
+        return max(shifts)
+
+
+def box(values: Tensor, window: int) -> Tensor:
+    """Mean over a window of the last two axes; at the border, over what the padding by zero leaves."""
+    radius = window // 2
+    padded = F.pad(values, (radius + 1, radius, radius + 1, radius))
+    sums = padded.cumsum(-1)
+    sums = (sums[..., window:] - sums[..., :-window]).cumsum(-2)
+    return (sums[..., window:, :] - sums[..., :-window, :]) / window**2
+
+
+def _high_pass(gray: NDArray[np.float32], high_pass_px: float) -> NDArray[np.float32]:
+    """The photo (H, W) without its slow changes of brightness, or with 0 without its mean."""
+    return gray - (cv2.GaussianBlur(gray, (0, 0), high_pass_px) if high_pass_px else gray.mean())

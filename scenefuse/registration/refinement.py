@@ -1,0 +1,186 @@
+"""From coarse poses to one decision: refine, turn, polish, rank, compare with the shared photos, decide."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scenefuse.registration.coarse import Candidate
+from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
+from scenefuse.registration.problem import Problem
+from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
+from scenefuse.registration.surface import Surface, with_grid, with_queries
+from scenefuse.registration.uncertainty import Uncertainty, half_sampling
+from scenefuse.registration.verify import DecidedBy, Decision, FineSettings, decide, turned_copies
+from scenefuse.transforms import Array, Sim3
+
+# Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
+MOST_POINTS = 12000
+QUERY_POINTS = 1200
+POLISH_QUERY_POINTS = 3000
+# Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
+START_FRACTION, END_FRACTION = 0.05, 0.02
+REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
+# Leading poses whose turned copies are tried, copies that are refined, and hypotheses that are polished.
+TURNED, COPIES, POLISHED = 2, 6, 4
+# Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
+COPY_ANGLE_DEG = 25
+# Nearer to its place than a coarse pose, a copy is refined from a smaller pairing distance.
+COPY_START = 0.7
+# A valley that is flat in scale has several ends: the polish is repeated from both sides.
+OFF_SCALE = 1.06
+# The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
+BEYOND_PRIOR = 0.15
+# The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
+ASTRAY = 0.9
+# Halves of the surface that are registered again for the uncertainty.
+RESAMPLINGS = 8
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The refined hypotheses, best first, the decision on the first, and its uncertainty."""
+
+    ranked: list[Hypothesis]
+    decision: Decision
+    uncertainty: Uncertainty | None
+
+
+def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:
+    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12).
+
+    Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
+    polish; ranking by the two-way F-score, the agreement of colours and free space; comparison with the alignment from
+    shared features, which replaces the clouds' pose where they differ; the uncertainty over halves of the surface; the
+    gate.
+
+    Args:
+        problem: the clouds and what is known.
+        candidates: poses scene_from_object, each with its source; one or more.
+        settings: see FineSettings.
+    """
+    work = _prepare(problem, candidates[0][0].scale, settings)
+    refined = work.best_first([work.refine(pose, source, work.wide) for pose, source in candidates])
+    refined = work.best_first([*refined, *work.turned(refined[:TURNED])])
+    polished = work.best_first([work.polish(h) for h in refined[:POLISHED]])
+    both_sides = [work.polish(work.resized(polished[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE)]
+    polished = work.best_first([*polished, *both_sides])
+    ranked, uncertainty, decided_by = work.compared_with_photos(polished)
+    shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
+    decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings)
+    return Outcome(ranked, decision, uncertainty)
+
+
+def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
+    """Thin and index both clouds for poses of about this scale."""
+    diagonal, fraction, seed = problem.scene.diagonal, settings.voxel_fraction, problem.seed
+    obj, scene = problem.surfaces(scale, fraction, MOST_POINTS)
+    cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
+    return _Work(
+        replace(problem, scales=problem.scales.widened(BEYOND_PRIOR)),
+        settings,
+        obj,
+        (
+            with_queries(with_grid(obj, cell / scale, reach / scale), QUERY_POINTS, seed),
+            with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
+        ),
+        (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
+        problem.surfaces(scale, 2 * fraction, MOST_POINTS),
+    )
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Both clouds, prepared once, and the steps of the refinement on them.
+
+    Attributes:
+        problem: with the prior of the scale widened.
+        settings: of the fine registration.
+        obj: the object's surface, thinned.
+        searched: object and scene with few query points and grids of nearest points, for refinement and ranking.
+        scored: the same with more query points and trees, for the polish and the final score.
+        coarser: both at twice the spacing, for the uncertainty.
+    """
+
+    problem: Problem
+    settings: FineSettings
+    obj: Surface
+    searched: tuple[Surface, Surface]
+    scored: tuple[Surface, Surface]
+    coarser: tuple[Surface, Surface]
+
+    @property
+    def centre(self) -> Array:
+        """(3,) centre of the object, in its own frame."""
+        return self.obj.points.mean(0)
+
+    @property
+    def wide(self) -> float:
+        """First pairing distance, scene units."""
+        return START_FRACTION * self.problem.scene.diagonal
+
+    @property
+    def narrow(self) -> float:
+        """Last pairing distance, scene units."""
+        return END_FRACTION * self.problem.scene.diagonal
+
+    def best_first(self, hypotheses: list[Hypothesis], angle_deg: float = SAME_ANGLE_DEG) -> list[Hypothesis]:
+        """Ranked by score, one of each valley."""
+        return best_distinct(hypotheses, self.centre, self.problem.scene.diagonal, len(hypotheses), angle_deg)
+
+    def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
+        """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
+        pose = refine_points(*self.searched, pose, self.problem.scales, (first, self.narrow), REFINE_ROUNDS)
+        return Hypothesis(pose, source, self._score(pose, self.searched))
+
+    def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
+        """The best of the leaders' turned copies, refined."""
+        ups = self.problem.evidence.ups
+        axis, steps = None if ups is None else ups[1], self.settings.turn_steps
+        copies = [pose for h in leaders for pose in turned_copies(h.pose, self.obj, axis, steps)]
+        scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
+        best = [h for h in self.best_first([*leaders, *scored], COPY_ANGLE_DEG) if h.source == "turned"]
+        return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:COPIES]]
+
+    def polish(self, h: Hypothesis) -> Hypothesis:
+        """The hypothesis after the last refinement, by planes and colours."""
+        pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow, POLISH_ROUNDS, COLOR_WEIGHT)
+        after, before = (Hypothesis(p, h.source, self._score(p, self.scored)) for p in (pose, h.pose))
+        return after if after.score.total > ASTRAY * before.score.total else before
+
+    def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
+        """The hypothesis with the object grown about its centre."""
+        fixed = h.pose.apply(self.centre)
+        pose = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
+        return Hypothesis(pose, h.source, self._score(pose, self.scored))
+
+    def uncertainty(self, h: Hypothesis) -> Uncertainty | None:
+        """How far the pose moves when halves of the surface are left out."""
+        surfaces, problem = [self.scored, self.coarser], self.problem
+        return half_sampling(surfaces, h.pose, problem.scales, self.narrow, RESAMPLINGS, problem.seed)
+
+    def compared_with_photos(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None, DecidedBy]:
+        """The ranking after the alignment from shared features, the uncertainty of its first, and what decided.
+
+        Where the alignment differs from the clouds' pose, its own is refined on the clouds. Of the refined pose and the
+        alignment's own the less uncertain one is taken; the worse the clouds score at the alignment's pose, the less
+        uncertain that must be. A refinement that leaves the alignment's valley is dropped.
+        """
+        alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
+        if alignment is None:
+            return ranked, self.uncertainty(ranked[0]), "geometry"
+        agree = alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        if not agree:
+            ranked = [self.polish(self.refine(alignment.pose, "photos", self.narrow)), *ranked]
+        own = self.uncertainty(ranked[0])
+        by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
+        worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
+        strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
+            ranked, own = [by_photos, *ranked], alignment.uncertainty
+        return ranked, own, "both" if agree else "photos"
+
+    def _score(self, pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
+        """How well a pose explains both clouds."""
+        tau = self.settings.score_fraction * self.problem.scene.diagonal
+        return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.evidence.free_space)

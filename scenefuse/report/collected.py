@@ -1,0 +1,152 @@
+"""What a run has left of its scenes and objects; a run may be partial."""
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.report.values import Fields, find, load
+
+# What each step leaves, in the order in which the steps run.
+_OBJECT_FILES = (
+    *("photos.json", "features.db", "matches.json", "sparse.json", "undistorted.json", "masks.json"),
+    *("stage1.json", "stage2.json", "stage3.json", "stage4.json", "object.json"),
+)
+_SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
+_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What a run has left of one object.
+
+    Attributes:
+        name: the object's name.
+        stages: its own stages' quantities, `stage4.psnr` for instance.
+        variants: variant -> quantities of its registration, `fine.scale` for instance.
+        fusion: quantities of the fusion.
+        missing: the first file that should be there and is not, or "".
+        failed: why a job of it failed, when something is missing; "" when nothing failed.
+        failed_variants: variant -> why its own jobs failed.
+    """
+
+    name: str
+    stages: Fields
+    variants: dict[str, Fields]
+    fusion: Fields
+    missing: str
+    failed: str
+    failed_variants: dict[str, str]
+
+
+def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
+    """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
+
+    Args:
+        folder: the scene's results.
+        chunks: jobs that its depth maps are split into.
+    """
+    there, gap = unbroken(folder, (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)), "dense.json"))
+    found = read_fields(folder, [name for name in there if "/" not in name])
+    return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
+
+
+def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = "", scene_gap: str = "") -> Collected:
+    """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
+
+    Args:
+        folder: the object's results.
+        variants: registration variants, the one that is fused first.
+        jobs: where the rules' logs and benchmarks are.
+        scene: name of the scene that the object lies in.
+        scene_gap: the first file that this scene lacks, or "".
+    """
+    there, gap = unbroken(folder, _OBJECT_FILES)
+    stages = read_fields(folder, [*there, *([] if gap else ["alignment.json"])])
+    if find(stages, "stage1.workspace") == "poses":
+        stages |= read_fields(folder, ["poses.json"])
+    who = folder.name
+    if not gap and scene_gap:
+        gap, who = f"{scene_gap} of the scene {scene}", scene
+    if not gap:
+        there, gap = unbroken(folder, ("alignment.json",))
+        stages |= read_fields(folder, there)
+    per_variant, gaps = ({variant: {} for variant in variants}, {}) if gap else _collect_variants(folder, variants)
+    fusion: Fields = {}
+    if "fine.status" in per_variant[variants[0]]:
+        there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
+        fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
+        per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
+    # A variant's own log, else one of the object as a whole.
+    failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}", folder.name) for variant in gaps}
+    gap = next(iter(gaps.values()), gap)
+    if fusion and all("fine.status" in per_variant[variant] for variant in variants):
+        truth = read_fields(folder, ["truth.json"])
+        stages |= {key: item for key, item in truth.items() if not key.startswith("truth.variants.")}
+        _add_truth(per_variant, truth)
+    unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
+    per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
+    failed = why_unfinished(jobs, who) if gap else ""
+    return Collected(folder.name, stages, per_variant, fusion, gap, failed, failed_variants)
+
+
+def _collect_variants(folder: Path, variants: list[str]) -> tuple[dict[str, Fields], dict[str, str]]:
+    """The quantities of each variant's registration, and the first file that each incomplete one lacks."""
+    found: dict[str, Fields] = {}
+    gaps: dict[str, str] = {}
+    for variant in variants:
+        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
+        found[variant] = read_fields(folder / "registration" / variant, there)
+        if lacking:
+            gaps[variant] = f"registration/{variant}/{lacking}"
+    return found, gaps
+
+
+def _add_truth(per_variant: dict[str, Fields], truth: Fields) -> None:
+    """Add each variant's errors against truth to its quantities, as `truth.NAME`."""
+    for variant, fields in per_variant.items():
+        prefix = f"truth.variants.{variant}."
+        fields |= {f"truth.{k.removeprefix(prefix)}": v for k, v in truth.items() if k.startswith(prefix)}
+
+
+def unbroken(folder: Path, names: Sequence[str]) -> tuple[list[str], str]:
+    """The files of a chain before the first that is missing, and that one, or "".
+
+    Snakemake removes what a rule wrote before it runs the rule again: what is behind a gap is from an earlier run.
+    """
+    there = list(itertools.takewhile(lambda name: (folder / name).is_file(), names))
+    return there, names[len(there)] if len(there) < len(names) else ""
+
+
+def read_fields(folder: Path, names: Sequence[str]) -> Fields:
+    """The quantities of the JSONs among some files of a folder, each prefixed by its file's name."""
+    stems = [name.removesuffix(".json") for name in names if name.endswith(".json")]
+    return {f"{stem}.{key}": item for stem in stems for key, item in load(folder / f"{stem}.json").items()}
+
+
+def _in_unit(fields: Fields, unit: str) -> Fields:
+    """The quantities with the scene's own unit of length where a stage knows it as "scene units" only."""
+    return {k: {**item, "unit": item["unit"].replace("scene units", unit)} for k, item in fields.items()}
+
+
+def status_of(item: Collected, variant: str) -> str:
+    """registered, unregistered, ungated (a pose that nothing checked), failed (an error), or missing (did not run)."""
+    decided = find(item.variants.get(variant, {}), "fine.status")
+    return str(decided) if decided else "failed" if _failure(item, variant) else "missing"
+
+
+def reason_of(item: Collected, variant: str) -> str | None:
+    """Why an object is not registered in a variant."""
+    if find(item.variants.get(variant, {}), "fine.status"):
+        return find(item.variants[variant], "fine.reason") or None
+    return why_missing(_failure(item, variant))
+
+
+def why_missing(failed: str) -> str:
+    """Why something is missing, for the reader: the failure, or that nothing of it ran."""
+    return failed or "no error in its logs; it has not run yet"
+
+
+def _failure(item: Collected, variant: str) -> str:
+    return item.failed_variants.get(variant, item.failed)

@@ -1,0 +1,239 @@
+"""summary.txt: a block per scene and object, then time and memory, within WIDTH columns."""
+
+import re
+import textwrap
+from typing import Any
+
+import pandas as pd
+
+from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
+from scenefuse.report.tables import REGISTRATION, completion_table, number_in, plain, records, truth_numbers
+from scenefuse.report.values import Fields, find, number, unit_of
+
+WIDTH = 100
+_COLUMNS = ("value", "null", "scene")
+_NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
+_TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
+_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "workspace", "kept", "kernels")
+
+
+def summary_text(
+    scenes: dict[str, Fields], objects: list[Collected], variants: list[str], tables: dict[str, pd.DataFrame]
+) -> str:
+    """The text, from the quantities of the scenes and objects and from their tables."""
+    lines: list[str] = []
+    for name, row in zip(scenes, records(tables["scenes"])):
+        lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
+    statuses = [status_of(item, variants[0]) for item in objects]
+    done = f"{statuses.count('registered')} of {len(objects)} objects registered and fused"
+    done += f", {statuses.count('ungated')} fused without a check of the pose" if "ungated" in statuses else ""
+    for item, row in zip(objects, records(tables["objects"])):
+        lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
+    lines += _heading(done) + _runtime_lines(tables["runtime"])
+    return "\n".join(lines) + "\n"
+
+
+def _heading(text: str) -> list[str]:
+    return ["", text, "-" * min(len(text), WIDTH)]
+
+
+def _line(label: str, text: str) -> list[str]:
+    """`label   text`, wrapped, continuation lines indented."""
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{label:<14}", subsequent_indent=" " * 14) if text else []
+
+
+def _pairs(cells: list[tuple[str, Any, str]]) -> str:
+    """`name value unit, ...` of the values that exist."""
+    return ", ".join(f"{n} {number(v)}{f' {u}' if u else ''}" for n, v, u in cells if number(v) not in ("-", "nan"))
+
+
+def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
+    unit = find(fields, "georeference.length_unit") or "scene units"
+    if find(fields, "dense.points") is None:
+        return _line("missing", f"no dense cloud: {row['error']}")
+    lines = _line("cameras", _cameras(row, "photos"))
+    frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
+    lines += _line("frame", _pairs(frame))
+    lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
+    return lines + _completed_lines(fields) + _truth_lines(fields) + _remarks(fields)
+
+
+def _cameras(row: dict[str, Any], pictures: str) -> str:
+    """How many photos or frames are registered, and how well."""
+    error = _pairs([("reprojection error", row["reprojection_error_px"], "px")])
+    return f"{number(row['registered'])} of {number(row[pictures])} {pictures} registered" + (error and f", {error}")
+
+
+def _completed_lines(fields: Fields) -> list[str]:
+    """The scene with all its objects: what was added and what is not in it."""
+    added = find(fields, "completed.added_points")
+    if added is None:
+        why = "not written with all decisions; look at the log of complete_scene, or run with --keep-going"
+        return _line("completed", why)
+    parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
+    parts += [f"{name} adds {count}" for name, count in added.items()]
+    parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
+    parts += [f"without {name}, which failed" for name in find(fields, "completed.failed") or {}]
+    return _line("completed", ", ".join(parts))
+
+
+def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> list[str]:
+    lines = _line("missing", item.missing) + _line("because", why_missing(item.failed) if item.missing else "")
+    fields = item.variants[variants[0]]
+    if find(fields, "fine.status"):
+        lines += _line("reason", str(reason_of(item, variants[0]) or ""))
+    if row["registered"] is not None and row["registered"] == row["registered"]:
+        lines += _line("cameras", _cameras(row, "frames"))
+    lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
+    for stage in (1, 2, 3, 4):
+        names = {
+            "psnr_db": ("PSNR", f"dB on {row.get(f'stage{stage}_measured_on') or 'photos'}"),
+            "ssim": ("SSIM", ""),
+            "depth_error_over_diagonal": ("median depth error", "of the diagonal"),
+            "depth_within_1pct": ("within 1 %", ""),
+        }
+        cells = [(label, row.get(f"stage{stage}_{key}"), unit) for key, (label, unit) in names.items()]
+        lines += _line(f"stage {stage}", _pairs(cells))
+    cloud = [("points", row["points"], ""), ("median distance", row["accuracy_pct_of_diagonal"], "% of the diagonal")]
+    cloud += [(k.replace("_", "-"), row[f"{k}_1pct"], "at 1 %") for k in ("precision", "completeness", "f_score")]
+    lines += (
+        _line("cloud", _pairs(cloud)) + _line("alignment", _alignment(item.stages)) + _variant_lines(item, variants)
+    )
+    lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
+    lines += _around_line(item.stages) + _completion_lines(item, variants[0])
+    return lines + _remarks(item.stages | fields | item.fusion)
+
+
+_DECIDED = {
+    "geometry": "by the clouds alone: no photos link object and scene",
+    "both": "clouds and shared photos agree",
+    "photos": "by shared photos, against the clouds",
+}
+
+
+def _alignment(fields: Fields) -> str:
+    """Where the features that the photos share put the object."""
+    found, reason = find(fields, "alignment.found"), find(fields, "alignment.reason")
+    if not found:
+        return "" if found is None else f"not found: {reason}"
+    deviation = 100 * find(fields, "alignment.scale_sd_log")
+    return f"scale {number(find(fields, 'alignment.scale'))} (standard deviation {number(deviation)} %), {reason}"
+
+
+def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
+    """One line a variant; errors against truth only where it is known."""
+    shown = {
+        "scale": "scale",
+        "f_score": "F-score",
+        "fitness_source": "fit src",
+        "fitness_target": "fit tgt",
+        "inlier_rmse_over_diagonal": "rmse/dg",
+        "normal_consistency_cross": "normals",
+        "margin": "margin",
+        "scale_error_pct": "d scl %",
+        "rotation_error_deg": "d rot °",
+        "translation_error_over_diagonal": "d t/dg",
+    }
+    rows = {
+        variant: {k: number_in(item.variants.get(variant, {}), *REGISTRATION[k]) for k in shown} for variant in variants
+    }
+    used = [k for k in shown if any(row[k] is not None for row in rows.values())]
+    if not used:
+        return []
+    words = {"registered": "ok", "unregistered": "refused"}
+    lines = [f"{'registration':<20}" + "".join(f"{shown[k]:>8}" for k in used)]
+    for variant, row in rows.items():
+        status = status_of(item, variant)
+        lines.append(
+            f"  {variant[:10]:<10}{words.get(status, status):>8}" + "".join(f"{_three(row[k]):>8}" for k in used)
+        )
+    rmse = number_in(item.variants[variants[0]], *REGISTRATION["inlier_rmse"])
+    if rmse is not None:
+        cells_of = [(k.replace("_", " "), k) for k in ("inlier_rmse", "threshold")]
+        found = item.variants[variants[0]]
+        units = [(n, number_in(found, *REGISTRATION[k]), _short(unit_of(found, *REGISTRATION[k]))) for n, k in cells_of]
+        lines += _line("", f"{variants[0]}: {_pairs(units)}")
+    decided = find(item.variants[variants[0]], "fine.decided_by")
+    if decided is not None:
+        lines += _line("pose", _DECIDED.get(decided, decided) + _spread(item.variants[variants[0]]))
+    return [line.rstrip() for line in lines]
+
+
+def _spread(found: Fields) -> str:
+    """Standard deviations of the pose, where they are known."""
+    scale, turn, shift = (number_in(found, f"fine.{k}") for k in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))
+    if scale is None or turn is None or shift is None:
+        return ""
+    unit = _short(unit_of(found, "fine.translation_sd"))
+    return f"; one sd {_three(100 * scale)} % of scale, {_three(turn)} degrees, {_three(shift)} {unit}"
+
+
+def _three(item: float | int | None) -> str:
+    """Three significant digits, two of a very small number: at most seven characters; or '-'."""
+    return "-" if item is None else f"{item:.1e}" if 0 < abs(item) < 1e-4 else f"{item:.3g}"
+
+
+def _around_line(fields: Fields) -> list[str]:
+    """The scene's scores around the object before and after fusion, where truth is known."""
+    parts = []
+    for label, name in (("F-score", "f_score"), ("precision", "precision"), ("recall", "recall")):
+        before, after = (number_in(fields, f"truth.scene_{name}_{when}") for when in ("before", "after"))
+        if before is not None:
+            parts.append(f"{label} {_three(before)} -> {_three(after)}")
+    return _line("scene, truth", f"around the object, at 1 % of its diagonal: {', '.join(parts)}" if parts else "")
+
+
+def _completion_lines(item: Collected, variant: str) -> list[str]:
+    table = records(completion_table([item], variant))
+    rows = [r for r in table if isinstance(r["value"], (int, float)) and not r["measure"].startswith("scene_")]
+    if not rows:
+        return []
+    lines = [f"{'completion':<14}{'':<34}{'value':>10}{'null':>10}{'scene':>10}"]
+    for row in rows:
+        lines.append(f"{'':<14}{row['measure'][:33]:<34}" + "".join(f"{_cell(row[k]):>10}" for k in _COLUMNS))
+    return [line.rstrip() for line in lines]
+
+
+def _cell(item: Any) -> str:
+    return _three(item) if isinstance(item, (int, float)) and item == item else "-"
+
+
+def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
+    return [(label, find(fusion, f"fusion.{key}"), "") for label, key in (("points added", "added_points"),)]
+
+
+def _short(unit: str | None) -> str:
+    """The unit as printed behind a number: nothing for pure numbers."""
+    return "" if unit in (None, "1", "") else str(unit)
+
+
+def _truth_lines(fields: Fields) -> list[str]:
+    cells = [
+        (key.removeprefix("truth.").replace("_", " "), item["value"], _short(item["unit"]))
+        for key, item in truth_numbers(fields).items()
+    ]
+    return _line("truth", _pairs(cells))
+
+
+def _remarks(fields: Fields) -> list[str]:
+    """What was chosen, and every fallback, warning and note that a stage recorded."""
+    chosen = {k: i["value"] for k, i in fields.items() if k.rsplit(".", 1)[-1] in _CHOICES and k.count(".") == 1}
+    lines = _line("chosen", "; ".join(f"{k} {number(plain(v))}" for k, v in chosen.items() if v not in (None, "")))
+    for key, item in fields.items():
+        if _NOTES.search(key) and key not in _TOLD and item["value"] not in (None, "", [], {}, False):
+            lines += _line("note", f"{key}: {plain(item['value'])}")
+    return lines
+
+
+def _memory(megabytes: float) -> str:
+    return f"{megabytes:.0f}" if megabytes == megabytes else "-"
+
+
+def _runtime_lines(runtime: pd.DataFrame) -> list[str]:
+    lines = [f"{'rule':<28}{'jobs':>6}{'seconds':>11}{'longest':>11}{'memory MB':>12}"]
+    for row in records(runtime):
+        lines.append(
+            f"{str(row['rule'])[:27]:<28}{row['jobs']:>6.0f}{row['seconds']:>11.1f}"
+            f"{row['longest_seconds']:>11.1f}{_memory(row['max_rss_mb']):>12}"
+        )
+    return lines if len(runtime) > 1 else ["no benchmark files yet"]

@@ -1,0 +1,57 @@
+"""Which files of a folder are photos. Standard library only: the workflow lists them whenever it is read."""
+
+import os
+from pathlib import Path
+
+from scenefuse.stage import StageError
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
+# Photos all the same, but in formats that not every stage can decode.
+UNREADABLE = frozenset(
+    (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")
+)
+UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
+
+
+def photo_files(folder: Path) -> list[Path]:
+    """The photos below a folder, symlinked folders included, sorted by their names relative to it.
+
+    Hidden files and folders and files that are no photos are left out; so are raw files and HEIC where the same photo
+    lies beside them in a readable format.
+
+    Raises:
+        StageError: the folder is missing or holds no photo, or a photo has a format that cannot be read.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise StageError(f"the photo folder {folder} does not exist; check its path in the configuration")
+    files = _files_below(folder)
+    photos = [file for file in files if file.suffix.lower() in SUFFIXES]
+    readable = {file.with_suffix("") for file in photos}
+    unreadable = [f for f in files if f.suffix.lower() in UNREADABLE and f.with_suffix("") not in readable]
+    if unreadable:
+        more = f" and {len(unreadable) - 1} other files" if len(unreadable) > 1 else ""
+        raise StageError(
+            f"{unreadable[0]}{more} cannot be read: {unreadable[0].suffix} is not supported; convert to JPEG with the"
+            " EXIF data kept, or take them out of the folder"
+        )
+    if not photos:
+        raise StageError(
+            f"the photo folder {folder} holds no photos; put JPEG, PNG, TIFF or BMP files there"
+            f" ({len(files)} other files were found)"
+        )
+    return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def _files_below(folder: Path) -> list[Path]:
+    """All files that are not hidden; a link to a folder that was already entered is not followed again."""
+    files, entered = [], set()
+    for place, folders, names in os.walk(folder, followlinks=True):
+        real = os.path.realpath(place)
+        if real in entered:
+            folders.clear()
+            continue
+        entered.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        files += [Path(place, name) for name in names if not name.startswith(".")]
+    return [file for file in files if file.is_file()]

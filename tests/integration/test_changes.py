@@ -1,0 +1,77 @@
+"""What a change of a user's own files reruns. The jobs are not run: their outputs are there, and taken for results."""
+
+import os
+import shutil
+
+import pytest
+from conftest import Project, planned
+
+CROP, MASKS = "results/objects/shed/registration/full/crop.json", "results/objects/shed/masks.json"
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory, snakemake):
+    """A project in which all jobs up to the masks and the crop of an object count as done."""
+    project = Project(tmp_path_factory.mktemp("finished"))
+    project.config |= {"scene": {"chunks": 1}, "registration": {"variants": ["full"]}}
+    project.photos("flight")
+    project.photos("close")
+    for name in ("clicks.tsv", "prompts.tsv"):
+        (project.path / name).write_text("new")
+    config = project.write()
+    listed = snakemake(project.path, "--summary", CROP, MASKS, config=config).stdout
+    for name in [line.split("\t")[0] for line in listed.splitlines() if line.startswith("results/")]:
+        path = project.path / name
+        (path.parent if path.suffix else path).mkdir(parents=True, exist_ok=True)
+        if path.suffix:
+            path.write_text("{}")
+    done = snakemake(project.path, "--touch", "--forceall", CROP, MASKS, config=config)
+    assert done.returncode == 0, done.stdout
+    return project.path
+
+
+@pytest.fixture
+def plan(finished, tmp_path, snakemake):
+    """What a run of a copy would do, after the change that `edit` makes in the copy."""
+
+    def run(edit, place="copy") -> set[str]:
+        shutil.copytree(finished, tmp_path / place)
+        edit(tmp_path / place)
+        done = snakemake(tmp_path / place, "--dry-run", CROP, MASKS, config=tmp_path / place / "mine.yaml")
+        assert done.returncode == 0, done.stdout
+        return planned(done.stdout)
+
+    return run
+
+
+def replace(name: str):
+    """An edit that puts another file in the place of one, with an older date as `cp -p`, rsync and unzip do."""
+
+    def edit(path):
+        (path / name).write_bytes(b"other")
+        os.utime(path / name, (1_000_000_000, 1_000_000_000))
+
+    return edit
+
+
+def test_neither_another_place_nor_a_file_that_is_no_photo_reruns_anything(plan):
+    def edit(path):
+        (path / "flight/.DS_Store").write_bytes(b"desktop")
+        (path / "close/notes.txt").write_text("sunny")
+
+    assert plan(edit, place="much/deeper/than/before") == set()
+
+
+def test_a_photo_replaced_by_an_older_one_reruns_what_reads_it(plan):
+    rules = plan(replace("flight/1.jpg"))
+    assert {"list_photos", "extract_scene_features", "map_scene_photos", "undistort_scene_photos"} <= rules
+    assert not {"extract_frames", "make_masks"} & rules
+
+
+def test_an_older_photo_of_the_object_reruns_its_frames(plan):
+    assert "extract_frames" in plan(replace("close/1.jpg"))
+
+
+@pytest.mark.parametrize("name, rule", [("prompts.tsv", "make_masks"), ("clicks.tsv", "crop_scene")])
+def test_older_clicks_rerun_what_reads_them_and_nothing_else(plan, name, rule):
+    assert plan(replace(name)) == {rule}

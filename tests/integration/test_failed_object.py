@@ -1,0 +1,114 @@
+"""One object fails: the others are completed and shown without it, and the next run takes it in once it is mended.
+
+Only the last stages run; what comes before them is written by hand.
+"""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pandas as pd
+import pycolmap
+import pytest
+import yaml
+
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.stage import quantity, write_json
+
+GATHERED = ("completed.", "scene.png", "summary/")
+STATUS = {
+    "status": quantity("registered", ""),
+    "reason": quantity("", ""),
+    "scene_from_object": quantity(np.eye(4), ""),
+}
+
+
+def sheet(low, high):
+    """A flat grid of 0.1, x from low to high, y from 0 to 2."""
+    x, y = np.meshgrid(np.arange(low, high, 0.1), np.arange(0, 2, 0.1))
+    return Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+
+
+def one_camera(folder: Path) -> None:
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
+    )
+    above = pycolmap.Rigid3d(pycolmap.Rotation3d(np.diag([1.0, -1, -1])), np.array([0.0, 0, 20]))
+    model.add_image_with_trivial_frame(pycolmap.Image(name="0.jpg", camera_id=1, image_id=1), above)
+    model.write(folder)
+
+
+def write_stages(folder: Path, files: list[str], date: float) -> None:
+    """Outputs of the stages before the last ones: real where these read them, else empty."""
+    content = {"fine.json": STATUS, "dense.json": {"points": quantity(1000, "points")}}
+    for path in (folder / file for file in files):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.suffix == ".ply":
+            write_cloud(path, sheet(5, 7) if path.name == "object.ply" else sheet(0, 5))
+        elif path.suffix:
+            write_json(path, content.get(path.name, {}))
+        else:
+            path.mkdir(exist_ok=True)
+        if path.name == "georeferenced":
+            one_camera(path)
+        os.utime(path, (date, date))
+
+
+@pytest.fixture
+def project(tmp_path, snakemake):
+    """A scene with a shed that is done up to its fusion, and a barn with a broken photo; call it to run Snakemake."""
+    for name in ("flight", "shed", "barn"):
+        (tmp_path / name).mkdir()
+        for index in range(3):
+            noise = np.random.default_rng(index).integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            cv2.imwrite(str(tmp_path / name / f"{index}.jpg"), noise)
+            os.utime(tmp_path / name / f"{index}.jpg", (1e9, 1e9))
+    (tmp_path / "barn/2.jpg").write_bytes(b"\xff\xd8\xff\xe0 broken")
+    (tmp_path / "scenes.tsv").write_text("scene\tphotos\nyard\tflight\n")
+    rows = [f"{name}\tyard\t{name}\tclicks.tsv\tprompts.tsv" for name in ("shed", "barn")]
+    (tmp_path / "objects.tsv").write_text("\n".join(["object\tscene\tphotos\tfiducials\tprompts", *rows]) + "\n")
+    for name in ("clicks.tsv", "prompts.tsv"):
+        (tmp_path / name).write_text("")
+        os.utime(tmp_path / name, (1e9, 1e9))
+    config = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": {"variants": ["full"]}}
+    (tmp_path / "mine.yaml").write_text(yaml.safe_dump(config))
+
+    def run(*words):
+        return snakemake(tmp_path, *words, config=tmp_path / "mine.yaml")
+
+    listed = [line.split("\t")[0] for line in run("--summary").stdout.splitlines()]
+    run.files = [f for f in listed if f.startswith("results/") and not any(part in f for part in GATHERED)]
+    done = [f for f in run.files if "/barn/" not in f or "/crop." in f]
+    write_stages(tmp_path, done, 1.1e9)
+    return run
+
+
+def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(project, tmp_path):
+    failed = project("--keep-going")
+    assert failed.returncode != 0
+    scene, summary = tmp_path / "results/scenes/yard", tmp_path / "results/summary"
+    report = json.loads((scene / "completed.json").read_text())
+    assert list(report["added_points"]["value"]) == ["shed"] and "2.jpg" in report["failed"]["value"]["barn"]
+    assert set(read_cloud(scene / "completed.ply").fields["source"]) == {0, 1}
+    assert (scene / "completed.laz").stat().st_size > 0 and (scene / "scene.png").stat().st_size > 0
+    table = pd.read_csv(summary / "registration.tsv", sep="\t").set_index("object")
+    assert table["status"].to_dict() == {"shed": "registered", "barn": "failed"} and "2.jpg" in table["reason"]["barn"]
+    text = " ".join((summary / "summary.txt").read_text().split())
+    assert "shed adds" in text and "without barn, which failed" in text and "object barn: failed" in text
+    page = (summary / "report.html").read_text()
+    assert '>barn<span class="badge no">failed<' in page and "2.jpg" in page
+
+    # As if the barn's stages had run after its photo was mended.
+    shutil.copy(tmp_path / "barn/1.jpg", tmp_path / "barn/2.jpg")
+    os.utime(tmp_path / "barn/2.jpg", (1e9, 1e9))
+    write_stages(tmp_path, [f for f in project.files if "/barn/" in f and "/crop." not in f], 1.2e9)
+    mended = project()
+    assert mended.returncode == 0, mended.stdout[-3000:]
+    report = json.loads((scene / "completed.json").read_text())
+    assert list(report["added_points"]["value"]) == ["shed", "barn"] and report["failed"]["value"] == {}
+    assert "2 of 2 objects registered" in (summary / "summary.txt").read_text()
+    assert "Nothing to be done" in project("-n").stdout

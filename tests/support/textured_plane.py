@@ -1,0 +1,47 @@
+"""A slanted, textured square photographed along an arc, with its true depths."""
+
+import math
+
+import numpy as np
+
+from scenefuse.mvs.views import Views
+
+
+def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    red = np.sin(5.1 * x + 1.3 * y) + np.sin(11.0 * x - 7.0 * y)
+    green = np.sin(4.3 * y - 2.0 * x) + np.sin(9.0 * y + 8.0 * x)
+    blue = np.sin(6.0 * x * 1.1 + 3.7 * y + 1.0) + np.sin(13.0 * y)
+    return (127.5 + 55.0 * np.stack([red, green, blue], -1)).astype(np.uint8)
+
+
+def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int = 1) -> tuple[Views, np.ndarray]:
+    """A slanted textured square, z = 3 + 0.3 x in the object frame, seen by cameras along an arc; with true depths."""
+    focal = 0.9 * width
+    intrinsics = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    v, u = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
+    rays = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-0.9, 0.9, (150, 2))
+    sparse = np.column_stack([xy, 3.0 + 0.3 * xy[:, 0]])
+    images, masks, poses, depths, tracks = [], [], [], [], []
+    for angle in np.linspace(-0.4, 0.4, count):
+        rotation = np.array([[math.cos(angle), 0, -math.sin(angle)], [0, 1, 0], [math.sin(angle), 0, math.cos(angle)]])
+        centre = np.array([0, 0, 3.0]) - 3.0 * rotation[:, 2]
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = rotation, centre
+        directions = rays @ rotation.T
+        depth = (3.0 + 0.3 * centre[0] - centre[2]) / (directions[..., 2] - 0.3 * directions[..., 0])
+        points = centre + directions * depth[..., None]
+        mask = (np.abs(points[..., 0]) < 1) & (np.abs(points[..., 1]) < 1)
+        images.append(np.where(mask[..., None], _texture(points[..., 0], points[..., 1]), 90).astype(np.uint8))
+        masks.append(mask)
+        poses.append(pose)
+        depths.append(np.where(mask, depth, 0.0))
+        tracks.append(np.arange(150))
+    held = np.zeros(count, bool)
+    held[count // 2 : count // 2 + held_out] = True
+    names = [f"{i:03d}.jpg" for i in range(count)]
+    k = np.repeat(intrinsics[None], count, 0)
+    mattes = np.stack(masks).astype(np.uint8) * 255
+    views = Views(names, np.stack(images), mattes, k, np.stack(poses), held, sparse, tracks)
+    return views, np.stack(depths)

@@ -1,0 +1,106 @@
+"""The documents name only what exists: links, headings, paths and commands."""
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from scenefuse.io.settings import problem
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "config").rglob("*.md")])
+PARTS = ("scenefuse", "scripts", "workflow", "tests", "docs", "config", "envs", "profiles")
+FILES = ("ply", "laz", "json", "tsv", "png", "smk")
+# What changed names the old along with the new.
+CURRENT = [page for page in PAGES if page.name != "CHANGELOG.md"]
+
+
+def names(pages):
+    return pytest.mark.parametrize("page", pages, ids=lambda page: str(page.relative_to(ROOT)))
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives a page's headings."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(), re.MULTILINE)
+    plain = [re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings]
+    return {heading.strip().replace(" ", "-") for heading in plain}
+
+
+def missing_links(page: Path) -> list[str]:
+    """Relative links of a page whose file or heading does not exist."""
+    missing = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path) if path else page
+        if "://" not in link and (not target.exists() or (anchor and anchor not in anchors(target))):
+            missing.append(link)
+    return missing
+
+
+def missing_paths(text: str) -> list[str]:
+    """Paths in backticks that begin with a folder of the repository and do not exist; a name in capitals is a blank."""
+    quoted = re.findall(rf"`((?:{'|'.join(PARTS)})/[\w./-]*)`", text)
+    return [path for path in quoted if not (ROOT / path).exists() and not re.search(r"/[A-Z]+(/|\.py$)", path)]
+
+
+def missing_scripts(text: str) -> list[str]:
+    """Scripts in commands, `python FILE.py`, that do not exist."""
+    called = re.findall(r"python3?\s+((?:scripts|tests|workflow)/[\w./-]+\.py)", text)
+    return [path for path in called if not (ROOT / path).is_file()]
+
+
+def missing_settings(text: str) -> list[str]:
+    """Files after --configfile and --config that the repository should hold and does not."""
+    files = re.findall(r"--config(?:file)?\s+((?:config|tests)/[\w./-]+)", text)
+    return [path for path in files if not (ROOT / path).is_file()]
+
+
+def missing_keys(text: str) -> list[str]:
+    """Settings in backticks, `object.nerf.width_px` or `object: { nerf: { width_px: 400 } }`, that the schema lacks."""
+    schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+    sections = "|".join(key for key, part in schema["properties"].items() if "properties" in part)
+    missing = []
+    for key in re.findall(rf"`((?:{sections})(?:\.\w+)+)`", text):
+        part = schema
+        for name in key.split("."):
+            part = part.get("properties", {}).get(name, {})
+        if not part and key.rpartition(".")[2] not in FILES:
+            missing.append(key)
+    written = re.findall(rf"`((?:{sections}): \{{[^`]*)`", text)
+    return missing + [settings for settings in written if problem(yaml.safe_load(settings), schema)]
+
+
+@names(PAGES)
+def test_links_lead_somewhere(page):
+    assert missing_links(page) == []
+
+
+@names(CURRENT)
+def test_paths_exist(page):
+    assert missing_paths(page.read_text()) == []
+
+
+@names(PAGES)
+def test_commands_name_existing_scripts_and_settings(page):
+    text = page.read_text()
+    assert missing_scripts(text) + missing_settings(text) == []
+
+
+@names(CURRENT)
+def test_settings_exist(page):
+    assert missing_keys(page.read_text()) == []
+
+
+def test_what_is_gone_is_noticed(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text("# One thing\n[a](gone.md) [b](#one-thing) [c](#two-things) [d](https://example.org/x)\n")
+    assert missing_links(page) == ["gone.md", "#two-things"]
+    text = "`scenefuse/gone.py`, `scenefuse/stage.py`, `results/x`; python scripts/gone.py --config config/gone.yaml"
+    assert missing_paths(text) == ["scenefuse/gone.py"]
+    assert missing_scripts(text) == ["scripts/gone.py"]
+    assert missing_settings(text) == ["config/gone.yaml"]
+    text = (
+        "`object.masks.gone`, `object.masks.keep`, `object.ply`, `object: { gone: 1 }`, `object: { hold_out_every: 8 }`"
+    )
+    assert missing_keys(text) == ["object.masks.gone", "object: { gone: 1 }"]

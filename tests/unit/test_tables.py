@@ -1,0 +1,119 @@
+"""A user's tables and settings: read as people write them, or refused in one sentence."""
+
+import codecs
+
+import pytest
+
+from scenefuse.io.project import read_project
+from scenefuse.io.tables import read_table, read_text
+from scenefuse.stage import StageError
+
+
+@pytest.fixture
+def table(tmp_path):
+    def write(text: str, encoding: str = "utf-8"):
+        path = tmp_path / "objects.tsv"
+        path.write_bytes(text.encode(encoding))
+        return path
+
+    return write
+
+
+def test_rows_go_by_the_named_column_wherever_it_stands(table):
+    rows = read_table(table("scene\tobject\tphotos\nyard\tshed\tclose\n"), "object")
+    assert rows == {"shed": {"scene": "yard", "object": "shed", "photos": "close"}}
+
+
+def test_comments_empty_lines_and_line_ends_of_all_systems_do_no_harm(table):
+    for end in ("\n", "\r\n", "\r"):
+        lines = ["# mine", "object\tphotos", "", "# one", "shed\tclose", ""]
+        assert list(read_table(table(end.join(lines)), "object").values()) == [{"object": "shed", "photos": "close"}]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_unicode_with_and_without_a_mark_is_read(table, encoding):
+    path = table("object\tphotos\nshed\tGärten\n", encoding)
+    assert read_table(path, "object")["shed"]["photos"] == "Gärten"
+
+
+def test_big_endian_unicode_is_read(tmp_path):
+    (tmp_path / "a.tsv").write_bytes(codecs.BOM_UTF16_BE + "object\nshed\n".encode("utf-16-be"))
+    assert list(read_table(tmp_path / "a.tsv", "object")) == ["shed"]
+
+
+@pytest.mark.parametrize(
+    "encoding, sentence",
+    [("latin-1", r"objects\.tsv, line 2: not UTF-8 text; save it as UTF-8"), ("utf-16-le", "looks like UTF-16")],
+)
+def test_another_encoding_is_named_with_its_file(table, encoding, sentence):
+    with pytest.raises(StageError, match=sentence):
+        read_text(table("object\tphotos\nshed\tGärten\n", encoding))
+
+
+@pytest.mark.parametrize(
+    "text, sentence",
+    [
+        ("scene\tphotos\nyard\tclose\n", "has no column 'object'; its first line names: scene, photos"),
+        ("", "has no column 'object'; its first line names: nothing"),
+        ("object\tobject\nshed\tshed\n", "two columns 'object'"),
+        ("object\tphotos\nshed\n", "row 1: 1 columns, and the header has 2; separate them by tabs"),
+        ("object\tphotos\nshed\ta\nbarn\ta\tb\n", "row 2: 3 columns, and the header has 2"),
+        ("object\tphotos\nshed\ta\nshed\tb\n", "'shed' stands in two rows; names must differ"),
+    ],
+    ids=["no such column", "empty", "column twice", "too few", "too many", "name twice"],
+)
+def test_a_bad_table_is_one_sentence_with_its_file(table, text, sentence):
+    with pytest.raises(StageError, match=f"objects.tsv.*{sentence}"):
+        read_table(table(text), "object")
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    """Read a project whose tables hold these rows."""
+    monkeypatch.chdir(tmp_path)
+
+    def read(scene_row="yard\tflight", object_row="shed\tyard\tclose", **settings):
+        (tmp_path / "scenes.tsv").write_text(f"scene\tphotos\n{scene_row}\n")
+        (tmp_path / "objects.tsv").write_text(f"object\tscene\tphotos\n{object_row}\n")
+        return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"} | settings)
+
+    return read
+
+
+def test_variants_are_the_settings_of_registration_with_what_differs(project):
+    found = project(registration={"variants": ["full", "no_scale"], "crop": {"mode": "masks"}})
+    assert set(found.variants) == {"full", "no_scale"}
+    assert found.variants["full"]["scale"]["method"] != found.variants["no_scale"]["scale"]["method"] == "none"
+    assert found.variants["no_scale"]["crop"]["mode"] == "masks"
+
+
+@pytest.mark.parametrize(
+    "changes, sentence",
+    [
+        ({"scene": {"matches": {"max_rati": 0.8}}}, "config, scene.matches: unknown key 'max_rati'; did you mean"),
+        ({"fusion": {"mode": "fil"}}, r"config, fusion.mode: 'fil' is not one of \['fill', 'append', 'replace'\]"),
+        ({"gpu": "many"}, "config, gpu: 'many' does not match"),
+        ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
+        ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
+        ({"objects": "nowhere.tsv"}, "nowhere.tsv does not exist; write it as config/README.md describes"),
+    ],
+)
+def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
+    with pytest.raises(StageError, match=sentence):
+        project(**changes)
+
+
+@pytest.mark.parametrize(
+    "rows, sentence",
+    [
+        ({"object_row": "shed\tgarden\tclose"}, "object 'shed' lies in scene 'garden', which scenes.tsv does not list"),
+        ({"object_row": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
+        ({"scene_row": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
+        ({"object_row": "shed\tyard\t"}, "objects.tsv, row 1, photos: '' "),
+        ({"scene_row": ""}, "scenes.tsv has no rows; add one for each scene"),
+    ],
+    ids=["unknown scene", "object with a dash", "scene with a dash", "no photos", "no scene"],
+)
+def test_a_bad_row_is_one_sentence_with_its_table(project, rows, sentence):
+    with pytest.raises(StageError, match=sentence):
+        project(**rows)

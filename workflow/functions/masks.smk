@@ -1,0 +1,42 @@
+# What masks are made from, and how.
+from scenefuse.masks.algebra import mask_folders
+
+
+def kept_masks(name):
+    """What an object's masks keep."""
+    return config["object"]["masks"]["keep"].replace("{object}", name)
+
+
+def mask_inputs(wildcards):
+    """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
+    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    try:
+        folders = mask_folders(kept_masks(wildcards.object))
+    except StageError as error:
+        raise WorkflowError(str(error)) from None
+    where = f"object.masks.keep of '{wildcards.object}'"
+    files = [file for folder in folders for file in photos_in(str(folder), where)]
+    if row.get("masks"):
+        return files + photos_in(
+            row["masks"], f"{config['objects']}, masks of '{wildcards.object}'"
+        )
+    if not row.get("prompts"):
+        raise WorkflowError(
+            f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
+        )
+    if settings["method"] == "sam2" and settings["sam2_checkpoint"]:
+        files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
+    elif settings["method"] == "sam2":
+        files += [settings["sam2_encoder"], settings["sam2_decoder"]]
+    return files + [row["prompts"]]
+
+
+def mask_options(wildcards):
+    """Settings of the masks; your own masks beat any method."""
+    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    own = {
+        "keep": kept_masks(wildcards.object),
+        "supplied": row.get("masks") or None,
+        "prompts": None if row.get("masks") else row.get("prompts") or None,
+    }
+    return flags(settings | own | ({"method": "supplied"} if row.get("masks") else {}))
