@@ -96,9 +96,9 @@ class _Encode(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
                 fine_from: int) -> Tensor:  # fmt: skip
         kernel, plain = _kernels_on(x.device)
-        levels = [plain(t) for t in (*grid.on(x.device), level_weight)]
+        levels = tuple(plain(t) for t in (*grid.on(x.device), level_weight))
         out = torch.empty(len(x), 2 * len(grid.resolution), device=x.device)
-        kernel.encode(plain(x), plain(table), *levels, plain(out))
+        kernel.encode(plain(x), plain(table), levels, plain(out))
         ctx.save_for_backward(x, table, torch.ones(len(x), device=x.device) if boost is None else boost)
         ctx.levels, ctx.fine_from = levels, fine_from
         return out
@@ -111,10 +111,10 @@ class _Encode(torch.autograd.Function):
         g_x = g_table = None
         if ctx.needs_input_grad[0]:
             g_x = torch.empty_like(x)
-            kernel.encode_backward_x(*given, plain(table), *ctx.levels, plain(g_x))
+            kernel.encode_backward_x(*given, plain(table), ctx.levels, plain(g_x))
         if ctx.needs_input_grad[1]:
             g_table = torch.empty_like(table)
-            kernel.encode_backward(*given, *ctx.levels, plain(boost), ctx.fine_from, plain(g_table))
+            kernel.encode_backward(*given, ctx.levels, plain(boost), ctx.fine_from, plain(g_table))
         return g_x, g_table, None, None, None, None
 
 

@@ -47,28 +47,26 @@ def _intrinsic(function):  # type: ignore[no-untyped-def]
     return function if nb is None else intrinsic(function)
 
 
-def encode(x, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+def encode(x, table, levels, out):  # type: ignore[no-untyped-def]
     """Trilinear hash encoding (Mueller et al. 2022, section 3).
 
-    x (N, 3) in 0..1; table (T, 2); per level: resolution, stride (0: hashed), offset into the table, index mask,
-    weight; out (N, 2 L).
+    x (N, 3) in 0..1; table (T, 2); levels: resolution, stride (0: hashed), offset into the table, index mask, weight,
+    each (L,); out (N, 2 L).
     """
-    _encode(nb.get_num_threads(), x, table, resolution, stride, offset, mask, level_weight, out)
+    _encode(nb.get_num_threads(), x, table, levels, out)
 
 
-def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):  # type: ignore[no-untyped-def]
+def encode_backward(x, gradient, levels, boost, fine_from, out):  # type: ignore[no-untyped-def]
     """Gradient of `encode` with respect to the table, written to out (T, 2).
 
     gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
     """
-    levels = resolution, stride, offset, mask, level_weight
-    _encode_backward(nb.get_num_threads(), x, gradient, *levels, boost, fine_from, out)
+    _encode_backward(nb.get_num_threads(), x, gradient, levels, boost, fine_from, out)
 
 
-def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+def encode_backward_x(x, gradient, table, levels, out):  # type: ignore[no-untyped-def]
     """Gradient of `encode` with respect to the positions, written to out (N, 3)."""
-    levels = resolution, stride, offset, mask, level_weight
-    _encode_backward_x(nb.get_num_threads(), x, gradient, table, *levels, out)
+    _encode_backward_x(nb.get_num_threads(), x, gradient, table, levels, out)
 
 
 @_inline
@@ -138,8 +136,9 @@ def _fetch(table, position, size, stride, start, mask):
 
 
 @_jit
-def _encode(threads, x, table, resolution, stride, offset, mask, level_weight, out):
+def _encode(threads, x, table, levels, out):
     """A thread goes through all of its samples level by level, so that one level's rows stay in its cache."""
+    resolution, stride, offset, mask, level_weight = levels
     count = x.shape[0]
     for thread in prange(threads):
         first, last = count * thread // threads, count * (thread + 1) // threads
@@ -178,14 +177,15 @@ def _add(out, row, weight, a, b):
 
 
 @_jit
-def _encode_backward(threads, x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):
+def _encode_backward(threads, x, gradient, levels, boost, fine_from, out):
     """One thread owns a level, and sets it to zero just before adding to it: its rows are still in the cache then."""
-    levels = resolution.shape[0]
+    resolution, stride, offset, mask, level_weight = levels
+    last_level = resolution.shape[0] - 1
     for thread in prange(threads):
         # Fine levels cost more than coarse ones: every thread gets some of both.
-        for level in range(thread, levels, threads):
+        for level in range(thread, last_level + 1, threads):
             weight = level_weight[level]
-            out[offset[level] : offset[level + 1] if level + 1 < levels else out.shape[0]] = ZERO
+            out[offset[level] : offset[level + 1] if level < last_level else out.shape[0]] = ZERO
             if weight == ZERO:
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
@@ -214,7 +214,8 @@ def _encode_backward(threads, x, gradient, resolution, stride, offset, mask, lev
 
 
 @_jit
-def _encode_backward_x(threads, x, gradient, table, resolution, stride, offset, mask, level_weight, out):
+def _encode_backward_x(threads, x, gradient, table, levels, out):
+    resolution, stride, offset, mask, level_weight = levels
     count = x.shape[0]
     for thread in prange(threads):
         first, last = count * thread // threads, count * (thread + 1) // threads
@@ -283,11 +284,15 @@ def _shares(uniform, prior, near_count, total):
 
 
 @_inline
-def _walk(ray, low, high, alpha, blocks_used, step, expected, width, start, raw, near):
+def _walk(ray, span, occupancy, expected, width, buffers):
     """Fill the beginnings, weights and nearness to the prior of the intervals of a ray that lie in occupied cells.
 
-    ray (6,): origin and direction; returns how many intervals there are, their total weight, how many are near.
+    ray (6,): origin and direction; span: where it enters and leaves; occupancy as in `march`; expected, width: the
+    prior; buffers: what is filled. Returns how many intervals there are, their total weight, how many are near.
     """
+    low, high = span
+    alpha, blocks_used, step = occupancy
+    start, raw, near = buffers
     grid = alpha.shape[0]
     scale = np.float32(grid)
     ox, oy, oz, dx, dy, dz = ray
@@ -313,8 +318,10 @@ def _walk(ray, low, high, alpha, blocks_used, step, expected, width, start, raw,
 
 
 @_inline
-def _place(r, jitter, shares, near_count, used, step, start, raw, near, out_t, out_delta):
+def _place(r, jitter, shares, near_count, used, step, buffers, out):
     """Cut the mass of a ray's intervals into equal shares, and put a sample into each."""
+    start, raw, near = buffers
+    out_t, out_delta, _ = out
     share_uniform, share_weight, share_prior = shares
     samples = jitter.shape[1]
     blurred = ZERO
@@ -358,25 +365,20 @@ def march(rays, occupancy, jitter, uniform, prior, out):
     width, share (R,); out: t, delta (R, S), hit (R,) uint8.
     """
     origin, direction = rays
-    alpha, blocks_used, step = occupancy
     distance, width, share = prior
-    out_t, out_delta, out_hit = out
+    step, out_hit = occupancy[2], out[2]
     longest = int(DIAGONAL / step) + 3
     for block in prange((origin.shape[0] + RAYS_A_BLOCK - 1) // RAYS_A_BLOCK):
-        start = np.empty(longest, np.float32)
-        raw = np.empty(longest, np.float32)
-        near = np.empty(longest, np.uint8)
+        buffers = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.uint8)
         for r in range(block * RAYS_A_BLOCK, min((block + 1) * RAYS_A_BLOCK, origin.shape[0])):
             low, high = _span(origin, direction, r)
             out_hit[r] = 0
             if high <= low:
                 continue
             ray = origin[r, 0], origin[r, 1], origin[r, 2], direction[r, 0], direction[r, 1], direction[r, 2]
-            used, total, near_count = _walk(
-                ray, low, high, alpha, blocks_used, step, distance[r], width[r], start, raw, near
-            )
+            used, total, near_count = _walk(ray, (low, high), occupancy, distance[r], width[r], buffers)
             if used == 0:
                 continue
             out_hit[r] = 1
             shares = _shares(uniform, share[r], near_count, total)
-            _place(r, jitter, shares, near_count, used, step, start, raw, near, out_t, out_delta)
+            _place(r, jitter, shares, near_count, used, step, buffers, out)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.io.settings import build, read_settings
+from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import MapSettings
@@ -40,31 +41,11 @@ class TrainingOptions:
     """Of the rendered maps."""
     gates: CloudGates = CloudGates()
     """Which points of the cloud are kept."""
+    refinement: RefinementSettings = RefinementSettings()
+    """Of the rendered depths by photos."""
 
 
 AS_SHIPPED = TrainingOptions()
-
-
-@dataclass(frozen=True)
-class _Places:
-    """Where everything lies in the output folder."""
-
-    out: Path
-
-    @property
-    def workspace(self) -> Path:
-        return self.out / "cameras"
-
-    @property
-    def masks(self) -> Path:
-        return self.out / "masks"
-
-    @property
-    def stage(self) -> Path:
-        return self.out / "nerf"
-
-    def json(self, step: str) -> Path:
-        return self.out / "steps" / f"{step}.json"
 
 
 def train_nerf(
@@ -96,35 +77,36 @@ def train_nerf(
     start = time.perf_counter()
     settings = read_settings(config)
     seed = settings["seed"] if seed is None else seed
-    wanted, places = settings["object"], _Places(out)
+    wanted = settings["object"]
     _clear(out)
+    workspace, mattes, photos_json = out / "cameras", out / "masks", out / "steps/photos.json"
     import_photos(
         data=data,
         images=images,
         masks=masks,
-        workspace=places.workspace,
-        mattes=places.masks,
-        report=places.json("photos"),
+        workspace=workspace,
+        mattes=mattes,
+        report=photos_json,
         settings=build(UndistortSettings, wanted["undistort"]),
     )
-    exact = value(read_json(places.json("photos")), "masks_exact")
-    chosen = _nerf_settings(wanted, options, epochs, exact)
+    chosen = _nerf_settings(wanted, options, epochs, value(read_json(photos_json), "masks_exact"))
     train_object_nerf(
-        inputs=NerfInputs(places.workspace, places.masks),
-        stage=places.stage,
-        report=places.json("nerf"),
+        inputs=NerfInputs(workspace, mattes),
+        stage=out / "nerf",
+        report=out / "steps/nerf.json",
         checkpoints=out / "checkpoints",
         settings=chosen,
         hold_out_every=wanted["hold_out_every"],
         seed=seed,
     )
     shutil.rmtree(out / "checkpoints", ignore_errors=True)
-    save_png(out / "renders.png", render_sheet(places.workspace, places.masks, places.stage))
-    fused = replace(build(CloudSettings, wanted["cloud"]), gates=options.gates)
-    refused = _make_cloud(places, fused, seed)
-    report = _report(places, {"nerf": asdict(chosen), "cloud": asdict(fused)}, refused, seed)
+    save_png(out / "renders.png", render_sheet(workspace, mattes, out / "nerf"))
+    fused = replace(build(CloudSettings, wanted["cloud"]), gates=options.gates, refinement=options.refinement)
+    inputs = CloudInputs(workspace, photos_json, mattes, out / "nerf", out / "steps/nerf.json")
+    refused = _make_cloud(inputs, out, fused, seed)
+    report = _report(out, {"nerf": asdict(chosen), "cloud": asdict(fused)}, refused, seed)
     write_json(out / "report.json", report | {"seconds": quantity(round(time.perf_counter() - start, 1), "s")})
-    _print_summary(report, places, refused)
+    _print_summary(report, out, refused)
     return 0 if refused is None else NO_CLOUD
 
 
@@ -143,34 +125,33 @@ def _nerf_settings(wanted: dict[str, Any], options: TrainingOptions, epochs: int
     return replace(built, recipe=recipe, losses=options.losses, maps=options.maps)
 
 
-def _make_cloud(places: _Places, settings: CloudSettings, seed: int) -> str | None:
+def _make_cloud(inputs: CloudInputs, out: Path, settings: CloudSettings, seed: int) -> str | None:
     """Write the cloud, or say why there is none."""
-    inputs = CloudInputs(places.workspace, places.json("photos"), places.masks, places.stage, places.json("nerf"))
+    cloud, report = out / "object.ply", out / "steps/cloud.json"
     try:
-        make_object_cloud(
-            inputs=inputs, cloud=places.out / "object.ply", report=places.json("cloud"), settings=settings, seed=seed
-        )
+        make_object_cloud(inputs=inputs, cloud=cloud, report=report, settings=settings, seed=seed)
     except StageError as error:
         return str(error)
     return None
 
 
-def _report(places: _Places, settings: dict[str, Any], refused: str | None, seed: int) -> dict[str, Any]:
+def _report(out: Path, settings: dict[str, Any], refused: str | None, seed: int) -> dict[str, Any]:
     """What the three steps say, and all settings."""
+    steps = out / "steps"
     return {
-        "photos": read_json(places.json("photos")),
-        "nerf": read_json(places.json("nerf")),
-        "cloud": {} if refused else read_json(places.json("cloud")),
+        "photos": read_json(steps / "photos.json"),
+        "nerf": read_json(steps / "nerf.json"),
+        "cloud": {} if refused else read_json(steps / "cloud.json"),
         "no_cloud_because": quantity(refused, ""),
         "settings": quantity(settings, ""),
         "seed": quantity(seed, ""),
     }
 
 
-def _print_summary(report: dict[str, Any], places: _Places, refused: str | None) -> None:
-    nerf, cloud, out = report["nerf"], report["cloud"], places.out
+def _print_summary(report: dict[str, Any], out: Path, refused: str | None) -> None:
+    nerf, cloud = report["nerf"], report["cloud"]
     quality = f"PSNR {value(nerf, 'psnr_held_out'):.2f} dB inside the masks, SSIM {value(nerf, 'ssim'):.3f}"
-    written = [out / "report.json", out / "renders.png", places.stage, *([] if refused else [out / "object.ply"])]
+    written = [out / "report.json", out / "renders.png", out / "nerf", *([] if refused else [out / "object.ply"])]
     print(f"quality    {quality}, on {value(nerf, 'photos_measured')} {value(nerf, 'measured_on')}")
     print(f"cloud      none: {refused}" if refused else f"cloud      {value(cloud, 'points')} points")
     print(f"written    {', '.join(map(str, written))}", flush=True)

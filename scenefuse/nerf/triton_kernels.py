@@ -14,29 +14,25 @@ PY, PZ = tl.constexpr(kernels.PRIMES[1]), tl.constexpr(kernels.PRIMES[2])
 BLOCK = 128
 
 
-def encode(x, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+def encode(x, table, levels, out):  # type: ignore[no-untyped-def]
     """As `kernels.encode`."""
-    levels = len(resolution)
+    count = len(levels[0])
     # Blocks of samples run fastest, so that one level's rows stay in the cache.
-    _encode[triton.cdiv(len(x), BLOCK), levels](
-        x, table, resolution, stride, offset, mask, level_weight, out, len(x), levels, BLOCK
-    )
+    _encode[triton.cdiv(len(x), BLOCK), count](x, table, *levels, out, len(x), count, BLOCK)
 
 
-def encode_backward(x, gradient, resolution, stride, offset, mask, level_weight, boost, fine_from, out):  # type: ignore[no-untyped-def]
+def encode_backward(x, gradient, levels, boost, fine_from, out):  # type: ignore[no-untyped-def]
     """As `kernels.encode_backward`."""
-    levels = len(resolution)
+    count = len(levels[0])
     out.zero_()
-    _encode_backward[triton.cdiv(len(x), BLOCK), levels](
-        x, gradient, resolution, stride, offset, mask, level_weight, boost, out, len(x), fine_from, levels, BLOCK
+    _encode_backward[triton.cdiv(len(x), BLOCK), count](
+        x, gradient, *levels, boost, out, len(x), fine_from, count, BLOCK
     )
 
 
-def encode_backward_x(x, gradient, table, resolution, stride, offset, mask, level_weight, out):  # type: ignore[no-untyped-def]
+def encode_backward_x(x, gradient, table, levels, out):  # type: ignore[no-untyped-def]
     """As `kernels.encode_backward_x`."""
-    _encode_backward_x[(triton.cdiv(len(x), BLOCK),)](
-        x, gradient, table, resolution, stride, offset, mask, level_weight, out, len(x), len(resolution), BLOCK
-    )
+    _encode_backward_x[(triton.cdiv(len(x), BLOCK),)](x, gradient, table, *levels, out, len(x), len(levels[0]), BLOCK)
 
 
 @triton.jit

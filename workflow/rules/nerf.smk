@@ -5,9 +5,6 @@
 #           results/objects/{object}/object.ply, object.json                the cloud
 
 
-NERF = config["object"]["nerf"]
-
-
 rule train_object_nerf:
     """Depth-guided NeRF (stage 2)."""
     input:
@@ -32,7 +29,7 @@ rule train_object_nerf:
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(NERF | config["object"]["stage2"] | HELD_OUT),
+        options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
         previous="",
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
@@ -65,7 +62,7 @@ use rule train_object_nerf as retrain_object_nerf with:
     benchmark:
         "results/benchmarks/retrain_object_nerf/{object}.tsv"
     params:
-        options=flags(NERF | config["object"]["stage4"] | HELD_OUT),
+        options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
         previous="--previous results/objects/{object}/stage2",
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
