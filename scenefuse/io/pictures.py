@@ -40,8 +40,9 @@ def write_picture(path: Path, pixels: NDArray[np.uint8], jpeg_quality: int = 97)
         StageError: OpenCV could not write the file: a full disk, or a suffix it does not know.
     """
     stored = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    jpeg = Path(path).suffix.lower() in (".jpg", ".jpeg")
     try:
-        written = cv2.imwrite(str(path), stored, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality])
+        written = cv2.imwrite(str(path), stored, [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if jpeg else [])
     except cv2.error:
         written = False
     if not written:
