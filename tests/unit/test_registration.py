@@ -3,15 +3,18 @@
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 from support.planted import errors, plant
 
 from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.maps import write_depth
 from scenefuse.registration.candidates import match, ransac_similarities, upright_candidates
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
 from scenefuse.registration.fine import register_finely, scale_ledger
 from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
+from scenefuse.registration.free_space import read_free_space
 from scenefuse.registration.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.registration.paper import register_as_paper
 from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem
@@ -345,6 +348,29 @@ def test_an_object_in_the_scenes_free_space_is_refused(house):
         house, lifted, evidence=Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
     ).decision
     assert not decision.registered and "free space" in decision.reason
+
+
+def test_free_space_is_read_from_the_depth_maps_of_a_workspace(tmp_path, house):
+    model = pycolmap.Reconstruction()
+    for k, view in enumerate(house.free_space.views, 1):
+        (fx, fy), (cx, cy) = np.diag(view.intrinsics)[:2], view.intrinsics[:2, 2]
+        # The photos are twice as large as the depth maps.
+        size, params = (2 * view.width, 2 * view.height), [2 * fx, 2 * fy, 2 * cx, 2 * cy]
+        camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params, camera_id=k)
+        model.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=f"{k}.jpg", camera_id=k, image_id=k)
+        pose = view.cam_from_world
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(pose[:3, :3]), pose[:3, 3]))
+        write_depth(tmp_path / f"depth/{k % 2}/depth_maps/{k}.jpg.bin", view.pixels)
+    (tmp_path / "sparse").mkdir()
+    model.write(tmp_path / "sparse")
+    chunks, truth = (tmp_path / "depth/0", tmp_path / "depth/1"), house.scene_from_object
+    found = read_free_space(tmp_path, chunks, house.scene.points, 5, house.free_space.tolerance)
+    assert len(found.views) == min(5, len(house.free_space.views))
+    lifted = Sim3(truth.scale, truth.rotation, truth.translation + [0, 0, 0.5 * house.diagonal])
+    assert found.violation(truth.apply(house.object.points)) < 0.05
+    assert found.violation(lifted.apply(house.object.points)) > 0.5
+    assert read_free_space(tmp_path, (tmp_path / "none",), house.scene.points, 5, 1.0) is None
 
 
 def test_spread_of_a_pose_grows_with_noise():

@@ -331,3 +331,12 @@ def test_the_text_names_photos_without_a_pose_where_poses_are_not_those_of_sfm(r
     write_json(house / "stage1.json", {"workspace": quantity("poses", "")})
     text = (summarise(results) / "summary.txt").read_text()
     assert "stage1.workspace poses" in text and "poses.not_registered: a.jpg" in text
+
+
+def test_a_variant_without_a_gate_is_neither_ok_nor_registered(results):
+    fine = results / "objects/house/registration/paper/fine.json"
+    write_json(fine, load(fine) | {"status": quantity("ungated", "")})
+    summary = summarise(results)
+    assert read(summary, "registration").set_index(["object", "variant"]).loc[("house", "paper"), "status"] == "ungated"
+    lines = [line.split() for line in (summary / "summary.txt").read_text().splitlines()]
+    assert ["paper", "ungated"] in [words[:2] for words in lines]
