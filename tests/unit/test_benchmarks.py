@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib
+import re
 from pathlib import Path
 from typing import get_type_hints
 
@@ -37,6 +38,13 @@ def test_what_benchmarks_vary_are_fields_of_the_settings():
     assert {key for varied in nerf for key in varied} <= fields(NerfSettings)
     assert {key for varied in object_mvs.DEPTH.values() for key in varied} <= fields(DepthMapSettings)
     assert {key for varied in object_mvs.FUSION.values() for key in varied or {}} <= fields(DenseCloudSettings)
+
+
+def test_the_lego_example_and_its_benchmark_train_alike():
+    example = (BENCHMARKS.parents[1] / "config/examples/lego.yaml").read_text()
+    words = re.sub(r"[#\\\n]+", " ", example.split("--out lego")[1].split("object:")[0]).split()
+    said = {words[i].removeprefix("--").replace("-", "_"): float(words[i + 1]) for i in range(0, len(words), 2)}
+    assert said | {"mask_band_px": 0} == lego.FLAGS
 
 
 def fields(settings: type) -> set[str]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from support.textured_plane import plane_views, speckled, wrong_depths
 
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
@@ -36,19 +37,26 @@ def test_depths_stay_where_nothing_can_be_matched():
     assert not (refined.moved | refined.inconsistent).any() and np.array_equal(refined.depths, wrong)
 
 
-def test_no_depth_moves_farther_than_its_reach():
+@pytest.fixture(scope="module")
+def far_off():
+    """A textured plane with depths far from the truth: views, true depths, these depths, and what they become."""
     views, truth = plane_views(count=8, width=160, height=120)
-    views = speckled(views, truth)
-    far_off = np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
-    refined = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(match_reach_px=1))
-    moved = np.abs(1 / refined.depths[truth > 0] - 1 / far_off[truth > 0])
+    views, depths = speckled(views, truth), np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
+    return (
+        views,
+        truth,
+        depths,
+        refine_by_photos(views, views.object_from_cam, depths, RefinementSettings(match_reach_px=1)),
+    )
+
+
+def test_no_depth_moves_farther_than_its_reach(far_off):
+    views, truth, depths, refined = far_off
+    moved = np.abs(1 / refined.depths[truth > 0] - 1 / depths[truth > 0])
     baseline = np.linalg.norm(np.diff(views.object_from_cam[:, :3, 3], axis=0), axis=1).min()
     assert moved.max() < 4.0 / (views.intrinsics[0, 0, 0] * baseline)
 
 
-def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent():
-    views, truth = plane_views(count=8, width=160, height=120)
-    views = speckled(views, truth)
-    far_off = np.where(truth > 0, 1.3 * truth, 0).astype(np.float32)
-    refined = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(match_reach_px=1))
+def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent(far_off):
+    _, truth, _, refined = far_off
     assert refined.inconsistent[truth > 0].mean() > 0.9
