@@ -76,7 +76,7 @@ class Field(nn.Module):
 def coarse_to_fine(field: Field, progress: float, finished: float) -> None:
     """Open the levels one after the other: all of them once `progress` (0..1) reaches `finished`.
 
-    The window is linear; Park et al. 2021 (Nerfies, equation 8) and Lin et al. 2021 (BARF) use a cosine.
+    The window is linear; Park et al. 2021 (Nerfies) and Lin et al. 2021 (BARF) use a cosine.
     """
     levels = field.settings.levels
     first = max(LEVELS_AT_START, levels // 2)

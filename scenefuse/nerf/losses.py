@@ -62,7 +62,7 @@ def rank_loss(
 ) -> Tensor:
     """The paper's relative depth: order of two pixels' depths as the prior has it (method N3).
 
-    The hinge is equation (6) of SparseNeRF (Wang et al. 2023), in units of its margin.
+    The ranking hinge of SparseNeRF (Wang et al. 2023), in units of its margin.
 
     Args:
         distance: (R,) expected depth along the ray, `images` equal groups of rays one after the other.

@@ -125,7 +125,7 @@ def _mass(middle: Tensor, alpha: Tensor, valid: Tensor, uniform: float, prior: R
     """Share of a ray's samples that each of its intervals (R, N) gets.
 
     A mixture of three: the same for all, the compositing weights of the grid, blurred by a maximum over neighbours
-    (as Mip-NeRF 360 does, section 3), and the intervals near the prior.
+    (after mip-NeRF, Barron et al. 2021), and the intervals near the prior.
     """
     ahead = torch.cumprod(1 - alpha, 1)
     raw = torch.cat([torch.ones_like(ahead[:, :1]), ahead[:, :-1]], 1) * alpha

@@ -214,7 +214,7 @@ def _key(given: _Given, settings: NerfSettings, device: str, seed: int) -> str:
 def _report(
     nerf: Nerf, given: _Given, settings: NerfSettings, result: dict[str, float], maps: RenderedMaps
 ) -> dict[str, Any]:
-    """What the training and its maps say of themselves."""
+    """Quantities of the training and of its maps."""
     prior, device = given.prior, nerf.field.table.device.type
     return {
         "steps": quantity(int(result["steps"]), "1"),

@@ -18,7 +18,7 @@ FIRST_CELLS = 64
 MARGIN = 0.02
 # The first, rough cube is half as wide again as the masks' extents ask for.
 ROUGH_FACTOR = 1.5
-# A mask of fewer pixels says nothing about where the object is.
+# A mask of fewer pixels does not show where the object is.
 LEAST_PIXELS = 16
 # Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
 HALF_DIAGONAL = 0.87

@@ -81,10 +81,11 @@ def project(tmp_path, monkeypatch):
 
 
 def test_variants_are_the_settings_of_registration_with_what_differs(project):
-    found = project(registration={"variants": ["full", "no_scale"], "crop": {"mode": "masks"}})
-    assert set(found.variants) == {"full", "no_scale"}
-    assert found.variants["full"]["scale"]["method"] != found.variants["no_scale"]["scale"]["method"] == "none"
-    assert found.variants["no_scale"]["crop"]["mode"] == "masks"
+    found = project(registration={"variants": ["full", "no_crop"], "crop": {"mode": "masks"}}).variants
+    assert set(found) == {"full", "no_crop"}
+    assert found["full"]["crop"]["mode"] == found["no_crop"]["crop"]["mode"] == "masks"
+    assert found["no_crop"]["crop"] != found["full"]["crop"]
+    assert found["no_crop"]["coarse"] == found["full"]["coarse"]
 
 
 @pytest.mark.parametrize(
