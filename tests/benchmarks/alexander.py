@@ -1,4 +1,4 @@
-"""Judge the masks of config/examples/alexander by the supplied ones, after that workflow has run; GrabCut beside SAM 2.
+"""Compare the masks of config/examples/alexander with the supplied ones, after that workflow has run; GrabCut beside SAM 2.
 
 python tests/benchmarks/alexander.py --results results --given data/alexander/masks
 """

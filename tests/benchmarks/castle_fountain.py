@@ -1,4 +1,4 @@
-"""Judge config/examples/castle_fountain against the photos' true cameras, after that workflow has run.
+"""Measure config/examples/castle_fountain against the photos' true cameras, after that workflow has run.
 
 python tests/benchmarks/castle_fountain.py --results results --truth data/castle_fountain/truth.json
 """

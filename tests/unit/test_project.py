@@ -110,7 +110,7 @@ import scenefuse.stage
 from test_depth import plane
 encoding._encode(photos._matte, scenefuse.stage._run)
 monkeypatch.setattr(encoding, "_encode", None)
-monkeypatch.setattr("scenefuse.stage._run", None)
+patch.setattr("scenefuse.stage._run", None)
 encoding.encode(photos.__name__, mine._own)
 """
     found = ["_encode", "_encode", "_matte", "_run", "_run", "_spacing", "test_depth"]
@@ -128,9 +128,10 @@ def private_uses(tree: ast.Module) -> list[str]:
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute) and ast.unparse(node.value).split(".")[0] in roots:
             named.append(node.attr)
-        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "monkeypatch.setattr":
-            patched = [argument.value for argument in node.args[:2] if isinstance(argument, ast.Constant)]
-            if not isinstance(node.args[0], ast.Constant) and ast.unparse(node.args[0]).split(".")[0] not in roots:
-                continue
-            named += [str(text).rsplit(".", 1)[-1] for text in patched]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith(".setattr"):
+            owner, name = (ast.unparse(argument).strip("'") for argument in node.args[:2])
+            if owner.startswith("scenefuse."):
+                named.append(owner.rsplit(".", 1)[-1])
+            elif owner.split(".")[0] in roots:
+                named.append(name)
     return other + [name for name in named if name.startswith("_") and not name.startswith("__")]
