@@ -1,4 +1,4 @@
-"""Compare the masks of config/examples/alexander with the supplied ones, after that workflow has run; GrabCut beside SAM 2.
+"""The masks of config/examples/alexander beside the supplied ones, after that workflow has run; GrabCut beside SAM 2.
 
 python tests/benchmarks/alexander.py --results results --given data/alexander/masks
 """
