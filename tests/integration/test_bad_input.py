@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from conftest import HEADER
+from support.user_project import HEADER
 
 
 @pytest.fixture

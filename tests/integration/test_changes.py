@@ -4,7 +4,7 @@ import os
 import shutil
 
 import pytest
-from conftest import Project, planned
+from support.user_project import Project, planned
 
 CROP, MASKS = "results/objects/shed/registration/full/crop.json", "results/objects/shed/masks.json"
 

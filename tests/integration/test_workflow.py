@@ -1,14 +1,17 @@
 """The whole workflow on a tiny capture: what it writes, what a second run does, what an edit reruns."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 import yaml
-from conftest import ROOT, planned
+from support.user_project import planned
 
 from scenefuse.io.clouds import read_cloud
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="session")

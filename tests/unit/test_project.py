@@ -121,7 +121,11 @@ def private_uses(tree: ast.Module) -> list[str]:
     """Private names of scenefuse, and test files, that a module imports, names as an attribute, or patches."""
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
     sources = [(getattr(node, "module", None), alias) for node in imports for alias in node.names]
-    other = [name for source, alias in sources if (name := source or alias.name).split(".")[0].startswith("test_")]
+    other = [
+        name
+        for source, alias in sources
+        if (name := source or alias.name).split(".")[0].startswith(("test_", "conftest"))
+    ]
     ours = [alias for source, alias in sources if (source or alias.name).split(".")[0] == "scenefuse"]
     roots = {(alias.asname or alias.name).split(".")[0] for alias in ours}
     named = [alias.name for alias in ours]

@@ -1,0 +1,40 @@
+"""A working directory of a user's own, and what Snakemake plans in it."""
+
+import re
+from pathlib import Path
+
+import cv2
+import numpy as np
+import yaml
+
+HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\ttruth\n"
+
+
+def planned(output: str) -> set[str]:
+    """Rules that a dry run lists."""
+    return set(re.findall(r"^([a-z0-9_]+) +\d+$", output, re.MULTILINE)) - {"total"}
+
+
+class Project:
+    """A working directory of a user's own: the scene yard, and in it the shed."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.config: dict = {"scenes": "scenes.tsv", "objects": "objects.tsv"}
+        self.scenes = "scene\tphotos\nyard\tflight\n"
+        self.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n"
+
+    def photos(self, folder: str, count: int = 3) -> None:
+        """Make a folder with this many photos of noise."""
+        (self.path / folder).mkdir()
+        rng = np.random.default_rng(0)
+        for index in range(count):
+            picture = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
+            cv2.imwrite(str(self.path / folder / f"{index}.jpg"), picture)
+
+    def write(self) -> Path:
+        """Write tables and settings; returns the settings file."""
+        (self.path / "scenes.tsv").write_text(self.scenes)
+        (self.path / "objects.tsv").write_text(self.objects)
+        (self.path / "mine.yaml").write_text(yaml.safe_dump(self.config))
+        return self.path / "mine.yaml"
