@@ -95,7 +95,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
                 fine_from: int) -> Tensor:  # fmt: skip
-        kernel, plain = _kernels_on(x.device)
+        kernel, plain = kernel_module(x.device)
         levels = tuple(plain(t) for t in (*grid.on(x.device), level_weight))
         out = torch.empty(len(x), 2 * len(grid.resolution), device=x.device)
         kernel.encode(plain(x), plain(table), levels, plain(out))
@@ -106,7 +106,7 @@ class _Encode(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
         x, table, boost = ctx.saved_tensors
-        kernel, plain = _kernels_on(x.device)
+        kernel, plain = kernel_module(x.device)
         given = plain(x), plain(gradients[0].contiguous())
         g_x = g_table = None
         if ctx.needs_input_grad[0]:
@@ -120,11 +120,11 @@ class _Encode(torch.autograd.Function):
 
 def kernels_on(device: str) -> str:
     """What computes the encoding on a device: numba, triton or torch."""
-    module = _kernels_on(torch.device(device))[0]
+    module = kernel_module(torch.device(device))[0]
     return "torch" if module is None else "triton" if module is triton_kernels else "numba"
 
 
-def _kernels_on(device: torch.device) -> tuple[Any, Callable[[Tensor], Any]]:
+def kernel_module(device: torch.device) -> tuple[Any, Callable[[Tensor], Any]]:
     """The module whose kernels run on a device, and how they take a tensor; no module: plain PyTorch has to do it."""
     if device.type == "cpu" and kernels.AVAILABLE:
         return kernels, lambda tensor: tensor.detach().numpy()
@@ -146,7 +146,7 @@ def encode(
         boost: (N,) factor on each sample's gradient on levels >= fine_from (adaptive grid update), or None.
         fine_from: first level that `boost` acts on.
     """
-    if _kernels_on(x.device)[0] is not None:
+    if kernel_module(x.device)[0] is not None:
         return _Encode.apply(x.contiguous(), table, grid, level_weight, boost, fine_from)
     return encode_reference(x, table, grid, level_weight, boost, fine_from)
 

@@ -8,6 +8,7 @@ import sys
 import time
 import types
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import cv2
@@ -45,14 +46,14 @@ def nerf(*, repeats: int = 10, steps: int = 60, threads: int = 2, device: Litera
     use_threads(threads)
     keep_memory()
     print(f"hash encoding, {LEVELS} levels, 2^{LOG2_TABLE} rows, {SAMPLES} samples, forward and backward, {device}:")
-    compare(medians({name: lambda step=step: time_of(step) for name, step in encodings(device).items()}, repeats), "s")
+    compare(medians({name: partial(time_of, step) for name, step in encodings(device).items()}, repeats), "s")
     if kernels_on(device) == "numba":
         print("marching 2304 rays through 128^3 cells, 32 samples:")
         step = marching(2304, 128, 32)
         compare(medians(by_both(lambda: time_of(step)), repeats), "s")
     if device == "cpu":
         print("matching 16 depth hypotheses of 400 x 300 pixels in 8 photos, windows of 7:")
-        compare(medians({name: lambda step=step: time_of(step) for name, step in matching().items()}, repeats), "s")
+        compare(medians({name: partial(time_of, step) for name, step in matching().items()}, repeats), "s")
     print("training, default field, 2304 rays a step:")
     compare(medians(by_both(lambda: training_seconds(steps, device)), 3), "s a step")
 
@@ -70,7 +71,7 @@ def by_both(measured: Callable[[], float]) -> dict[str, Callable[[], float]]:
     return {"scenefuse": measured, "scenefuse in plain PyTorch": plain}
 
 
-def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
+def marching(rays: int, cells: int, samples: int) -> Callable[[], object]:
     """Marching as in a training step, through a shell."""
     generator = torch.Generator().manual_seed(0)
     grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
@@ -83,7 +84,7 @@ def marching(rays: int, cells: int, samples: int) -> Callable[[], None]:
     return lambda: march(origin, direction, occupancy, jitter, UNIFORM_SHARE, prior)
 
 
-def matching() -> dict[str, Callable[[], None]]:
+def matching() -> dict[str, Callable[[], object]]:
     """A chunk of the plane sweep, by the kernel and in plain PyTorch."""
     rng = np.random.default_rng(0)
     grays = [cv2.GaussianBlur(rng.random((300, 400), np.float32), (0, 0), 2) for _ in range(9)]
@@ -110,7 +111,7 @@ def compare(seconds: dict[str, float], unit: str) -> None:
         print(f"  {name:30s} {value:9.4f} {unit}   {value / first:6.1f} x")
 
 
-def encodings(device: str) -> dict[str, Callable[[], None]]:
+def encodings(device: str) -> dict[str, Callable[[], object]]:
     """Encoders of the same size, each as a step that runs forward and backward on the same positions."""
     generator = torch.Generator().manual_seed(0)
     x = torch.rand(SAMPLES, 3, generator=generator).to(device)
@@ -124,7 +125,7 @@ def encodings(device: str) -> dict[str, Callable[[], None]]:
         parameters.grad = None
         (encoder() * weight).sum().backward()
 
-    peers = {
+    peers: dict[str, Callable[[], object]] = {
         "scenefuse": lambda: step(lambda: encode(x, table, grid, every_level), table),
         "scenefuse in plain PyTorch": lambda: step(lambda: encode_reference(x, table, grid, every_level), table),
         "floor: copying the table": lambda: gradient.copy_(table.detach()),
@@ -148,7 +149,7 @@ def medians(measured: dict[str, Callable[[], float]], repeats: int) -> dict[str,
     return {name: statistics.median(taken[name] for taken in rounds[1:]) for name in measured}
 
 
-def time_of(step: Callable[[], None]) -> float:
+def time_of(step: Callable[[], object]) -> float:
     """Time of one step."""
     wait = torch.cuda.synchronize if torch.cuda.is_available() else lambda: None
     wait()

@@ -3,7 +3,7 @@
 PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --out results/bench/no_sfm
 
 Taken from a finished demo are the frames and, as a person's own, the masks. The focal length is the one in the photos'
-EXIF, as COLMAP reads it (without EXIF its guess, 1.2 times the longer side). Only the last step, which judges the
+EXIF, as COLMAP reads it (without EXIF its guess, 1.2 times the longer side). Only the last step, which measures the
 trajectory and the cloud, reads the truth; it aligns by the cameras' centres alone.
 """
 
@@ -20,12 +20,8 @@ from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.object_truth import cloud_results, read_object_truth
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.poses.find_poses import PoseSettings, find_poses
 from scenefuse.stage import quantity, run, value, write_json
 
@@ -52,40 +48,40 @@ def workspace(frames: Path, masks: Path, folder: Path) -> None:
 
 def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, seed: int) -> None:
     """All stages from a workspace to the cloud, as the workflow runs them."""
+    posed, masks = folder / "poses", folder / "masks"
     find_poses(
-        workspace=folder / "undistorted", posed=folder / "poses", report=folder / "poses.json",
+        workspace=folder / "undistorted", posed=posed, report=folder / "poses.json",
         settings=build(PoseSettings, settings["poses"]), seed=seed,
     )  # fmt: skip
-    inputs: dict[str, Any] = {"cameras": folder / "poses", "masks": folder / "masks"}
-    common = {"checkpoints": folder / "checkpoints", "hold_out_every": hold_out_every, "seed": seed}
+    common: dict[str, Any] = {"checkpoints": folder / "checkpoints", "hold_out_every": hold_out_every, "seed": seed}
 
-    def outputs(name: str) -> dict[str, Path]:
+    def outputs(name: str) -> dict[str, Any]:
         return {"stage": folder / name, "report": folder / f"{name}.json"}
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
-        own = settings["nerf"] | settings[name]
         train_object_nerf(
-            **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
-            field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
-            refinement=build(RefinementSettings, own), settings=build(NerfSettings, own),
+            inputs=NerfInputs(posed, masks, folder / prior, previous), **outputs(name), **common,
+            settings=build(NerfSettings, settings["nerf"] | settings[name]),
         )  # fmt: skip
 
     train_depth(
-        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage1"),
+        workspace=posed, masks=masks, **common, **outputs("stage1"),
         settings=build(DepthTrainingSettings, settings["stage1"]),
     )  # fmt: skip
     nerf("stage2", "stage1", None)
     refine_depth(
-        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage3"),
+        workspace=posed, masks=masks, **common, **outputs("stage3"),
         earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
         settings=build(FeedbackSettings, settings["stage3"]),
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
-    own = settings["cloud"]
     make_object_cloud(
-        **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
+        inputs=CloudInputs(
+            workspace=posed, workspace_json=folder / "poses.json", masks=masks,
+            stage=folder / "stage4", stage_json=folder / "stage4.json",
+        ),
         cloud=folder / "object.ply", report=folder / "object.json",
-        refinement=build(RefinementSettings, own), settings=build(CloudSettings, own), seed=seed,
+        settings=build(CloudSettings, settings["cloud"]), seed=seed,
     )  # fmt: skip
 
 
@@ -96,7 +92,7 @@ def no_sfm(
     objects: tuple[str, ...] = ("house", "balloon", "sculpture"),
     settings: Path | None = None,
 ) -> None:
-    """Reconstruct and judge; truth.json of each object's folder holds what is printed.
+    """Reconstruct and measure; truth.json of each object's folder holds what is printed.
 
     Args:
         results: folder of a finished demo.
@@ -118,8 +114,8 @@ def no_sfm(
             "photos": quantity(len(known.orbit.names), "1"),
             "photos_with_pose": quantity(len(known.posed), "1"),
             "trajectory_error_over_extent": quantity(float(np.sqrt(np.mean(known.fit.position**2))) / extent, "1"),
-            "rotation_error_median_deg": quantity(float(np.median(known.fit.rotation_deg)), "degrees"),
-            "rotation_error_max_deg": quantity(float(known.fit.rotation_deg.max()), "degrees"),
+            "rotation_error_median_deg": quantity(float(np.median(known.fit.rotation_deg)), "deg"),
+            "rotation_error_max_deg": quantity(float(known.fit.rotation_deg.max()), "deg"),
             **cloud_results(points, known, samples, seed),
         }
         write_json(folder / "truth.json", measured)

@@ -1,4 +1,4 @@
-"""What each part of the four stages is worth: the demo's objects again without it, over seeds, judged by the truth.
+"""What each part of the four stages is worth: the demo's objects again without it, over seeds, against the truth.
 
 make demo; then python tests/benchmarks/object_ablation.py --results results --objects house --seeds 3
 """
@@ -16,6 +16,7 @@ import torch
 
 from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.io.clouds import read_cloud
+from scenefuse.io.pictures import read_rgb
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
@@ -139,9 +140,9 @@ def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> float:
     )
     scores = []
     for index in np.flatnonzero(views.held_out):
-        render = cv2.imread(str(stage / "renders" / f"{Path(views.names[index]).stem}.png"))[..., ::-1].copy()
-        pictures = (torch.from_numpy(p).float() / 255 for p in (render, views.images[index]))
-        scores.append(psnr(*pictures, torch.from_numpy(views.masks[index])))
+        picture = read_rgb(stage / "renders" / f"{Path(views.names[index]).stem}.png")
+        render, photo = (torch.from_numpy(p).float() / 255 for p in (picture, views.images[index]))
+        scores.append(psnr(render, photo, torch.from_numpy(views.masks[index])))
     return float(np.mean(scores))
 
 
@@ -176,7 +177,7 @@ def object_ablation(
         settings: laid over the shipped ones, or none.
     """
     shipped = read_settings(settings)
-    own, judge = shipped["object"], shipped["evaluation"]["object"]
+    own, limits = shipped["object"], shipped["evaluation"]["object"]
     out = results / "bench/object_ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = []
@@ -184,12 +185,12 @@ def object_ablation(
     for name in objects:
         folder, known = results / "objects" / name, results / "demo/demo/truth"
         truth = read_object_truth(
-            folder / "undistorted", known / "scene", known / name, judge["samples"], shipped["seed"]
+            folder / "undistorted", known / "scene", known / name, limits["samples"], shipped["seed"]
         )
         for seed in range(seeds):
             for variant in chosen:
                 print(f"{name} {variant} {seed}", flush=True)
-                measured = one(folder, truth, chosen[variant], seed, own, judge["max_photos"])
+                measured = one(folder, truth, chosen[variant], seed, own, limits["max_photos"])
                 rows.append({"object": name, "variant": variant, "seed": seed} | measured)
                 pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
     print_table(pd.DataFrame(rows), seeds)

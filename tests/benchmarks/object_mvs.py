@@ -22,7 +22,7 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.mvs.views import Views, load_views
-from scenefuse.nerf.object_cloud import CloudSettings, clean, fuse_depths
+from scenefuse.nerf.object_cloud import CloudSettings, SurfaceMaps, clean, fuse_depths
 from scenefuse.stage import StageError, read_json, run, value
 
 # Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,
@@ -37,7 +37,7 @@ FUSION: dict[str, dict[str, Any] | None] = {
     "two photos": STRICT | {"min_photos": 2},
     "object": None,
 }
-STAGES = ("stage1", "stage2", "stage3", "stage4", "object_cloud")
+STAGES = ("train_depth", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud")
 
 
 def mask_depths(depth: Path, views: Views) -> None:
@@ -59,7 +59,8 @@ def fused(
         normals = np.stack(
             [read_normals(p) if (p := depth / "normal_maps" / n).is_file() else np.stack([z] * 3, -1) for n, z in read]
         )
-        return fuse_depths(views, views.object_from_cam, depths, (depths > 0).astype(np.float32), normals, settings)[0]
+        maps = SurfaceMaps(depths, (depths > 0).astype(np.float32), normals)
+        return fuse_depths(views, views.object_from_cam, maps, settings)[0]
     path = depth.with_name("fused.ply")
     fuse_depth_maps(
         workspace=folder / "undistorted", depth=[depth], depth_json=[report], cloud=path,
@@ -68,8 +69,8 @@ def fused(
     cloud = read_cloud(path)
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0 for m in views.masks])
     nothing = np.zeros(grown.shape, np.float32)
-    said = compare(cloud.points, -1, nothing, grown, views.intrinsics, views.object_from_cam, 0.0)
-    return cloud[said.off_mask <= settings.mask_share * len(grown)]
+    found = compare(cloud.points, -1, nothing, grown, views.intrinsics, views.object_from_cam, 0.0)
+    return cloud[found.off_mask <= settings.gates.mask_share * len(grown)]
 
 
 def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures: Path) -> list[dict[str, Any]]:
@@ -77,7 +78,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
     own = settings["object"] | {key: settings["scene"][key] for key in ("depth_maps", "dense_cloud")}
     width = own["nerf"]["width_px"]
     views = load_views(folder / "undistorted", folder / "masks", width, 0)
-    judge, rows = settings["evaluation"]["object"], []
+    limits, rows = settings["evaluation"]["object"], []
     for maps, over in DEPTH.items():
         with tempfile.TemporaryDirectory() as temporary:
             depth, report = Path(temporary) / maps.replace(" ", "_"), Path(temporary) / "depth.json"
@@ -89,7 +90,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
             )  # fmt: skip
             mask_depths(depth, views)
             wall, cpu = time.monotonic() - start, used(began)
-            errors = depth_results([depth], truth, judge["max_photos"])
+            errors = depth_results([depth], truth, limits["max_photos"])
             for fusion, changes in FUSION.items():
                 start, began = time.monotonic(), os.times()
                 try:
@@ -104,7 +105,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
                     {"object": folder.name, "method": "mvs", "maps": maps, "fusion": fusion}
                     | {"depth_pct": 100 * (value(errors, f"{depth.name}_depth_error") or np.nan)}
                     | {"within_1pct": value(errors, f"{depth.name}_depth_within_1pct")}
-                    | judged(cloud, truth, judge["samples"], settings["seed"])
+                    | measured(cloud, truth, limits["samples"], settings["seed"])
                     | {"seconds": seconds, "cpu_seconds": work}
                 )
                 print(rows[-1], flush=True)
@@ -113,18 +114,18 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
 
 def early_stages(folder: Path, truth: ObjectTruth, settings: dict[str, Any]) -> list[dict[str, Any]]:
     """The maps of stages 1 and 3, fused and cleaned as the object's cloud: what the NeRF adds to them."""
-    own, judge, rows = settings["object"], settings["evaluation"]["object"], []
+    own, limits, rows = settings["object"], settings["evaluation"]["object"], []
     for stage in ("stage1", "stage3"):
         depth = folder / stage
         width = read_depth(next(iter(sorted((depth / "depth_maps").glob("*.bin"))))).shape[1]
         views = load_views(folder / "undistorted", folder / "masks", width, 0)
         cloud = cleaned(fused(folder, depth, depth, views, own, None), folder, own)
-        errors = depth_results([depth], truth, judge["max_photos"])
+        errors = depth_results([depth], truth, limits["max_photos"])
         rows.append(
             {"object": folder.name, "method": "stage 1 alone" if stage == "stage1" else "stages 1 to 3"}
             | {"maps": stage, "fusion": "object", "depth_pct": 100 * value(errors, f"{stage}_depth_error")}
             | {"within_1pct": value(errors, f"{stage}_depth_within_1pct")}
-            | judged(cloud, truth, judge["samples"], settings["seed"])
+            | measured(cloud, truth, limits["samples"], settings["seed"])
         )
     return rows
 
@@ -133,7 +134,7 @@ def cleaned(cloud: Cloud, folder: Path, own: dict[str, Any]) -> Cloud:
     """Thinned and cleaned like the object's cloud."""
     settings = build(CloudSettings, own["cloud"])
     step = settings.spacing * value(read_json(folder / "object.json"), "diagonal")
-    return clean(voxel_downsample(cloud, step), settings.outlier_deviations, settings.min_component, step)
+    return clean(voxel_downsample(cloud, step), settings.gates.outlier_deviations, settings.gates.min_component, step)
 
 
 def used(began: os.times_result) -> float:
@@ -142,7 +143,7 @@ def used(began: os.times_result) -> float:
     return now.user + now.system - began.user - began.system
 
 
-def judged(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
+def measured(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
     found = cloud_results(truth.fit.truth_from_model.apply(cloud.points), truth, samples, seed)
     return {
         "points": len(cloud),
@@ -156,15 +157,15 @@ def judged(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[st
 
 
 def four_stages(results: Path, name: str, truth: ObjectTruth, settings: dict[str, Any]) -> dict[str, Any]:
-    """The workflow's cloud, judged alike, and the time of its stages."""
-    folder, judge = results / "objects" / name, settings["evaluation"]["object"]
+    """The workflow's cloud, measured alike, and the time of its stages."""
+    folder, limits = results / "objects" / name, settings["evaluation"]["object"]
     times = [pd.read_csv(results / f"benchmarks/{stage}/{name}.tsv", sep="\t").iloc[-1] for stage in STAGES]
-    errors = depth_results([folder / "stage4"], truth, judge["max_photos"])
+    errors = depth_results([folder / "stage4"], truth, limits["max_photos"])
     return (
         {"object": name, "method": "four stages", "maps": "stage4", "fusion": "object"}
         | {"depth_pct": 100 * value(errors, "stage4_depth_error")}
         | {"within_1pct": value(errors, "stage4_depth_within_1pct")}
-        | judged(read_cloud(folder / "object.ply"), truth, judge["samples"], settings["seed"])
+        | measured(read_cloud(folder / "object.ply"), truth, limits["samples"], settings["seed"])
         | {"seconds": sum(t["s"] for t in times), "cpu_seconds": sum(t["cpu_time"] for t in times)}
     )
 
@@ -190,11 +191,11 @@ def object_mvs(
     chosen, rows = read_settings(settings), []
     out = results / "bench/object_mvs.tsv"
     (out.parent / "object_mvs").mkdir(parents=True, exist_ok=True)
-    judge, known = chosen["evaluation"]["object"], results / "demo/demo/truth"
+    limits, known = chosen["evaluation"]["object"], results / "demo/demo/truth"
     for name in objects:
         folder = results / "objects" / name
         truth = read_object_truth(
-            folder / "undistorted", known / "scene", known / name, judge["samples"], chosen["seed"]
+            folder / "undistorted", known / "scene", known / name, limits["samples"], chosen["seed"]
         )
         rows += [four_stages(results, name, truth, chosen), *early_stages(folder, truth, chosen)]
         rows += trials(folder, truth, chosen, out.parent / "object_mvs")

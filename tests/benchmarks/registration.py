@@ -71,9 +71,9 @@ def fgr(trial: Trial, scene: Cloud) -> Found:
     for cloud in (source, target):
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(2 * voxel, 30))
         search = o3d.geometry.KDTreeSearchParamHybrid(5 * voxel, 100)
-        features.append(registration.compute_fpfh_feature(cloud, search))
+        features.append(registration.compute_fpfh_feature(cloud, search))  # type: ignore[call-arg]
     option = registration.FastGlobalRegistrationOption(maximum_correspondence_distance=1.5 * voxel)
-    result = registration.registration_fgr_based_on_feature_matching(source, target, *features, option)
+    result = registration.registration_fgr_based_on_feature_matching(source, target, features[0], features[1], option)
     start = Sim3.from_matrix(np.asarray(result.transformation)) @ scaled
     return Found(paper_fine(trial.object, scene, start), True)
 
@@ -95,11 +95,11 @@ def _at_rms_scale(trial: Trial, scene: Cloud) -> tuple[Sim3, Any, Any, float]:
     """The scaling, both clouds thinned to voxels of 2 % of the scene crop's diagonal, and that voxel."""
     scaled = Sim3(estimates(trial.object, scene, None)[0].scale, np.eye(3), np.zeros(3))
     voxel = 0.02 * scene.diagonal
-    clouds = [
+    source, target = (
         o3d.geometry.PointCloud(o3d.utility.Vector3dVector(p)).voxel_down_sample(voxel)
         for p in (scaled.apply(trial.object.points), scene.points)
-    ]
-    return scaled, *clouds, voxel
+    )
+    return scaled, source, target, voxel
 
 
 METHODS = {

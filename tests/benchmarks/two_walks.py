@@ -1,4 +1,4 @@
-"""Real scenes laid on each other by their clouds alone, judged by the photos that they share.
+"""Real scenes laid on each other by their clouds alone, measured against the photos that they share.
 
 snakemake --configfile config/examples/two_walks/config.yaml --cores 2 \\
     results/scenes/{walk1,walk2,boulder,boulder_section}/dense.ply

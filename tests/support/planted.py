@@ -133,8 +133,8 @@ def _paint(name, points, normals):
 
 def _mesh(part):
     mesh = o3d.t.geometry.TriangleMesh()
-    mesh.vertex.positions = o3d.core.Tensor(part.vertices.astype(np.float32))
-    mesh.triangle.indices = o3d.core.Tensor(part.triangles.astype(np.int32))
+    mesh.vertex.positions = o3d.core.Tensor.from_numpy(part.vertices.astype(np.float32))
+    mesh.triangle.indices = o3d.core.Tensor.from_numpy(part.triangles.astype(np.int32))
     return mesh
 
 
@@ -143,7 +143,7 @@ def _seen_by(rays, points, camera):
     direction = camera - points
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     ray = np.concatenate([points + 2e-2 * direction, direction], 1).astype(np.float32)
-    return ~np.isfinite(rays.cast_rays(o3d.core.Tensor(ray))["t_hit"].numpy())
+    return ~np.isfinite(rays.cast_rays(o3d.core.Tensor.from_numpy(ray))["t_hit"].numpy())
 
 
 @cache
@@ -315,7 +315,7 @@ def _sampled(part, count, hue, rng):
 def _depth_maps(rays, own, cameras, shown, centre, diagonal, noise, rng):
     """What each of the scene's cameras measured: nothing where the object was not reconstructed."""
     tree = cKDTree(shown)
-    views = []
+    views: list[View] = []
     for camera in cameras:
         width, height = 160, 120
         focal = 0.9 * width * np.linalg.norm(camera - centre) / (2.4 * diagonal)
@@ -327,7 +327,7 @@ def _depth_maps(rays, own, cameras, shown, centre, diagonal, noise, rng):
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         local = np.stack([(u - width / 2) / focal, (v - height / 2) / focal, np.ones_like(u)], -1)
         ray = np.concatenate([np.broadcast_to(camera, (*u.shape, 3)), local @ rotation], -1).astype(np.float32)
-        hit = rays.cast_rays(o3d.core.Tensor(ray))
+        hit = rays.cast_rays(o3d.core.Tensor.from_numpy(ray))
         depth, of = hit["t_hit"].numpy(), hit["geometry_ids"].numpy()
         depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
         world = camera + depth[..., None] * (local @ rotation)

@@ -1,9 +1,12 @@
 """A slanted, textured square photographed along an arc, with its true depths."""
 
 import math
+from dataclasses import replace
 
+import cv2
 import numpy as np
 
+from scenefuse.mvs.consistency import back_project
 from scenefuse.mvs.views import Views
 
 
@@ -45,3 +48,22 @@ def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int
     mattes = np.stack(masks).astype(np.uint8) * 255
     views = Views(names, np.stack(images), mattes, k, np.stack(poses), held, sparse, tracks)
     return views, np.stack(depths)
+
+
+def speckled(views, truth):
+    """The same views of the plane, painted with fine speckles."""
+    speckles = cv2.GaussianBlur(np.random.default_rng(0).random((400, 400)).astype(np.float32), (0, 0), 2.0)
+    speckles = (speckles - speckles.min()) / np.ptp(speckles) * 255
+    images = []
+    for depth, k, pose in zip(truth, views.intrinsics, views.object_from_cam):
+        rows, columns = np.indices(depth.shape).reshape(2, -1)
+        points = back_project(depth.ravel().astype(np.float64), k, pose, rows, columns).reshape(*depth.shape, 3)
+        place = ((points[..., :2] + 1) * 199.5).astype(np.float32)
+        images.append(cv2.remap(speckles, place[..., 0], place[..., 1], cv2.INTER_LINEAR).astype(np.uint8))
+    return replace(views, images=np.repeat(np.stack(images)[..., None], 3, axis=3))
+
+
+def wrong_depths(truth, share=0.05):
+    """True depths with a smooth error of up to a share of them."""
+    waves = np.sin(np.arange(truth.shape[2]) / 15)[None, None] * np.cos(np.arange(truth.shape[1]) / 12)[None, :, None]
+    return (truth * (1 + share * waves)).astype(np.float32)

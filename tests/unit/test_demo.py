@@ -1,5 +1,6 @@
 """The demo capture: truth that agrees with the photos, and the same bytes for the same seed."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,12 +35,22 @@ def world() -> World:
     return build_world(0)
 
 
-@pytest.fixture(autouse=True)
-def one_world(monkeypatch: pytest.MonkeyPatch, world: World) -> None:
+@pytest.fixture(autouse=True, scope="module")
+def one_world(world: World) -> Iterator[None]:
     """Every stage gets the world that is already there, with an open sky."""
-    monkeypatch.setattr(capture, "build_world", lambda seed: world)
-    monkeypatch.setattr(clicks, "build_world", lambda seed: world)
-    monkeypatch.setattr(capture, "openness", lambda w, *_: np.ones(len(w.vertices), dtype=np.float32))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(capture, "build_world", lambda seed: world)
+        patch.setattr(clicks, "build_world", lambda seed: world)
+        patch.setattr(capture, "openness", lambda w, *_: np.ones(len(w.vertices), dtype=np.float32))
+        yield
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory: pytest.TempPathFactory, one_world: None) -> Path:
+    """A folder with scene and house, rendered; only to be read."""
+    root = tmp_path_factory.mktemp("rendered")
+    render_all(root)
+    return root
 
 
 def render_all(root: Path) -> None:
@@ -47,23 +58,21 @@ def render_all(root: Path) -> None:
     capture.render_object(name="house", photos=root / "house", truth=root / "truth/house", settings=ORBIT, seed=0)
 
 
-def test_same_seed_same_bytes_and_all_files(tmp_path: Path) -> None:
-    render_all(tmp_path / "a")
-    render_all(tmp_path / "b")
-    files = manifest(tmp_path / "a")
-    assert files == manifest(tmp_path / "b")
+def test_same_seed_same_bytes_and_all_files(tmp_path: Path, rendered: Path) -> None:
+    render_all(tmp_path)
+    files = manifest(rendered)
+    assert files == manifest(tmp_path)
     assert sum(name.startswith("scene/") for name in files) == 6
     assert sum(name.startswith("truth/house/masks/") for name in files) == 4
     assert {"truth/house/mesh.ply", "truth/scene/meshes/world.ply", "truth/scene/meshes/balloon.ply"} <= set(files)
 
 
-def test_masks_and_photos_agree_with_the_true_cameras(tmp_path: Path, world: World) -> None:
-    render_all(tmp_path)
-    cameras = read_cameras(tmp_path / "truth/house/cameras.json")
-    middle = np.array(value(read_json(tmp_path / "truth/house/cameras.json")["object"], "middle"))
+def test_masks_and_photos_agree_with_the_true_cameras(rendered: Path, world: World) -> None:
+    cameras = read_cameras(rendered / "truth/house/cameras.json")
+    middle = np.array(value(read_json(rendered / "truth/house/cameras.json")["object"], "middle"))
     assert np.allclose(middle, world.bounds("house").mean(0))
     for k, name in enumerate(cameras.names):
-        mask = cv2.imread(str(tmp_path / f"truth/house/masks/{Path(name).stem}.png"), cv2.IMREAD_GRAYSCALE)
+        mask = cv2.imread(str(rendered / f"truth/house/masks/{Path(name).stem}.png"), cv2.IMREAD_GRAYSCALE)
         assert set(np.unique(mask)) == {0, 255}
         rows = np.flatnonzero(mask.any(1))
         assert 0.35 < (rows[-1] - rows[0] + 1) / 48 < 0.95
@@ -82,18 +91,17 @@ def test_a_ray_through_a_pixel_projects_back_to_it(world: World) -> None:
     assert np.abs(pixels.reshape(60, 80, 2)[10, 20] - [20.5, 10.5]).max() < 1e-3
 
 
-def test_exif_position_is_the_true_one_when_noise_is_zero(tmp_path: Path) -> None:
-    render_all(tmp_path)
-    cameras = read_cameras(tmp_path / "truth/scene/cameras.json")
+def test_exif_position_is_the_true_one_when_noise_is_zero(rendered: Path) -> None:
+    cameras = read_cameras(rendered / "truth/scene/cameras.json")
     for name, centre in zip(cameras.names, cameras.centres):
-        exif = Image.open(tmp_path / "scene" / name).getexif()
+        exif = Image.open(rendered / "scene" / name).getexif()
         gps = exif.get_ifd(0x8825)
         degrees = [sum(float(v) / 60**i for i, v in enumerate(gps[tag])) for tag in (2, 4)]
         found = LocalFrame(*ORIGIN).apply(np.array([[*degrees, float(gps[6])]]))
         assert np.abs(found[0] - centre).max() < 0.01
         # 35 mm equivalent by the diagonal: 60 px on a diagonal of 100 px.
         assert exif.get_ifd(0x8769)[0xA405] == round(0.6 * 43.267)
-    assert not Image.open(tmp_path / "house/house_0001.jpg").getexif().get_ifd(0x8825)
+    assert not Image.open(rendered / "house/house_0001.jpg").getexif().get_ifd(0x8825)
 
 
 def test_clicks_without_noise_meet_at_the_landmarks(tmp_path: Path, world: World) -> None:

@@ -185,7 +185,7 @@ def test_the_plane_sweep_alone_is_near_the_truth():
     assert np.median(error) < 0.003
 
 
-RECIPE = Recipe(epochs=4, warmup_epochs=1, batch_photos=4, coarse_share=0.3)
+RECIPE = Recipe(epochs=3, warmup_epochs=1, batch_photos=4, coarse_share=0.3)
 
 
 def _train(checkpoint, photos, stop_at=None):
@@ -210,9 +210,15 @@ def _photos():
     return photo_tensors(plane_views(6)[0], 3, torch.device("cpu"))
 
 
-def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    """The photos of a training, its networks and its losses."""
     photos = _photos()
-    whole, losses = _train(tmp_path / "a.pt", photos)
+    return photos, *_train(tmp_path_factory.mktemp("whole") / "state.pt", photos)
+
+
+def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, uninterrupted, capsys):
+    photos, whole, losses = uninterrupted
     with pytest.raises(SystemExit):
         _train(tmp_path / "b.pt", photos, stop_at=3)
     capsys.readouterr()
@@ -223,9 +229,8 @@ def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, capsys):
         assert torch.equal(a, b)
 
 
-def test_a_truncated_checkpoint_starts_the_training_afresh_and_says_so(tmp_path, capsys):
-    photos, checkpoint = _photos(), tmp_path / "state.pt"
-    _, losses = _train(tmp_path / "whole.pt", photos)
+def test_a_truncated_checkpoint_starts_the_training_afresh_and_says_so(tmp_path, uninterrupted, capsys):
+    (photos, _, losses), checkpoint = uninterrupted, tmp_path / "state.pt"
     with pytest.raises(SystemExit):
         _train(checkpoint, photos, stop_at=2)
     checkpoint.write_bytes(checkpoint.read_bytes()[:1000])
@@ -241,9 +246,8 @@ def test_a_diverged_training_is_one_sentence_and_saves_nothing(tmp_path):
     assert not checkpoint.exists()
 
 
-def test_a_failed_save_does_not_end_the_training(tmp_path, monkeypatch, capsys):
-    photos = _photos()
-    _, losses = _train(tmp_path / "whole.pt", photos)
+def test_a_failed_save_does_not_end_the_training(tmp_path, uninterrupted, monkeypatch, capsys):
+    photos, _, losses = uninterrupted
     monkeypatch.setattr("scenefuse.checkpoints.SAVE_EVERY_SECONDS", 0.0)
     monkeypatch.setattr(torch, "save", _full_disk)
     assert _train(tmp_path / "other/state.pt", photos)[1] == losses

@@ -4,15 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.textured_plane import plane_views
-from test_photo_refinement import _speckled, _wrong
+from support.textured_plane import plane_views, speckled, wrong_depths
 
 from scenefuse.depth.prior import read_prior
 from scenefuse.io.maps import write_depth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 
-MATCHING = RefinementSettings(8.0, 5, 0.6)
-AS_IT_IS = RefinementSettings(0.0, 5, 0.6)
+MATCHING = RefinementSettings(match_reach_px=8.0)
+AS_IT_IS = RefinementSettings(match_reach_px=0.0)
 
 
 def _write(folder, views, depths, confidence=0.5):
@@ -24,12 +23,12 @@ def _write(folder, views, depths, confidence=0.5):
 @pytest.fixture(scope="module")
 def plane():
     views, truth = plane_views(count=8, width=160, height=120, held_out=2)
-    return _speckled(views, truth), truth.astype(np.float32)
+    return speckled(views, truth), truth.astype(np.float32)
 
 
 def test_photos_sharpen_the_prior_and_make_it_sure(plane, tmp_path):
     views, truth = plane
-    wrong = _wrong(truth)
+    wrong = wrong_depths(truth)
     _write(tmp_path, views, wrong)
     prior = read_prior(tmp_path, views, MATCHING, 0.01)
     known = (prior.confidence > 0) & (truth > 0)
@@ -41,8 +40,8 @@ def test_photos_sharpen_the_prior_and_make_it_sure(plane, tmp_path):
 
 def test_held_out_photos_and_their_maps_change_nothing(plane, tmp_path):
     views, truth = plane
-    _write(tmp_path / "whole", views, _wrong(truth))
-    other = _wrong(truth)
+    _write(tmp_path / "whole", views, wrong_depths(truth))
+    other = wrong_depths(truth)
     other[views.held_out] *= 1.2
     _write(tmp_path / "other", views, other)
     images = np.where(views.held_out[:, None, None, None], 255 - views.images, views.images)

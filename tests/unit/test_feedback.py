@@ -1,6 +1,7 @@
 """Stage 3: fusing and gating on planted depth maps."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -34,20 +35,32 @@ def _refine(tmp_path):
     return json.loads((tmp_path / "stage3.json").read_text())
 
 
-@pytest.fixture
-def stage1(tmp_path, monkeypatch):
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """Stage 1 of a plane: the folder it wrote to, views, true depths."""
+    folder = tmp_path_factory.mktemp("trained")
     views, truth = plane_views()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(depth, "load_views", lambda *_: views)
+        depth.train_depth(
+            workspace=folder,
+            masks=folder,
+            stage=folder / "stage1",
+            report=folder / "stage1.json",
+            checkpoints=folder / "checkpoints",
+            settings=DEPTH_SETTINGS,
+            hold_out_every=8,
+            seed=0,
+        )
+    return folder, views, truth
+
+
+@pytest.fixture
+def stage1(tmp_path, monkeypatch, trained):
+    """A copy of stage 1 in the test's own folder; returns views and true depths."""
+    folder, views, truth = trained
+    shutil.copytree(folder / "stage1", tmp_path / "stage1")
     monkeypatch.setattr(depth, "load_views", lambda *_: views)
-    depth.train_depth(
-        workspace=tmp_path,
-        masks=tmp_path,
-        stage=tmp_path / "stage1",
-        report=tmp_path / "stage1.json",
-        checkpoints=tmp_path / "checkpoints",
-        settings=DEPTH_SETTINGS,
-        hold_out_every=8,
-        seed=0,
-    )
     return views, truth
 
 

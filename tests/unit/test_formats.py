@@ -7,12 +7,11 @@ import pye57
 import pytest
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
+from support.cloud_files import UTM, write_e57
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import bytes_of, las_crs
 from scenefuse.stage import StageError
-
-UTM = np.array([500_000.0, 5_572_094.0, 300.0])
 
 
 @pytest.fixture
@@ -40,15 +39,6 @@ def write_pcd(path, cloud, data, kind="U"):
         table.tobytes() if data == "binary" else "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
     )
     path.write_bytes(header.encode() + body)
-
-
-def write_e57(path, scans, **options):
-    file = pye57.E57(str(path), mode="w")
-    for points, colors, rotation, translation in scans:
-        columns = dict(zip(("cartesianX", "cartesianY", "cartesianZ"), points.T.astype(np.float64)))
-        columns |= dict(zip(("colorRed", "colorGreen", "colorBlue"), colors.T)) | options
-        file.write_scan_raw(columns, rotation=rotation, translation=translation)
-    file.close()
 
 
 @pytest.mark.parametrize("data", ["binary", "ascii"])

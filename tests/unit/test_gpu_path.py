@@ -5,7 +5,7 @@ import pytest
 import torch
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 from support.pretend_gpu import OnGpu, PretendGpu, to_pretended
-from test_depth import plane_views
+from support.textured_plane import plane_views
 
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
@@ -53,7 +53,9 @@ def test_training_and_rendering_on_a_gpu(gpu, tmp_path):
     assert rendered.depth.device.type == "cpu" and bool((rendered.opacity > 0).any())
 
 
-def test_asking_photos_about_depths_on_a_gpu(gpu):
+def test_depths_are_refined_by_photos_on_a_gpu(gpu):
     views, truth = plane_views(count=4)
-    refined = refine_by_photos(views, views.object_from_cam, truth.astype(np.float32), RefinementSettings(4.0, 5, 0.6))
+    refined = refine_by_photos(
+        views, views.object_from_cam, truth.astype(np.float32), RefinementSettings(match_reach_px=4.0)
+    )
     assert refined.depths.shape == truth.shape

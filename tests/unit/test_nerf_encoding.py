@@ -22,7 +22,7 @@ def device(request, monkeypatch):
     pytest.importorskip("triton", reason="Triton is not installed: pip install -r tests/requirements.txt")
     if torch.cuda.is_available():
         return "cuda"
-    monkeypatch.setattr(encoding, "_kernels_on", lambda _: (encoding.triton_kernels, torch.Tensor.detach))
+    monkeypatch.setattr(encoding, "kernel_module", lambda _: (encoding.triton_kernels, torch.Tensor.detach))
     return "cpu"
 
 

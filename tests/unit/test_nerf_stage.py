@@ -1,8 +1,6 @@
 """The NeRF stage on a tiny workspace: what it writes, and the sentences for bad input."""
 
-import ast
-import re
-from dataclasses import fields, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -95,9 +93,15 @@ def _run(root, stage, previous=None, masks=None, settings=SETTINGS):
     )
 
 
-def test_two_stages_and_the_cloud(workspace):
+@pytest.fixture(scope="module")
+def stage2(workspace):
+    """The folder of stage 2; poses move in it."""
     _run(workspace, "stage2")
-    _run(workspace, "stage4", previous=workspace / "stage2")
+    return workspace / "stage2"
+
+
+def test_two_stages_and_the_cloud(workspace, stage2):
+    _run(workspace, "stage4", previous=stage2)
     report = read_json(workspace / "stage4.json")
     assert value(report, "started_from_previous") is True
     assert value(report, "psnr_held_out") > 15 and value(report, "silhouette_iou") > 0.8
@@ -128,11 +132,10 @@ def test_two_stages_and_the_cloud(workspace):
     assert np.shape(value(cloud, "nerf_from_object")) == (4, 4)
 
 
-def test_a_later_stage_starts_from_the_poses_of_the_earlier_one(workspace):
-    _run(workspace, "moved")
+def test_a_later_stage_starts_from_the_poses_of_the_earlier_one(workspace, stage2):
     still = replace(SETTINGS, recipe=replace(RECIPE, pose_learning_rate=0.0))
-    _run(workspace, "later", previous=workspace / "moved", settings=still)
-    moved, later = (torch.load(workspace / stage / "model.pt", weights_only=True) for stage in ("moved", "later"))
+    _run(workspace, "later", previous=stage2, settings=still)
+    moved, later = (torch.load(stage / "model.pt", weights_only=True) for stage in (stage2, workspace / "later"))
     assert torch.equal(moved["object_from_cam"], later["object_from_cam"])
     assert not torch.equal(moved["object_from_cam"], torch.from_numpy(sphere_views()[3]))
 
@@ -161,14 +164,3 @@ def test_empty_masks_are_named(workspace, tmp_path):
 def test_missing_cuda_is_named(workspace):
     with pytest.raises(StageError, match="no CUDA device; set it to auto or cpu"):
         _run(workspace, "other", settings=replace(SETTINGS, device="cuda"))
-
-
-def test_the_lego_example_and_its_benchmark_train_alike():
-    example = (ROOT / "config/examples/lego.yaml").read_text()
-    words = re.sub(r"[#\\\n]+", " ", example.split("--out lego")[1].split("object:")[0]).split()
-    said = {words[i].removeprefix("--").replace("-", "_"): float(words[i + 1]) for i in range(0, len(words), 2)}
-    benchmark = (ROOT / "tests/benchmarks/lego.py").read_text()
-    flags = ast.literal_eval(re.search(r"^FLAGS = (\{.*?^\})", benchmark, re.M | re.S).group(1))
-    assert said | {"mask_band_px": 0} == flags
-    known = {field.name for part in (NerfRecipe, LossWeights, MapSettings, Schedule) for field in fields(part)}
-    assert set(flags) <= known

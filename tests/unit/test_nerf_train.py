@@ -205,7 +205,7 @@ def test_plain_pytorch_trains_like_the_kernels(sphere, monkeypatch):
         assert plain[name] == pytest.approx(with_kernels[name], rel=0.02)
 
 
-def test_of_many_views_the_near_ones_and_fewer_far_ones_are_asked():
+def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
     def ring(count):
         angle = 2 * np.pi * np.arange(count) / count
         poses = np.tile(np.eye(4), (count, 1, 1))
@@ -213,9 +213,9 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_asked():
         return poses
 
     assert others(7, ring(40)).tolist() == [k for k in range(40) if k != 7]
-    asked = others(7, ring(400))
-    assert len(asked) == len(set(asked)) == MOST_VIEWS
-    away = np.abs((asked - 7 + 200) % 400 - 200)
+    compared = others(7, ring(400))
+    assert len(compared) == len(set(compared)) == MOST_VIEWS
+    away = np.abs((compared - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
 

@@ -1,5 +1,6 @@
 """The repository's own promises: one set of versions, settings that are documented, docs that are not stale."""
 
+import ast
 import os
 import re
 import subprocess
@@ -90,3 +91,46 @@ def test_default_profile_holds_nothing_of_a_machine_and_shows_no_commands():
 
 def test_no_job_asks_a_cluster_for_more_cores_than_its_smallest_node_may_have():
     assert yaml.safe_load((ROOT / "profiles/slurm/config.yaml").read_text())["max-threads"] <= 2
+
+
+TESTS = sorted(path for path in (ROOT / "tests").rglob("*.py") if "__pycache__" not in path.parts)
+
+
+@pytest.mark.parametrize("path", TESTS, ids=lambda path: str(path.relative_to(ROOT / "tests")))
+def test_a_test_uses_public_names_and_no_other_test_file(path):
+    assert private_uses(ast.parse(path.read_text())) == []
+
+
+def test_private_uses_are_found():
+    source = """
+from scenefuse.nerf import encoding
+from scenefuse.io.clouds import _spacing
+from scenefuse.mvs import views as photos
+import scenefuse.stage
+from test_depth import plane
+encoding._encode(photos._matte, scenefuse.stage._run)
+monkeypatch.setattr(encoding, "_encode", None)
+monkeypatch.setattr("scenefuse.stage._run", None)
+encoding.encode(photos.__name__, mine._own)
+"""
+    found = ["_encode", "_encode", "_matte", "_run", "_run", "_spacing", "test_depth"]
+    assert sorted(private_uses(ast.parse(source))) == found
+
+
+def private_uses(tree: ast.Module) -> list[str]:
+    """Private names of scenefuse, and test files, that a module imports, names as an attribute, or patches."""
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.Import | ast.ImportFrom)]
+    sources = [(getattr(node, "module", None), alias) for node in imports for alias in node.names]
+    other = [name for source, alias in sources if (name := source or alias.name).split(".")[0].startswith("test_")]
+    ours = [alias for source, alias in sources if (source or alias.name).split(".")[0] == "scenefuse"]
+    roots = {(alias.asname or alias.name).split(".")[0] for alias in ours}
+    named = [alias.name for alias in ours]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and ast.unparse(node.value).split(".")[0] in roots:
+            named.append(node.attr)
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) == "monkeypatch.setattr":
+            patched = [argument.value for argument in node.args[:2] if isinstance(argument, ast.Constant)]
+            if not isinstance(node.args[0], ast.Constant) and ast.unparse(node.args[0]).split(".")[0] not in roots:
+                continue
+            named += [str(text).rsplit(".", 1)[-1] for text in patched]
+    return other + [name for name in named if name.startswith("_") and not name.startswith("__")]
