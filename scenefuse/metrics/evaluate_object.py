@@ -19,11 +19,11 @@ from scenefuse.metrics.truth import (
     camera_results,
     distances,
     f_score,
-    mask_iou,
     nearest,
     print_results,
     registration_error,
 )
+from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3
 

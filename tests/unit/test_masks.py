@@ -413,6 +413,12 @@ def test_ground_of_a_tilted_bowl_is_measured_beside_the_object():
     assert nowhere.height_of(np.array([[0, 0, box.low[2] + 1]])) == pytest.approx(1)
 
 
+def test_masks_agree_by_what_they_share_and_two_empty_ones_agree():
+    half, empty = np.arange(10)[:, None] < np.array([5]), np.zeros((10, 1), dtype=bool)
+    assert mask_iou(half, np.roll(half, 2)) == pytest.approx(3 / 7)
+    assert mask_iou(half, empty) == 0 and mask_iou(empty, empty) == 1
+
+
 def test_cleaned_turns_specks_and_pinholes():
     mask = np.zeros((50, 50), dtype=bool)
     mask[10:40, 10:40] = True
