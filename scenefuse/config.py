@@ -19,9 +19,9 @@ from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
+from scenefuse.metrics.completion import MetricSettings
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
-from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
@@ -29,6 +29,7 @@ from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
+from scenefuse.registration.agreement import AgreementSettings
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.scale import ScaleSettings
@@ -125,7 +126,7 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
     "fusion": [FusionSettings()],
-    "metrics": [MetricSettings()],
+    "metrics": [AgreementSettings(), MetricSettings()],
     "evaluation.scene": [SceneEvaluationSettings()],
     "evaluation.object": [ObjectEvaluationSettings()],
 }

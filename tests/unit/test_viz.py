@@ -7,9 +7,9 @@ import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.maps import write_depth
+from scenefuse.io.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
 from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
-from scenefuse.report.sheets import save_png
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Sim3
 
