@@ -78,7 +78,7 @@ def train_nerf(
     seed = settings["seed"] if seed is None else seed
     wanted = settings["object"]
     _clear(out)
-    workspace, mattes, photos_json = out / "cameras", out / "masks", out / "steps/photos.json"
+    workspace, mattes, photos_json = out / "undistorted", out / "masks", out / "steps/photos.json"
     import_photos(
         data=data,
         images=images,

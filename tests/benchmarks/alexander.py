@@ -43,7 +43,7 @@ def alexander(*, results: Path, given: Path) -> None:
         work = Path(temporary)
         make_masks(
             inputs=MaskInputs(
-                workspace=folder / "undistorted", undistorted_json=folder / "undistorted.json",
+                workspace=folder / "undistorted", workspace_json=folder / "undistorted.json",
                 sparse=folder / "sparse", photos_json=folder / "photos.json", prompts=EXAMPLE / "prompts.tsv",
             ),
             settings=build(MaskSettings, shipped["object"]["masks"] | {"method": "grabcut"}),

@@ -45,7 +45,7 @@ def castle_fountain(*, results: Path, truth: Path) -> None:
     known = read_json(truth)
     scene, fountain = results / "scenes/courtyard", results / "objects/fountain"
     fits = {}
-    for name, model in (("scene", scene / "georeferenced"), ("object", fountain / "cameras/sparse")):
+    for name, model in (("scene", scene / "georeferenced"), ("object", fountain / "undistorted/sparse")):
         true = cameras(known, name)
         fits[name] = fit_cameras(read_posed(model, true), true)
         print(line(name, fits[name]))

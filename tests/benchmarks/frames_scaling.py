@@ -24,12 +24,8 @@ from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine
 from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.truth import read_mesh, sample_surface
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.stage import quantity, run, write_json
 
 # A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
@@ -41,13 +37,13 @@ PARTS = {
     ("scenefuse.depth.train_depth", "train_networks"): "training",
     ("scenefuse.depth.refine_depth", "train_networks"): "training",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
-    ("scenefuse.nerf.train_object_nerf", "make_photos"): "loading",
-    ("scenefuse.nerf.train_object_nerf", "_volume"): "visual hull",
+    ("scenefuse.nerf.train_object_nerf", "photo_tensors"): "loading",
+    ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",
     ("scenefuse.nerf.train_object_nerf", "train"): "training",
-    ("scenefuse.nerf.train_object_nerf", "_render_all"): "rendering",
-    ("scenefuse.nerf.train_object_nerf", "_confidence"): "confidence",
+    ("scenefuse.nerf.rendered_maps", "render_view"): "rendering",
+    ("scenefuse.nerf.rendered_maps", "_confidence"): "confidence",
     ("scenefuse.nerf.object_cloud", "load_views"): "loading",
-    ("scenefuse.nerf.object_cloud", "_maps"): "loading",
+    ("scenefuse.nerf.object_cloud", "_read_maps"): "loading",
     ("scenefuse.nerf.object_cloud", "fuse_depths"): "fusion",
 }
 
@@ -96,29 +92,27 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     for (module, function), label in PARTS.items():
         home = importlib.import_module(module)
         setattr(home, function, timed(getattr(home, function), label, spent))
-    inputs: dict[str, Any] = {"cameras": folder / "undistorted", "masks": folder / "masks"}
+    workspace, masks = folder / "undistorted", folder / "masks"
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": own["hold_out_every"], "seed": seed}
 
     def nerf(number: int, prior: int, previous: Path | None) -> None:
-        settings = own["nerf"] | own[f"stage{number}"]
         train_object_nerf(
-            **inputs, **common, prior=folder / f"stage{prior}", previous=previous, stage=folder / f"stage{number}",
-            report=folder / f"stage{number}.json", device=settings["device"], field=build(FieldSettings, settings),
-            schedule=build(Schedule, settings), losses=build(LossWeights, settings),
-            refinement=build(RefinementSettings, settings), settings=build(NerfSettings, settings),
+            inputs=NerfInputs(workspace, masks, folder / f"stage{prior}", previous), **common,
+            stage=folder / f"stage{number}", report=folder / f"stage{number}.json",
+            settings=build(NerfSettings, own["nerf"] | own[f"stage{number}"]),
         )  # fmt: skip
 
     start, began = time.monotonic(), os.times()
     if part == "stage1":
         train_depth(
-            workspace=folder / "undistorted", masks=folder / "masks", **common, stage=folder / part,
+            workspace=workspace, masks=masks, **common, stage=folder / part,
             report=folder / "stage1.json", settings=replace(build(DepthTrainingSettings, own["stage1"]), **SMALL),
         )  # fmt: skip
     elif part == "stage2":
         nerf(2, 1, None)
     elif part == "stage3":
         refine_depth(
-            workspace=folder / "undistorted", masks=folder / "masks", **common, stage=folder / part,
+            workspace=workspace, masks=masks, **common, stage=folder / part,
             earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
             report=folder / "stage3.json", settings=build(FeedbackSettings, own["stage3"]),
         )  # fmt: skip
@@ -126,10 +120,11 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
         nerf(4, 3, folder / "stage2")
     else:
         make_object_cloud(
-            **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", seed=seed,
-            cameras_report=folder / "undistorted.json", cloud=folder / "object.ply", report=folder / "object.json",
-            refinement=build(RefinementSettings, own["cloud"]),
-            settings=build(CloudSettings, own["cloud"]),
+            inputs=CloudInputs(
+                workspace, folder / "undistorted.json", masks, folder / "stage4", folder / "stage4.json"
+            ),
+            cloud=folder / "object.ply", report=folder / "object.json", settings=build(CloudSettings, own["cloud"]),
+            seed=seed,
         )  # fmt: skip
     now = os.times()
     total = now.user + now.system - began.user - began.system

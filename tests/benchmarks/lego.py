@@ -74,7 +74,7 @@ def lego(
     chosen = build(NerfSettings, settings["nerf"] | FLAGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        places = {"workspace": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        places = {"workspace": folder / "undistorted", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
             data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )

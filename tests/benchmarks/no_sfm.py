@@ -20,12 +20,8 @@ from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.object_truth import cloud_results, read_object_truth
-from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.nerf.field import FieldSettings
-from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.object_cloud import CloudSettings, make_object_cloud
-from scenefuse.nerf.train_object_nerf import NerfSettings, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.poses.find_poses import PoseSettings, find_poses
 from scenefuse.stage import quantity, run, value, write_json
 
@@ -56,36 +52,33 @@ def reconstruct(folder: Path, settings: dict[str, Any], hold_out_every: int, see
         workspace=folder / "undistorted", posed=folder / "poses", report=folder / "poses.json",
         settings=build(PoseSettings, settings["poses"]), seed=seed,
     )  # fmt: skip
-    inputs: dict[str, Any] = {"cameras": folder / "poses", "masks": folder / "masks"}
+    posed, masks = folder / "poses", folder / "masks"
     common = {"checkpoints": folder / "checkpoints", "hold_out_every": hold_out_every, "seed": seed}
 
     def outputs(name: str) -> dict[str, Path]:
         return {"stage": folder / name, "report": folder / f"{name}.json"}
 
     def nerf(name: str, prior: str, previous: Path | None) -> None:
-        own = settings["nerf"] | settings[name]
         train_object_nerf(
-            **inputs, **common, **outputs(name), prior=folder / prior, previous=previous, device=own["device"],
-            field=build(FieldSettings, own), schedule=build(Schedule, own), losses=build(LossWeights, own),
-            refinement=build(RefinementSettings, own), settings=build(NerfSettings, own),
+            inputs=NerfInputs(posed, masks, folder / prior, previous), **common, **outputs(name),
+            settings=build(NerfSettings, settings["nerf"] | settings[name]),
         )  # fmt: skip
 
     train_depth(
-        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage1"),
+        workspace=posed, masks=masks, **common, **outputs("stage1"),
         settings=build(DepthTrainingSettings, settings["stage1"]),
     )  # fmt: skip
     nerf("stage2", "stage1", None)
     refine_depth(
-        workspace=folder / "poses", masks=folder / "masks", **common, **outputs("stage3"),
+        workspace=posed, masks=masks, **common, **outputs("stage3"),
         earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
         settings=build(FeedbackSettings, settings["stage3"]),
     )  # fmt: skip
     nerf("stage4", "stage3", folder / "stage2")
-    own = settings["cloud"]
     make_object_cloud(
-        **inputs, stage=folder / "stage4", stage_report=folder / "stage4.json", cameras_report=folder / "poses.json",
+        inputs=CloudInputs(posed, folder / "poses.json", masks, folder / "stage4", folder / "stage4.json"),
         cloud=folder / "object.ply", report=folder / "object.json",
-        refinement=build(RefinementSettings, own), settings=build(CloudSettings, own), seed=seed,
+        settings=build(CloudSettings, settings["cloud"]), seed=seed,
     )  # fmt: skip
 
 
