@@ -43,10 +43,12 @@ from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 
+# Five groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
+
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What concerns all stages."""
+    """What concerns the whole run."""
 
     scenes: str = setting("config/scenes.tsv")
     """Table of scenes."""
@@ -69,15 +71,15 @@ class ChunkSettings:
 
 @dataclass(frozen=True)
 class HoldOutSettings:
-    """What the training stages never see."""
+    """What is left out of the training."""
 
     hold_out_every: int = setting(8, least=0)
     """Every n-th photo is not trained on and measures quality; 0 holds out none."""
 
 
 @dataclass(frozen=True)
-class PoseSource:
-    """Whose poses the training stages use."""
+class PoseSourceSettings:
+    """Where poses come from."""
 
     pose_source: Literal["sfm", "network"] = setting("sfm")
     """Whose poses the training stages use; with `network` those that the photos and a depth network give."""
@@ -113,7 +115,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
-    "object.stage1": [PoseSource(), DepthTrainingSettings()],
+    "object.stage1": [PoseSourceSettings(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [Schedule()],
@@ -130,7 +132,7 @@ SECTIONS: dict[str, list[Any]] = {
     "evaluation.scene": [SceneEvaluationSettings()],
     "evaluation.object": [ObjectEvaluationSettings()],
 }
-# Set by another section, or by the workflow.
+# Keys of a dataclass that its section does not hold: the other section of the same stage sets them.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
 
 
