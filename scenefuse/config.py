@@ -19,9 +19,9 @@ from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
+from scenefuse.metrics.completion import MetricSettings
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
-from scenefuse.metrics.registration import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
@@ -29,6 +29,7 @@ from scenefuse.nerf.object_cloud import CloudSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.poses.find_poses import PoseSettings
+from scenefuse.registration.agreement import AgreementSettings
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.scale import ScaleSettings
@@ -42,10 +43,12 @@ from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 
+# Five groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
+
 
 @dataclass(frozen=True)
 class RunSettings:
-    """What concerns all stages."""
+    """What concerns the whole run."""
 
     scenes: str = setting("config/scenes.tsv")
     """Table of scenes."""
@@ -68,15 +71,15 @@ class ChunkSettings:
 
 @dataclass(frozen=True)
 class HoldOutSettings:
-    """What the training stages never see."""
+    """What is left out of the training."""
 
     hold_out_every: int = setting(8, least=0)
     """Every n-th photo is not trained on and measures quality; 0 holds out none."""
 
 
 @dataclass(frozen=True)
-class PoseSource:
-    """Whose poses the training stages use."""
+class PoseSourceSettings:
+    """Where poses come from."""
 
     pose_source: Literal["sfm", "network"] = setting("sfm")
     """Whose poses the training stages use; with `network` those that the photos and a depth network give."""
@@ -112,7 +115,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],
-    "object.stage1": [PoseSource(), DepthTrainingSettings()],
+    "object.stage1": [PoseSourceSettings(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],
     "object.stage4": [Schedule()],
@@ -125,11 +128,11 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
     "fusion": [FusionSettings()],
-    "metrics": [MetricSettings()],
+    "metrics": [AgreementSettings(), MetricSettings()],
     "evaluation.scene": [SceneEvaluationSettings()],
     "evaluation.object": [ObjectEvaluationSettings()],
 }
-# Set by another section, or by the workflow.
+# Keys of a dataclass that its section does not hold: the other section of the same stage sets them.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}
 
 

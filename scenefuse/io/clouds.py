@@ -114,6 +114,20 @@ def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> f
     return float(np.median(tree.query(points[chosen], k=2)[0][:, 1]))
 
 
+def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Unit normals (M, 3) of the planes through rows (M, K) of points (N, 3), on either side."""
+    local = points[neighbours]
+    local = local - local.mean(1, keepdims=True)
+    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+
+
+def sampled(points: NDArray[np.float64], most: int, seed: int) -> NDArray[np.float64]:
+    """At most that many of (N, 3) points, drawn evenly."""
+    if len(points) <= most:
+        return points
+    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]
+
+
 def read_cloud(path: Path) -> Cloud:
     """Read PLY, LAS, LAZ, E57, PCD, or text (XYZ, PTS, TXT, ASC, CSV). Rows without a finite position are left out.
 

@@ -45,7 +45,7 @@ class MaskInputs:
 
     workspace: Path
     """Undistorted COLMAP workspace of the object (PINHOLE cameras)."""
-    undistorted_json: Path
+    workspace_json: Path
     """Its report, with `up_in_camera_frame`."""
     sparse: Path
     """COLMAP model of the photos before undistortion."""
@@ -104,7 +104,7 @@ def make_masks(
 
 def _make(inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int) -> tuple[ScoredMasks, Target, str]:
     """Masks of all photos that have one, where the object is, and which weights segmented them."""
-    up = np.array(value(read_json(inputs.undistorted_json), "up_in_camera_frame"), dtype=np.float64)
+    up = np.array(value(read_json(inputs.workspace_json), "up_in_camera_frame"), dtype=np.float64)
     unusable: dict[str, str] = {}
     masks: list[Mask] = []
     if settings.method == "supplied":

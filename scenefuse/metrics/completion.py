@@ -1,18 +1,41 @@
 """Unsupervised quality of what was added: surface variation, uniformity of density, primitives; each with its null."""
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.io.clouds import Cloud, plane_normals, sampled, spacing
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.metrics.registration import MetricSettings, plane_normals, sampled
-from scenefuse.stage import quantity, threads
+from scenefuse.registration.agreement import NORMAL_NEIGHBOURS, AgreementSettings
+from scenefuse.stage import quantity, setting, threads
 from scenefuse.transforms import Array
 
 # Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
 WIDE_SAMPLE = 1500
+
+
+@dataclass(frozen=True)
+class MetricSettings:
+    """Settings of all metrics. Shares are of the full variant's crop diagonal, the same for every variant."""
+
+    agreement: AgreementSettings = AgreementSettings()
+    """When points correspond."""
+    sample: int = setting(4000, least=0)
+    """Points at which a completion metric is measured, chosen by the seed."""
+    variation_spacings: float = 8
+    """Radius of the surface variation, in spacings of the scene crop."""
+    density_neighbours: int = 16
+    """Neighbours k of the local density."""
+    primitive_fraction: float = 0.005
+    """Distance to a primitive within which a point lies on it, as a share of the crop's diagonal."""
+    primitive_support: float = 0.01
+    """Smallest share of the new points that makes a primitive."""
+    primitive_most: int = 20
+    """Most primitives taken."""
+    primitive_angle_deg: float = 25
+    """Largest angle in degrees between a point's normal and the primitive's."""
 
 
 def completion_metrics(
@@ -70,9 +93,10 @@ def _measure(
         new, old = local_density(complete, few, k), local_density(scene, few_scene, k)
         found[f"nue{suffix}"] = float(new.std() / old.std())
         found[f"nue_density_invariant{suffix}"] = float((new.std() / new.mean()) / (old.std() / old.mean()))
+    nearest = cKDTree(complete).query(few, k=min(NORMAL_NEIGHBOURS, len(complete)), workers=threads())[1]
     found["primitive_fitting_score"] = primitive_fitting_score(
         few,
-        plane_normals(complete, few, settings.normal_neighbours),
+        plane_normals(complete, nearest),
         settings.primitive_fraction * diagonal,
         settings.primitive_support,
         settings.primitive_most,

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.metrics.completion import completion_metrics
-from scenefuse.metrics.registration import MetricSettings, registration_metrics
+from scenefuse.metrics.completion import MetricSettings, completion_metrics
+from scenefuse.registration.agreement import registration_metrics
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -40,7 +40,8 @@ def compute_metrics(
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
     extent = read_json(crop_json)["diagonal"]
     diagonal, unit = float(extent["value"]), str(extent["unit"])
-    found = registration_metrics(obj, scene, pose, settings.tau_fraction * diagonal, diagonal, unit, settings)
+    tau = settings.agreement.tau_fraction * diagonal
+    found = registration_metrics(obj, scene, pose, tau, diagonal, unit)
     found["status"] = quantity(value(registration, "status"), "")
     content: dict[str, Any] = {"registration": found}
     if fused is not None:

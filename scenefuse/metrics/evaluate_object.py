@@ -8,10 +8,9 @@ import cv2
 import numpy as np
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.io.clouds import read_cloud
+from scenefuse.io.clouds import read_cloud, sampled
 from scenefuse.io.pictures import read_gray
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.metrics.registration import sampled
 from scenefuse.metrics.truth import (
     HIDDEN,
     Posed,
@@ -19,11 +18,11 @@ from scenefuse.metrics.truth import (
     camera_results,
     distances,
     f_score,
-    mask_iou,
     nearest,
     print_results,
     registration_error,
 )
+from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3
 

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.io.clouds import read_cloud
-from scenefuse.metrics.registration import sampled
+from scenefuse.io.clouds import read_cloud, sampled
 from scenefuse.metrics.truth import (
     HIDDEN,
     Mesh,

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.io.clouds import sampled
 from scenefuse.io.maps import read_depth
-from scenefuse.metrics.registration import sampled
 from scenefuse.metrics.truth import (
     HIDDEN,
     CameraFit,

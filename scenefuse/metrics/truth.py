@@ -137,12 +137,6 @@ def _errors(centres: Array, target: Array, chosen: NDArray[np.int64]) -> Array:
         return np.full(len(target), np.inf)
 
 
-def mask_iou(mask: NDArray[np.bool_], true_mask: NDArray[np.bool_]) -> float:
-    """Intersection over union; two empty masks agree."""
-    union = int((mask | true_mask).sum())
-    return float((mask & true_mask).sum() / union) if union else 1.0
-
-
 def true_depth(
     scene: o3d.t.geometry.RaycastingScene, view: View, truth_from_model: Sim3, size: tuple[int, int]
 ) -> tuple[NDArray[np.float32], NDArray[np.int64]]:

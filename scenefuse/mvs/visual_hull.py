@@ -142,6 +142,6 @@ def silhouette(hull: Hull, view: View) -> Mask:
 
 
 def mask_iou(a: Mask, b: Mask) -> float:
-    """Intersection over union of two masks; 0 when both are empty."""
+    """Intersection over union of two masks; 1 when both are empty, since they agree."""
     union = np.count_nonzero(a | b)
-    return np.count_nonzero(a & b) / union if union else 0.0
+    return np.count_nonzero(a & b) / union if union else 1.0

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.cores import use_threads
-from scenefuse.io.clouds import Cloud, concatenate, spacing, voxel_downsample, write_cloud
+from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
@@ -194,8 +194,7 @@ def clean(cloud: Cloud, deviations: float, min_component: float, step: float) ->
 def with_plane_normals(cloud: Cloud) -> Cloud:
     """Normals of local planes through the nearest points, on the side of the rendered normals they replace."""
     index = cKDTree(cloud.points).query(cloud.points, k=min(PLANE_POINTS, len(cloud)), workers=threads())[1]
-    local = cloud.points[index] - cloud.points[index].mean(1, keepdims=True)
-    normal = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
+    normal = plane_normals(cloud.points, index)
     if cloud.normals is not None:
         normal *= np.where((normal * cloud.normals).sum(1, keepdims=True) < 0, -1.0, 1.0)
     return Cloud(cloud.points, normal.astype(np.float32), cloud.colors, cloud.fields)

@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.io.settings import build, read_settings
+from scenefuse.io.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import MapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
-from scenefuse.report.object_sheet import depth_colors
-from scenefuse.report.sheets import Image, Sheet, draw_sheet, save_png
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
@@ -79,7 +78,7 @@ def train_nerf(
     seed = settings["seed"] if seed is None else seed
     wanted = settings["object"]
     _clear(out)
-    workspace, mattes, photos_json = out / "cameras", out / "masks", out / "steps/photos.json"
+    workspace, mattes, photos_json = out / "undistorted", out / "masks", out / "steps/photos.json"
     import_photos(
         data=data,
         images=images,

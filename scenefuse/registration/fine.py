@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import Candidate
 from scenefuse.registration.free_space import FreeSpace, read_free_space
-from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem, read_alignment, read_scales
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.score import Hypothesis

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import MOST_POINTS as COARSE_POINTS
 from scenefuse.registration.coarse import coarse_quantities
 from scenefuse.registration.fine import ledger_row, pose_quantities
 from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.problem import Evidence, Inputs, Problem
 from scenefuse.registration.refinement import MOST_POINTS
 from scenefuse.registration.scale import estimates, scale_quantities

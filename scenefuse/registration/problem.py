@@ -28,7 +28,7 @@ class Inputs:
     """Scene crop (PLY) in the scene frame."""
     crop_json: Path
     """JSON of the crop stage, for `up_in_scene` and the unit of lengths."""
-    cameras_json: Path | None = None
+    workspace_json: Path | None = None
     """JSON with `up_in_camera_frame`, the up direction in the object's frame; without it, or without the key, gravity
     is not used."""
 
@@ -45,7 +45,7 @@ class Inputs:
 
     def ups(self) -> tuple[Array, Array] | None:
         """Unit up directions (3,) in the object's and in the scene's frame, or None when either is unknown."""
-        up_in_object = None if self.cameras_json is None else read_json(self.cameras_json).get("up_in_camera_frame")
+        up_in_object = None if self.workspace_json is None else read_json(self.workspace_json).get("up_in_camera_frame")
         up_in_scene = read_json(self.crop_json).get("up_in_scene")
         if not up_in_object or not up_in_scene or up_in_object["value"] is None or up_in_scene["value"] is None:
             return None

@@ -1,22 +1,22 @@
 """Registration on its own: two clouds in, a decision, a transform and a picture out; the workflow's steps in memory."""
 
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
 from scenefuse.io.settings import build, read_settings
-from scenefuse.metrics.registration import MetricSettings, registration_metrics
+from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.crop.crop_scene import MIN_POINTS, crop_marked
 from scenefuse.registration.fine import pose_quantities
 from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.problem import Evidence, Problem, check_extent
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
@@ -42,7 +42,7 @@ class RegistrationSettings:
     scale: ScaleSettings = ScaleSettings()
     coarse: CoarseSettings = CoarseSettings()
     fine: FineSettings = FineSettings()
-    metrics: MetricSettings = field(default_factory=MetricSettings)
+    agreement: AgreementSettings = AgreementSettings()
 
     @classmethod
     def read(cls, path: Path | None) -> tuple["RegistrationSettings", int]:
@@ -54,7 +54,7 @@ class RegistrationSettings:
             build(ScaleSettings, parts["scale"]),
             build(CoarseSettings, parts["coarse"]),
             build(FineSettings, parts["fine"]),
-            build(MetricSettings, content["metrics"]),
+            build(AgreementSettings, content["metrics"]),
         ), content["seed"]
 
 
@@ -158,8 +158,8 @@ def register_clouds(
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
     outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings.fine)
     pose, diagonal = outcome.ranked[0].pose, near_scene.diagonal
-    tau = settings.metrics.tau_fraction * diagonal
-    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, "scene units", settings.metrics)
+    tau = settings.agreement.tau_fraction * diagonal
+    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, "scene units")
     whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
     return Registration(
         outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement

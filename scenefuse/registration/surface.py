@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, voxel_average
+from scenefuse.io.clouds import Cloud, plane_normals, voxel_average
 from scenefuse.stage import threads
 from scenefuse.transforms import Array, Sim3
 
@@ -108,7 +108,7 @@ def prepare(cloud: Cloud, voxel: float, seed: int, most: int) -> Surface:
         thin = thin[np.sort(np.random.default_rng(seed).choice(len(thin), most, replace=False))]
     tree = cKDTree(thin.points)
     neighbours = tree.query(thin.points, k=min(16, len(thin)), workers=threads())[1]
-    normals = _plane_normals(thin.points, neighbours)
+    normals = plane_normals(thin.points, neighbours)
     outward = thin.points - thin.points.mean(0) if thin.normals is None else thin.normals
     normals = np.where(((normals * outward).sum(1) < 0)[:, None], -normals, normals)
     colors = None
@@ -123,13 +123,6 @@ def with_queries(surface: Surface, count: int, seed: int = 0) -> Surface:
         return surface
     chosen = np.random.default_rng(seed).choice(len(surface), count, replace=False)
     return replace(surface, queries=np.sort(chosen))
-
-
-def _plane_normals(points: Array, neighbours: NDArray[np.int64]) -> Array:
-    """Unit normals (N, 3) of the planes through each point's (N, K) neighbours."""
-    local = points[neighbours]
-    local = local - local.mean(1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
 
 
 def _color_slopes(surface: Surface, neighbours: int = 20) -> Array:

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from scenefuse.fusion.fuse_object import is_placed
 from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.report.object_sheet import SIDES_DEG, inner, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
-from scenefuse.report.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.report.values import find, flatten, number
 from scenefuse.stage import StageError, atomic_directory, read_json, value
 from scenefuse.transforms import Array, Sim3, rotation_between

@@ -4,14 +4,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from scenefuse.io.clouds import Cloud
 from scenefuse.io.maps import read_depth
 from scenefuse.io.pictures import read_mask, read_rgb
+from scenefuse.io.sheets import Image, Sheet, depth_colors, draw_sheet
 from scenefuse.report.render import orbit_camera, point_radii, render
-from scenefuse.report.sheets import Image, Sheet, draw_sheet
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3, rotation_between
@@ -55,14 +54,6 @@ def _depth_row(photos: list[Path], masks: Path, stages: list[Path]) -> tuple[lis
         return [None] * len(stages), shown
     low, high = np.percentile(known[-1], [1, 99])
     return [None if d is None else depth_colors(d, float(low), float(high)) for d in inside], shown
-
-
-def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
-    """(H, W, 3) colours of a depth map, near bright; pixels without a depth are light grey."""
-    level = 1.0 - np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)
-    picture = (colormaps["viridis"](level)[..., :3] * 255).astype(np.uint8)
-    picture[depth <= 0] = 235
-    return picture
 
 
 def _render_row(workspace: Path, stage: Path) -> tuple[list[Image | None], list[str]]:

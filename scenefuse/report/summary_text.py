@@ -14,7 +14,7 @@ WIDTH = 100
 _COLUMNS = ("value", "null", "scene")
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
-_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "recipe", "mode", "workspace", "kept", "kernels")
+_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "mode", "workspace", "kept", "kernels")
 
 
 def summary_text(
@@ -68,8 +68,7 @@ def _completed_lines(fields: Fields) -> list[str]:
     """The scene with all its objects: what was added and what is not in it."""
     added = find(fields, "completed.added_points")
     if added is None:
-        why = "not written with all decisions; look at the log of complete_scene, or run with --keep-going"
-        return _line("completed", why)
+        return _line("completed", "not written with all decisions; look at the log of complete_scene")
     parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
     parts += [f"{name} adds {count}" for name, count in added.items()]
     parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
@@ -123,16 +122,16 @@ def _alignment(fields: Fields) -> str:
 def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     """One line a variant; errors against truth only where it is known."""
     shown = {
-        "scale": "scale",
-        "f_score": "F-score",
-        "fitness_source": "fit src",
-        "fitness_target": "fit tgt",
-        "inlier_rmse_over_diagonal": "rmse/dg",
-        "normal_consistency_cross": "normals",
-        "margin": "margin",
-        "scale_error_pct": "d scl %",
-        "rotation_error_deg": "d rot °",
-        "translation_error_over_diagonal": "d t/dg",
+        "scale": ("", "scale"),
+        "f_score": ("", "F-score"),
+        "fitness_source": ("fitness", "object"),
+        "fitness_target": ("fitness", "scene"),
+        "inlier_rmse_over_diagonal": ("RMSE", "of diag"),
+        "normal_consistency_cross": ("", "normals"),
+        "margin": ("", "margin"),
+        "scale_error_pct": ("scale", "error %"),
+        "rotation_error_deg": ("angle", "error °"),
+        "translation_error_over_diagonal": ("shift", "of diag"),
     }
     rows = {
         variant: {k: number_in(item.variants.get(variant, {}), *REGISTRATION[k]) for k in shown} for variant in variants
@@ -141,7 +140,8 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     if not used:
         return []
     words = {"registered": "ok", "unregistered": "refused"}
-    lines = [f"{'registration':<20}" + "".join(f"{shown[k]:>8}" for k in used)]
+    above, below = ("".join(f"{shown[k][row]:>8}" for k in used) for row in (0, 1))
+    lines = [f"{'registration':<20}{above}".rstrip(), f"{'':<20}{below}"]
     for variant, row in rows.items():
         status = status_of(item, variant)
         lines.append(

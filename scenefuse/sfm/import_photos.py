@@ -11,8 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from scenefuse.io.mask_files import mask_files, matte_of
 from scenefuse.io.pictures import write_picture
-from scenefuse.masks.supplied import mask_files, matte_of
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.photos import JPEG_QUALITY
 from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size

@@ -14,8 +14,8 @@ import yaml
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.settings import ROOT, build, read_settings
-from scenefuse.metrics.registration import MetricSettings, registration_metrics
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
+from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
 from scenefuse.registration.fine import EvidenceFiles, register_finely
 from scenefuse.registration.paper import register_as_paper
@@ -48,9 +48,9 @@ def one(results: Path, name: str, variant: str, seed: int, options: dict[str, An
         found = read_json(fine)
     reference = read_json(folder / "registration/full/crop.json")
     obj, crop = read_cloud(folder / "object.ply"), read_cloud(folder / "registration/full/crop.ply")
-    diagonal, measures = value(reference, "diagonal"), MetricSettings()
+    diagonal, measures = value(reference, "diagonal"), AgreementSettings()
     pose = Sim3.from_matrix(np.array(value(found, "scene_from_object")))
-    measured = registration_metrics(obj, crop, pose, measures.tau_fraction * diagonal, diagonal, "m", measures)
+    measured = registration_metrics(obj, crop, pose, measures.tau_fraction * diagonal, diagonal, "m")
     error = registration_error(pose, true, *_size(obj, true))
     rmse = value(measured, "inlier_rmse")
     return {

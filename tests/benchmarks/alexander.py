@@ -15,7 +15,7 @@ from scenefuse.io.settings import ROOT, build, read_settings
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.metrics.truth import mask_iou
+from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.report.object_sheet import inner, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.stage import read_json, run, value
@@ -43,7 +43,7 @@ def alexander(*, results: Path, given: Path) -> None:
         work = Path(temporary)
         make_masks(
             inputs=MaskInputs(
-                workspace=folder / "undistorted", undistorted_json=folder / "undistorted.json",
+                workspace=folder / "undistorted", workspace_json=folder / "undistorted.json",
                 sparse=folder / "sparse", photos_json=folder / "photos.json", prompts=EXAMPLE / "prompts.tsv",
             ),
             settings=build(MaskSettings, shipped["object"]["masks"] | {"method": "grabcut"}),

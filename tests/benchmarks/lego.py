@@ -15,9 +15,9 @@ import torch
 from scenefuse.cores import use_threads
 from scenefuse.io.settings import build, read_settings
 from scenefuse.mvs.views import load_views
-from scenefuse.nerf.quality import psnr, ssim
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.render import render_view
+from scenefuse.nerf.rendered_maps import psnr, ssim
 from scenefuse.nerf.train_object_nerf import NerfSettings, photo_tensors
 from scenefuse.nerf.training import Nerf, Training, keep_memory, new_nerf, train
 from scenefuse.nerf.volume import find_volume, silhouettes
@@ -74,7 +74,7 @@ def lego(
     chosen = build(NerfSettings, settings["nerf"] | FLAGS)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        places = {"workspace": folder / "cameras", "mattes": folder / "masks", "report": folder / "photos.json"}
+        places = {"workspace": folder / "undistorted", "mattes": folder / "masks", "report": folder / "photos.json"}
         import_photos(
             data=data, images=None, masks=None, **places, settings=build(UndistortSettings, settings["undistort"])
         )

@@ -22,7 +22,7 @@ from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_res
 from scenefuse.metrics.truth import belongs_to_object, distances
 from scenefuse.mvs.views import load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.quality import psnr
+from scenefuse.nerf.rendered_maps import psnr
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.stage import StageError, run, value
 

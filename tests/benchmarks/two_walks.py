@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import read_cloud
-from scenefuse.registration.picture import draw_alignment
 from scenefuse.registration.register import RegistrationSettings, register_clouds
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.registration.shared_features.landmarks import read_landmarks

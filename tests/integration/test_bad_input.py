@@ -75,7 +75,7 @@ def test_a_failed_object_does_not_block_the_other_and_is_named(project, refused)
         HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n" + "barn\tyard\tother\tclicks.tsv\tprompts.tsv\t\t\n"
     )
     targets = [f"results/objects/{name}/photos.json" for name in ("shed", "barn")]
-    refused("--keep-going", *targets)
+    refused(*targets)
     assert json.loads((project.path / targets[0]).read_text())["photos"]
     summary = (project.path / "results/summary/summary.txt").read_text()
     assert "barn" in summary and "2.jpg" in summary

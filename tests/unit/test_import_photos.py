@@ -143,12 +143,12 @@ def imported(data, out, images=None, masks=None):
         data=data,
         images=images,
         masks=masks,
-        workspace=out / "cameras",
+        workspace=out / "undistorted",
         mattes=out / "masks",
         report=out / "photos.json",
         settings=UndistortSettings(max_size_px=1600),
     )
-    return load_views(out / "cameras", out / "masks", WIDTH, 0), read_json(out / "photos.json")
+    return load_views(out / "undistorted", out / "masks", WIDTH, 0), read_json(out / "photos.json")
 
 
 def misses(views):
@@ -213,7 +213,7 @@ def test_photos_of_two_sizes_meet_at_the_narrower_width(tmp_path):
     write(data / "images", 0, blob((u / 2, v / 2), WIDTH // 2, HEIGHT // 2))
     with pytest.raises(StageError, match="photos in .* have different sizes"):
         imported(data, tmp_path)
-    views = load_views(tmp_path / "cameras", tmp_path / "masks", WIDTH // 2, 0)
+    views = load_views(tmp_path / "undistorted", tmp_path / "masks", WIDTH // 2, 0)
     assert np.max([*misses(views)]) < 0.15
 
 
@@ -239,7 +239,7 @@ def test_cameras_calibrated_photo_by_photo_come_out_at_one_size(tmp_path):
         write(data / "images", i, blob(seen(pose, LENS, own)))
     (data / "transforms.json").write_text(json.dumps(content))
     views, _ = imported(data, tmp_path)
-    model = pycolmap.Reconstruction(tmp_path / "cameras/sparse")
+    model = pycolmap.Reconstruction(tmp_path / "undistorted/sparse")
     assert model.num_cameras() == 5 and len({(c.width, c.height) for c in model.cameras.values()}) == 1
     assert np.max([*misses(views)]) < 0.15
 
@@ -306,7 +306,7 @@ def test_bad_input_is_one_sentence(tmp_path, damage, words):
     damage(nerfstudio(tmp_path / "in"))
     with pytest.raises(StageError, match=words):
         imported(tmp_path / "in", tmp_path)
-    assert not (tmp_path / "cameras").exists() and not (tmp_path / "masks").exists()
+    assert not (tmp_path / "undistorted").exists() and not (tmp_path / "masks").exists()
 
 
 def test_no_masks_says_what_to_give(tmp_path):
@@ -403,7 +403,7 @@ def test_a_sphere_from_the_files_to_its_cloud(tmp_path, quick, form):
     distance = np.linalg.norm(read_cloud(out / "object.ply").points - CENTER, axis=1)
     assert np.median(np.abs(distance - RADIUS)) < 0.1
     assert sorted(p.name for p in out.iterdir()) == sorted(
-        ["cameras", "masks", "nerf", "object.ply", "renders.png", "report.json", "steps"]
+        ["masks", "nerf", "object.ply", "renders.png", "report.json", "steps", "undistorted"]
     )
     assert (out / "renders.png").stat().st_size > 5000
 

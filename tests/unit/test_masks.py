@@ -64,8 +64,8 @@ def look(pose):
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     folder = tmp_path_factory.mktemp("capture")
-    (folder / "cameras" / "images").mkdir(parents=True)
-    (folder / "cameras" / "sparse").mkdir()
+    (folder / "undistorted" / "images").mkdir(parents=True)
+    (folder / "undistorted" / "sparse").mkdir()
     (folder / "truth").mkdir()
     generator = np.random.default_rng(0)
     sphere = generator.normal(size=(150, 3))
@@ -83,7 +83,7 @@ def capture(tmp_path_factory):
         ball, seen = look(pose)
         noise = generator.normal(0, 18, (HEIGHT, WIDTH, 1))
         photo = np.where(ball[..., None], [50, 60, 170], [60, 130, 70]) + noise
-        cv2.imwrite(str(folder / "cameras" / "images" / f"f{k}.png"), np.clip(photo, 0, 255).astype(np.uint8))
+        cv2.imwrite(str(folder / "undistorted" / "images" / f"f{k}.png"), np.clip(photo, 0, 255).astype(np.uint8))
         cv2.imwrite(str(folder / "truth" / f"f{k}_mask.png"), ball.astype(np.uint8) * 255)
         x = points @ pose[:3, :3].T + pose[:3, 3]
         pixels = FOCAL * x[:, :2] / x[:, 2:] + [WIDTH / 2, HEIGHT / 2]
@@ -99,9 +99,9 @@ def capture(tmp_path_factory):
     for point, track in zip(points, tracks):
         if len(track) > 1:
             model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
-    model.write_binary(folder / "cameras" / "sparse")
+    model.write_binary(folder / "undistorted" / "sparse")
     write_json(folder / "photos.json", {"photos": []})
-    write_json(folder / "cameras.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
+    write_json(folder / "undistorted.json", {"up_in_camera_frame": {"value": [0, 0, 1], "unit": "1"}})
     marks = [(0, 0, 2), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1), (0, 0, 0.05)]
     lines = [f"p{i}\t{x}\t{y}\t{z}" for i, (x, y, z) in enumerate(marks)]
     (folder / "prompts.tsv").write_text("\n".join(["point\tx\ty\tz", *lines]) + "\n")
@@ -110,9 +110,9 @@ def capture(tmp_path_factory):
 
 def run_stage(capture, output, supplied=None, prompts="prompts.tsv", **changes):
     inputs = MaskInputs(
-        workspace=capture / "cameras",
-        undistorted_json=capture / "cameras.json",
-        sparse=capture / "cameras" / "sparse",
+        workspace=capture / "undistorted",
+        workspace_json=capture / "undistorted.json",
+        sparse=capture / "undistorted" / "sparse",
         photos_json=capture / "photos.json",
         prompts=prompts and capture / prompts,
         supplied=supplied,
@@ -149,7 +149,7 @@ def test_grabcut_finds_the_ball(capture, tmp_path):
 def test_a_photo_whose_colours_mislead_is_repaired_or_dropped(capture, tmp_path):
     broken = tmp_path / "capture"
     shutil.copytree(capture, broken)
-    photo = broken / "cameras" / "images" / "f3.png"
+    photo = broken / "undistorted" / "images" / "f3.png"
     cv2.imwrite(str(photo), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     output = tmp_path / "out"
     run_stage(broken, output)
@@ -243,7 +243,7 @@ class TrueNetwork:
 
 def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
     network = TrueNetwork()
-    network.images = [read_rgb(capture / "cameras" / "images" / f"f{k}.png") for k in range(PHOTOS)]
+    network.images = [read_rgb(capture / "undistorted" / "images" / f"f{k}.png") for k in range(PHOTOS)]
     monkeypatch.setattr(masks_module, "load_network", lambda *_: (network, "own weights"))
     run_stage(capture, tmp_path, method="sam2")
     assert network.segmented == [*range(PHOTOS), 5]
@@ -411,6 +411,12 @@ def test_ground_of_a_tilted_bowl_is_measured_beside_the_object():
     nowhere, found = find_ground(np.empty((0, 3)), box, box.to_box(prompts), 0)
     assert not found
     assert nowhere.height_of(np.array([[0, 0, box.low[2] + 1]])) == pytest.approx(1)
+
+
+def test_masks_agree_by_what_they_share_and_two_empty_ones_agree():
+    half, empty = np.arange(10)[:, None] < np.array([5]), np.zeros((10, 1), dtype=bool)
+    assert mask_iou(half, np.roll(half, 2)) == pytest.approx(3 / 7)
+    assert mask_iou(half, empty) == 0 and mask_iou(empty, empty) == 1
 
 
 def test_cleaned_turns_specks_and_pinholes():

@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.metrics.completion import completion_metrics, local_density, surface_variation
+from scenefuse.metrics.completion import MetricSettings, completion_metrics, local_density, surface_variation
 from scenefuse.metrics.compute_metrics import compute_metrics
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.metrics.registration import MetricSettings, registration_metrics
+from scenefuse.registration.agreement import registration_metrics
 from scenefuse.stage import quantity, read_json, write_json
 from scenefuse.transforms import Sim3
 
 SETTINGS = MetricSettings(
-    tau_fraction=0.016,
-    normal_neighbours=16,
     variation_spacings=8.0,
     density_neighbours=16,
     primitive_fraction=0.005,
@@ -41,7 +39,7 @@ def ball(n, seed=0):
 def test_fitness_counts_both_ways_and_rmse_is_the_shift():
     scene = Cloud(grid(20))
     obj = Cloud(np.concatenate([grid(20)[:100] + [0, 0, 0.3], grid(20)[:100] + [0, 0, 50.0]]))
-    found = registration_metrics(obj, scene, Sim3.identity(), 0.5, 10.0, "m", SETTINGS)
+    found = registration_metrics(obj, scene, Sim3.identity(), 0.5, 10.0, "m")
     assert found["fitness_source"]["value"] == pytest.approx(0.5)
     assert found["fitness_target"]["value"] == pytest.approx(0.25)
     assert found["f_score"]["value"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)
@@ -53,13 +51,13 @@ def test_fitness_counts_both_ways_and_rmse_is_the_shift():
 def test_normals_of_unrelated_surfaces_agree_by_chance_only():
     rng = np.random.default_rng(0)
     found = registration_metrics(
-        Cloud(rng.uniform(size=(3000, 3))), Cloud(rng.uniform(size=(3000, 3))), Sim3.identity(), 0.2, 1.0, "m", SETTINGS
+        Cloud(rng.uniform(size=(3000, 3))), Cloud(rng.uniform(size=(3000, 3))), Sim3.identity(), 0.2, 1.0, "m"
     )
     assert found["normal_consistency_cross"]["value"] == pytest.approx(0.5, abs=0.1)
 
 
 def test_no_inlier_gives_no_rmse():
-    found = registration_metrics(Cloud(grid(5)), Cloud(grid(5) + 100), Sim3.identity(), 0.1, 1.0, "m", SETTINGS)
+    found = registration_metrics(Cloud(grid(5)), Cloud(grid(5) + 100), Sim3.identity(), 0.1, 1.0, "m")
     assert found["inlier_rmse"]["value"] is None and found["fitness_source"]["value"] == 0
 
 

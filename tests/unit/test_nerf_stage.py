@@ -63,27 +63,27 @@ GATES = CloudGates(
 def workspace(tmp_path_factory):
     root = tmp_path_factory.mktemp("object")
     images, masks, k, poses, depths = sphere_views()
-    for folder in ("cameras/images", "cameras/sparse", "masks", "stage1"):
+    for folder in ("undistorted/images", "undistorted/sparse", "masks", "stage1"):
         (root / folder).mkdir(parents=True)
     rows = []
     for i, (image, mask, pose, depth) in enumerate(zip(images, masks, poses, depths)):
-        cv2.imwrite(str(root / f"cameras/images/{i:02d}.png"), image[..., ::-1])
+        cv2.imwrite(str(root / f"undistorted/images/{i:02d}.png"), image[..., ::-1])
         cv2.imwrite(str(root / f"masks/{i:02d}.png"), mask.astype(np.uint8) * 255)
         write_depth(root / f"stage1/depth_maps/{i:02d}.png.bin", depth.astype(np.float32))
         write_depth(root / f"stage1/confidence_maps/{i:02d}.png.bin", mask.astype(np.float32))
         rotation, move = pose[:3, :3].T, -pose[:3, :3].T @ pose[:3, 3]
         numbers = " ".join(f"{v:.12g}" for v in (*np.roll(Rotation.from_matrix(rotation).as_quat(), 1), *move))
         rows.append(f"{i + 1} {numbers} 1 {i:02d}.png\n\n")
-    (root / "cameras/sparse/images.txt").write_text("".join(rows))
-    (root / "cameras/sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
-    (root / "cameras/sparse/points3D.txt").write_text("")
-    write_json(root / "cameras.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
+    (root / "undistorted/sparse/images.txt").write_text("".join(rows))
+    (root / "undistorted/sparse/cameras.txt").write_text(f"1 PINHOLE 48 48 {k[0, 0, 0]} {k[0, 1, 1]} 24 24\n")
+    (root / "undistorted/sparse/points3D.txt").write_text("")
+    write_json(root / "undistorted.json", {"up_in_camera_frame": quantity([0.0, 0.0, 1.0], "1")})
     return root
 
 
 def _run(root, stage, previous=None, masks=None, settings=SETTINGS):
     train_object_nerf(
-        inputs=NerfInputs(root / "cameras", masks or root / "masks", prior=root / "stage1", previous=previous),
+        inputs=NerfInputs(root / "undistorted", masks or root / "masks", prior=root / "stage1", previous=previous),
         stage=root / stage,
         report=root / f"{stage}.json",
         checkpoints=root / "checkpoints",
@@ -116,8 +116,8 @@ def test_two_stages_and_the_cloud(workspace, stage2):
     assert not list((workspace / "checkpoints").rglob("*.pt"))
     make_object_cloud(
         inputs=CloudInputs(
-            workspace=workspace / "cameras",
-            workspace_json=workspace / "cameras.json",
+            workspace=workspace / "undistorted",
+            workspace_json=workspace / "undistorted.json",
             masks=workspace / "masks",
             stage=workspace / "stage4",
             stage_json=workspace / "stage4.json",

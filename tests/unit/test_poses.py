@@ -157,7 +157,7 @@ def room(folder, count: int, known: bool) -> np.ndarray:
 
 def _find(tmp_path):
     find_poses(
-        workspace=tmp_path / "cameras",
+        workspace=tmp_path / "undistorted",
         posed=tmp_path / "poses",
         report=tmp_path / "poses.json",
         settings=SETTINGS,
@@ -173,7 +173,7 @@ def _poses(model: pycolmap.Reconstruction) -> np.ndarray:
 
 @pytest.mark.parametrize("known", [True, False])
 def test_photos_of_a_planted_room_give_their_poses(tmp_path, known):
-    true = room(tmp_path / "cameras", 10, known)
+    true = room(tmp_path / "undistorted", 10, known)
     report, model = _find(tmp_path)
     found = _poses(model)
     up = np.array(report["up_in_camera_frame"]["value"])
@@ -204,12 +204,12 @@ def test_photos_of_a_planted_room_give_their_poses(tmp_path, known):
 
 
 def test_photos_without_matches_and_unreadable_photos_are_one_sentence(tmp_path):
-    room(tmp_path / "cameras", 4, False)
-    for path in (tmp_path / "cameras/images").iterdir():
+    room(tmp_path / "undistorted", 4, False)
+    for path in (tmp_path / "undistorted/images").iterdir():
         cv2.imwrite(str(path), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     with pytest.raises(StageError, match="only 1 of 4 photos share 20 matches with another"):
         _find(tmp_path)
-    (tmp_path / "cameras/images/01.png").unlink()
+    (tmp_path / "undistorted/images/01.png").unlink()
     with pytest.raises(StageError, match="01.png does not exist"):
         _find(tmp_path)
 

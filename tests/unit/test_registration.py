@@ -185,8 +185,8 @@ def stage_inputs(folder, obj, scene, up_in_object=None):
     write_cloud(folder / "object.ply", obj)
     write_cloud(folder / "crop.ply", scene)
     write_json(folder / "crop.json", {"up_in_scene": quantity(Z, ""), "diagonal": quantity(1.0, "m")})
-    write_json(folder / "cameras.json", {"up_in_camera_frame": quantity(up_in_object, "")})
-    return Inputs(folder / "object.ply", folder / "crop.ply", folder / "crop.json", folder / "cameras.json")
+    write_json(folder / "undistorted.json", {"up_in_camera_frame": quantity(up_in_object, "")})
+    return Inputs(folder / "object.ply", folder / "crop.ply", folder / "crop.json", folder / "undistorted.json")
 
 
 def test_stages_hand_their_files_on_and_register(tmp_path, house):

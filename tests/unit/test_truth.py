@@ -90,11 +90,11 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
         },
     )
     object_from_truth, scene_from_truth = TRUTH_FROM_OBJECT.inverse(), TRUTH_FROM_SCENE.inverse()
-    model_of(orbit, object_from_truth, root / "cameras/sparse")
+    model_of(orbit, object_from_truth, root / "undistorted/sparse")
     model_of(flight, scene_from_truth, root / "scene")
     write_json(root / "georeference.json", {"status": quantity("none", "")})
     caster = tr.cast_together([thing, plate])
-    posed = tr.read_posed(root / "cameras/sparse", orbit)
+    posed = tr.read_posed(root / "undistorted/sparse", orbit)
     (root / "masks").mkdir()
     (root / "truth/thing/masks").mkdir()
     for view, _ in posed:
@@ -159,7 +159,7 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     scene_of(planted, tmp_path / "s.json")
     evaluate_object(
         inputs=EvaluationInputs(
-            workspace=planted / "cameras",
+            workspace=planted / "undistorted",
             masks=planted / "masks",
             stages=[planted / "stage1", planted / "stage2"],
             cloud=planted / "object.ply",

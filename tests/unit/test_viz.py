@@ -7,9 +7,9 @@ import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.maps import write_depth
+from scenefuse.io.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
 from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
-from scenefuse.report.sheets import save_png
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Sim3
 
@@ -136,8 +136,8 @@ def capture(tmp_path_factory):
     model = pycolmap.Reconstruction()
     pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
     model.add_camera_with_trivial_rig(pinhole)
-    (folder / "cameras/images").mkdir(parents=True)
-    (folder / "cameras/sparse").mkdir()
+    (folder / "undistorted/images").mkdir(parents=True)
+    (folder / "undistorted/sparse").mkdir()
     (folder / "masks").mkdir()
     for k in range(4):
         camera = orbit_camera(whole.points, 90.0 * k, 20.0, (64, 48))
@@ -147,10 +147,10 @@ def capture(tmp_path_factory):
         image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k + 1)
         model.add_image_with_trivial_frame(image, pose_of_camera)
         picture = render(whole, camera, 0.05)
-        cv2.imwrite(str(folder / f"cameras/images/{k}.png"), picture)
+        cv2.imwrite(str(folder / f"undistorted/images/{k}.png"), picture)
         cv2.imwrite(str(folder / f"masks/{k}.png"), (picture.min(2) < 255).astype(np.uint8) * 255)
         write_depth(folder / f"stage1/depth_maps/{k}.png.bin", np.full((24, 32), 3.0, dtype=np.float32))
-    model.write(folder / "cameras/sparse")
+    model.write(folder / "undistorted/sparse")
     for stage in (2, 3, 4):
         (folder / f"stage{stage}").mkdir()
     return folder
@@ -167,7 +167,7 @@ def draw(capture, fine, figures):
         object_cloud=capture / "object.ply",
         fine_json=capture / "fine.json",
         metrics_json=capture / "metrics.json",
-        workspace=capture / "cameras",
+        workspace=capture / "undistorted",
         masks=capture / "masks",
         stages=[capture / f"stage{stage}" for stage in (1, 2, 3, 4)],
     )
@@ -204,7 +204,7 @@ def test_an_object_far_from_the_scene_is_named(capture, tmp_path):
 def test_scene_figure_with_a_failed_object(capture, tmp_path):
     figure = tmp_path / "scene.png"
     objects = [capture / "box", capture / "failed"]
-    files = {"dense": capture / "dense.ply", "georeferenced": capture / "cameras/sparse"}
+    files = {"dense": capture / "dense.ply", "georeferenced": capture / "undistorted/sparse"}
     draw_scene(name="demo", **files, objects=objects, failed=("failed",), figure=figure)
     picture = cv2.imread(str(figure)).astype(int)
     # Camera markers are red on a grey scene.

@@ -37,7 +37,7 @@ def summary_command(log):
 
 def held_up(rule):
     """The jobs of a rule that have not run, because of what failed before them. An object that fails holds up those that
-    wait for all objects; under --keep-going they run at the end without it."""
+    wait for all objects; they run at the end without it."""
     jobs = set(workflow.dag.needrun_jobs()) - workflow.scheduler.failed
     return [job for job in jobs if job.rule.name == rule]
 

@@ -34,7 +34,7 @@ rule make_masks:
         photos_json="results/objects/{object}/photos.json",
         sparse="results/objects/{object}/sparse",
         workspace="results/objects/{object}/undistorted",
-        undistorted_json="results/objects/{object}/undistorted.json",
+        workspace_json="results/objects/{object}/undistorted.json",
     output:
         masks=directory("results/objects/{object}/masks"),
         report="results/objects/{object}/masks.json",
@@ -62,6 +62,6 @@ rule make_masks:
     message:
         "{wildcards.object}: masks"
     shell:
-        "exec python {params.script} --workspace {input.workspace} --undistorted-json {input.undistorted_json}"
+        "exec python {params.script} --workspace {input.workspace} --workspace-json {input.workspace_json}"
         " --sparse {input.sparse} --photos-json {input.photos_json}"
         " --masks {output.masks} --report {output.report} --contact-sheet {output.sheet} --seed {params.seed} {params.options} &> {log}"

@@ -85,7 +85,7 @@ rule estimate_scale:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        cameras="results/objects/{object}/undistorted.json",
+        workspace_json="results/objects/{object}/undistorted.json",
     output:
         "results/objects/{object}/registration/{variant}/scale.json",
     log:
@@ -105,7 +105,7 @@ rule estimate_scale:
         "{wildcards.object}, variant {wildcards.variant}: scale"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --cameras-json {input.cameras} --report {output} {params.options} &> {log}"
+        " --workspace-json {input.workspace_json} --report {output} {params.options} &> {log}"
 
 
 rule register_coarsely:
@@ -115,7 +115,7 @@ rule register_coarsely:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        cameras="results/objects/{object}/undistorted.json",
+        workspace_json="results/objects/{object}/undistorted.json",
         scale="results/objects/{object}/registration/{variant}/scale.json",
     output:
         "results/objects/{object}/registration/{variant}/coarse.json",
@@ -138,7 +138,7 @@ rule register_coarsely:
         "{wildcards.object}, variant {wildcards.variant}: coarse registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --cameras-json {input.cameras} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
+        " --workspace-json {input.workspace_json} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule register_finely:
@@ -148,7 +148,7 @@ rule register_finely:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        cameras="results/objects/{object}/undistorted.json",
+        workspace_json="results/objects/{object}/undistorted.json",
         scale="results/objects/{object}/registration/{variant}/scale.json",
         coarse="results/objects/{object}/registration/{variant}/coarse.json",
         alignment="results/objects/{object}/alignment.json",
@@ -182,7 +182,7 @@ rule register_finely:
         "{wildcards.object}, variant {wildcards.variant}: fine registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --cameras-json {input.cameras} --scale-json {input.scale} --coarse-json {input.coarse} --alignment-json {input.alignment}"
+        " --workspace-json {input.workspace_json} --scale-json {input.scale} --coarse-json {input.coarse} --alignment-json {input.alignment}"
         " --workspace {input.workspace} --depth {input.depth} --report {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
 
@@ -194,7 +194,7 @@ rule register_as_paper:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/paper/crop.ply",
         crop_json="results/objects/{object}/registration/paper/crop.json",
-        cameras="results/objects/{object}/undistorted.json",
+        workspace_json="results/objects/{object}/undistorted.json",
     output:
         scale="results/objects/{object}/registration/paper/scale.json",
         coarse="results/objects/{object}/registration/paper/coarse.json",
@@ -223,7 +223,7 @@ rule register_as_paper:
         "{wildcards.object}: registration by the paper's recipe"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --cameras-json {input.cameras} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
+        " --workspace-json {input.workspace_json} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
         " --picture {output.picture} --seed {params.seed} &> {log}"
 
 

@@ -164,7 +164,5 @@ onerror:
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
     print(
-        "Some jobs failed; results/summary/summary.txt names them."
-        + ("" if keep_going else " With --keep-going the other objects go on."),
-        file=sys.stderr,
+        "Some jobs failed; results/summary/summary.txt names them.", file=sys.stderr
     )

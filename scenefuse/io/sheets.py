@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib import colormaps
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -104,6 +105,14 @@ def to_image(figure: Figure) -> Image:
     assert isinstance(canvas, FigureCanvasAgg)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
+
+
+def depth_colors(depth: NDArray[np.float32], low: float, high: float) -> Image:
+    """(H, W, 3) colours of a depth map, near bright; pixels without a depth are light grey."""
+    level = 1.0 - np.clip((depth - low) / max(high - low, 1e-9), 0.0, 1.0)
+    picture = (colormaps["viridis"](level)[..., :3] * 255).astype(np.uint8)
+    picture[depth <= 0] = 235
+    return picture
 
 
 def save_png(path: Path, image: Image) -> None:

@@ -1,48 +1,32 @@
-"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score."""
+"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score (method R10, R11, G1)."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.io.clouds import Cloud, plane_normals, spacing
 from scenefuse.stage import quantity, setting, threads
 from scenefuse.transforms import Array, Sim3
 
+# Neighbours that a plane is fitted to for a normal.
+NORMAL_NEIGHBOURS = 16
+# Points of both clouds together at which their common normals are measured.
+MOST_TOGETHER = 20000
+
 
 @dataclass(frozen=True)
-class MetricSettings:
-    """Settings of all metrics. Shares are of the full variant's crop diagonal, the same for every variant."""
+class AgreementSettings:
+    """When points correspond."""
 
     tau_fraction: float = setting(0.016, least=0)
     """Distance within which points correspond, as a share of the crop's diagonal."""
-    sample: int = setting(4000, least=0)
-    """Points at which a completion metric is measured, chosen by the seed."""
-    normal_neighbours: int = 16
-    """Neighbours that a normal is fitted to."""
-    variation_spacings: float = 8
-    """Radius of the surface variation, in spacings of the scene crop."""
-    density_neighbours: int = 16
-    """Neighbours k of the local density."""
-    primitive_fraction: float = 0.005
-    """Distance to a primitive within which a point lies on it, as a share of the crop's diagonal."""
-    primitive_support: float = 0.01
-    """Smallest share of the new points that makes a primitive."""
-    primitive_most: int = 20
-    """Most primitives taken."""
-    primitive_angle_deg: float = 25
-    """Largest angle in degrees between a point's normal and the primitive's."""
 
 
 def registration_metrics(
-    obj: Cloud,
-    scene: Cloud,
-    scene_from_object: Sim3,
-    tau: float,
-    diagonal: float,
-    unit: str,
-    settings: MetricSettings,
+    obj: Cloud, scene: Cloud, scene_from_object: Sim3, tau: float, diagonal: float, unit: str
 ) -> dict[str, dict[str, Any]]:
     """The registration.* numbers of one pose.
 
@@ -58,7 +42,6 @@ def registration_metrics(
         tau: inlier distance.
         diagonal: of the full variant's crop.
         unit: of the scene's lengths.
-        settings: for the normals.
     """
     moved = scene_from_object.apply(obj.points)
     ahead, partner = cKDTree(scene.points).query(moved, workers=threads())
@@ -66,16 +49,12 @@ def registration_metrics(
     inlier = ahead <= tau
     source, target = float(inlier.mean()), float((back <= tau).mean())
     rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
-    normals_object = plane_normals(moved, moved, settings.normal_neighbours)
-    normals_scene = plane_normals(scene.points, scene.points, settings.normal_neighbours)
+    normals_object, normals_scene = (_normals(points)[0] for points in (moved, scene.points))
     facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
     together = np.concatenate([moved[inlier], scene.points])
-    if len(together) > 20000:
-        together = together[np.random.default_rng(0).permutation(len(together))[:20000]]
-    union = plane_normals(together, together, settings.normal_neighbours)
-    neighbours = cKDTree(together).query(together, k=min(settings.normal_neighbours, len(together)), workers=threads())[
-        1
-    ]
+    if len(together) > MOST_TOGETHER:
+        together = together[np.random.default_rng(0).permutation(len(together))[:MOST_TOGETHER]]
+    union, neighbours = _normals(together)
     smooth = np.abs(np.einsum("nk,njk->nj", union, union[neighbours[:, 1:]])).mean()
     return {
         "fitness_source": quantity(source, "1"),
@@ -91,16 +70,7 @@ def registration_metrics(
     }
 
 
-def plane_normals(cloud: Array, at: Array, neighbours: int) -> Array:
-    """Unit normals (M, 3) at points `at` from the planes through their nearest neighbours in the cloud."""
-    index = cKDTree(cloud).query(at, k=min(neighbours, len(cloud)), workers=threads())[1]
-    local = cloud[index]
-    local = local - local.mean(1, keepdims=True)
-    return np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))[1][:, :, 0]
-
-
-def sampled(points: Array, most: int, seed: int) -> Array:
-    """At most that many of (N, 3) points, drawn evenly."""
-    if len(points) <= most:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]
+def _normals(points: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Normals (N, 3) of the planes through each point's nearest neighbours, and these (N, K)."""
+    neighbours = cKDTree(points).query(points, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    return plane_normals(points, neighbours), neighbours

@@ -1,0 +1,88 @@
+"""The library's structure: which way imports run, what stays out of it, and how large its folders are."""
+
+import ast
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+LIBRARY = ROOT / "scenefuse"
+# In the order in which data flow; each imports only itself and what stands before it.
+PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
+PACKAGES += ["metrics", "report"]
+# Shared by all, and importing no package.
+SHARED = ["stage", "transforms", "cores", "checkpoints", "fingerprint", "machine", "logs"]
+# The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.
+MAY_IMPORT = {name: {*SHARED, *PACKAGES[: PACKAGES.index(name) + 1]} for name in PACKAGES}
+MAY_IMPORT |= {name: set(SHARED) for name in SHARED}
+MAY_IMPORT["metrics"] |= {"demo.cameras"}
+MAY_IMPORT |= {"demo": {*SHARED, "io", "workspace", "demo"}, "config": {*SHARED, *PACKAGES, "demo"}}
+MOST_MODULES = 16
+CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
+CORE += ("progress", "pose_refinement")
+OUTSIDE = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
+OURS = {f"scenefuse.{name}" for name in ("stage", "transforms", "cores", "checkpoints")}
+
+
+def modules() -> list[Path]:
+    return sorted(path for path in LIBRARY.rglob("*.py") if path.name != "__init__.py")
+
+
+def imported(path: Path) -> Iterator[str]:
+    """The modules that a file imports, at its top or inside functions."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            module = str(node.module)
+            package = (ROOT / module.replace(".", "/")).is_dir()
+            yield from (f"{module}.{alias.name}" for alias in node.names) if package else [module]
+
+
+def part(module: str) -> str:
+    """The package of a module, or its name where it lies in none: `scenefuse.sfm.photos` -> `sfm`."""
+    return module.split(".")[1]
+
+
+def test_every_module_has_its_place_in_the_order():
+    assert {part(".".join(path.relative_to(ROOT).with_suffix("").parts)) for path in modules()} == set(MAY_IMPORT)
+
+
+def test_imports_run_from_later_packages_to_earlier_ones():
+    backwards = []
+    for path in modules():
+        here = path.relative_to(LIBRARY).with_suffix("").parts[0]
+        for module in imported(path):
+            allowed = not module.startswith("scenefuse") or part(module) in MAY_IMPORT[here]
+            if not allowed and module.removeprefix("scenefuse.") not in MAY_IMPORT[here]:
+                backwards.append(f"{path.relative_to(ROOT)} imports {module}")
+    assert backwards == []
+
+
+def test_the_library_never_sees_snakemake():
+    assert [str(path) for path in modules() for name in imported(path) if name.split(".")[0] == "snakemake"] == []
+
+
+def test_no_folder_holds_more_modules_than_a_screen_shows():
+    folders = [LIBRARY, *(path for path in LIBRARY.rglob("*") if path.is_dir())]
+    counts = {str(f.relative_to(ROOT)): sum(path.parent == f for path in modules()) for f in folders}
+    assert {folder: count for folder, count in counts.items() if count > MOST_MODULES} == {}
+
+
+@pytest.mark.parametrize("name", CORE)
+def test_the_core_of_the_nerf_imports_numpy_and_pytorch_only(name):
+    found = set(imported(LIBRARY / f"nerf/{name}.py"))
+    ours = {module for module in found if module.startswith("scenefuse")}
+    assert {module.split(".")[0] for module in found - ours} <= OUTSIDE
+    assert ours <= OURS | {f"scenefuse.nerf.{other}" for other in CORE}
+
+
+def test_one_module_reads_colmap_models():
+    readers = set()
+    for path in modules():
+        calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call) and node.args]
+        if any(ast.unparse(call.func).endswith("Reconstruction") for call in calls):
+            readers.add(str(path.relative_to(LIBRARY)))
+    assert readers == {"workspace.py"}
