@@ -32,9 +32,9 @@ from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.registration.agreement import AgreementSettings
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
-from scenefuse.registration.verify import FineSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings

@@ -10,12 +10,12 @@ import numpy as np
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import Candidate
+from scenefuse.registration.decision import DecidedBy, FineSettings, tilt_deg
 from scenefuse.registration.free_space import FreeSpace, read_free_space
 from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem, read_alignment, read_scales
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.score import Hypothesis
 from scenefuse.registration.uncertainty import Uncertainty, uncertainty_quantities
-from scenefuse.registration.verify import DecidedBy, FineSettings, tilt_deg
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 

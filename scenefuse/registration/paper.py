@@ -16,6 +16,7 @@ from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import MOST_POINTS as COARSE_POINTS
 from scenefuse.registration.coarse import coarse_quantities
+from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import ledger_row, pose_quantities
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.problem import Evidence, Inputs, Problem
@@ -23,7 +24,6 @@ from scenefuse.registration.refinement import MOST_POINTS
 from scenefuse.registration.scale import estimates, scale_quantities
 from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, score
 from scenefuse.registration.uncertainty import uncertainty_quantities
-from scenefuse.registration.verify import FineSettings, tilt_deg
 from scenefuse.stage import quantity, write_json
 from scenefuse.transforms import Array, Sim3
 

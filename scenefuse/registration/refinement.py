@@ -4,14 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.coarse import Candidate
+from scenefuse.registration.decision import DecidedBy, Decision, FineSettings, decide
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.registration.problem import Problem
 from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
 from scenefuse.registration.surface import Surface, with_grid, with_queries
 from scenefuse.registration.uncertainty import Uncertainty, half_sampling
-from scenefuse.registration.verify import DecidedBy, Decision, FineSettings, decide, turned_copies
 from scenefuse.transforms import Array, Sim3
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
@@ -184,3 +185,19 @@ class _Work:
         """How well a pose explains both clouds."""
         tau = self.settings.score_fraction * self.problem.scene.diagonal
         return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.evidence.free_space)
+
+
+def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:
+    """The pose turned about the object's centre: a full circle about the vertical and half turns about level axes.
+
+    Without gravity, the object's own principal axes take the vertical's place, each in turn.
+    """
+    centre = pose.apply(obj.points.mean(0))
+    principal = np.linalg.svd(pose.rotate(obj.points - obj.points.mean(0)), full_matrices=False)[2]
+    axes = principal if up_in_scene is None else up_in_scene[None]
+    copies = []
+    for axis in axes:
+        for angle in np.arange(1, steps) * 2 * np.pi / steps:
+            rotation = Rotation.from_rotvec(angle * axis).as_matrix()
+            copies.append(Sim3(1.0, rotation, centre - rotation @ centre) @ pose)
+    return copies

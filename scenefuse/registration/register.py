@@ -15,13 +15,13 @@ from scenefuse.registration.agreement import AgreementSettings, registration_met
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.crop.crop_scene import MIN_POINTS, crop_marked
+from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import pose_quantities
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.problem import Evidence, Problem, check_extent
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
 from scenefuse.registration.uncertainty import uncertainty_quantities
-from scenefuse.registration.verify import FineSettings, tilt_deg
 from scenefuse.sfm.fiducials import ScenePoints, read_points
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Array, Sim3

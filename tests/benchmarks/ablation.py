@@ -17,10 +17,10 @@ from scenefuse.io.settings import ROOT, build, read_settings
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.fine import EvidenceFiles, register_finely
 from scenefuse.registration.paper import register_as_paper
 from scenefuse.registration.problem import Inputs
-from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
 

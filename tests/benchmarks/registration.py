@@ -18,12 +18,12 @@ from support.planted import SHAPES, Trial, errors, plant
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.paper import paper_coarse, paper_fine
 from scenefuse.registration.problem import Evidence, Problem
 from scenefuse.registration.refinement import refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
-from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import run
 from scenefuse.transforms import Sim3
 

@@ -12,8 +12,8 @@ from support.planted import errors, plant
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
 from scenefuse.registration.coarse import CoarseSettings
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import Known, RegistrationSettings, register, register_clouds
-from scenefuse.registration.verify import FineSettings
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
 

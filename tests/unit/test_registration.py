@@ -12,6 +12,7 @@ from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.registration.candidates import match, ransac_similarities, upright_candidates
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
+from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import register_finely, scale_ledger
 from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
 from scenefuse.registration.free_space import read_free_space
@@ -23,7 +24,6 @@ from scenefuse.registration.scale import ScaleSettings, estimate_scale, estimate
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
 from scenefuse.registration.uncertainty import Uncertainty, half_sampling
-from scenefuse.registration.verify import FineSettings, tilt_deg
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 

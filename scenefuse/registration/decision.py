@@ -1,4 +1,4 @@
-"""May a pose be used? Turned copies of it, the margin to the best rival, and the gate (method R12)."""
+"""May a pose be used? The margin to the best rival, and the gate (method R12)."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -69,22 +69,6 @@ class Decision:
     margin: float
     rival: Hypothesis | None
     free_axis: Array | None
-
-
-def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:
-    """The pose turned about the object's centre: a full circle about the vertical and half turns about level axes.
-
-    Without gravity, the object's own principal axes take the vertical's place, each in turn.
-    """
-    centre = pose.apply(obj.points.mean(0))
-    principal = np.linalg.svd(pose.rotate(obj.points - obj.points.mean(0)), full_matrices=False)[2]
-    axes = principal if up_in_scene is None else up_in_scene[None]
-    copies = []
-    for axis in axes:
-        for angle in np.arange(1, steps) * 2 * np.pi / steps:
-            rotation = Rotation.from_rotvec(angle * axis).as_matrix()
-            copies.append(Sim3(1.0, rotation, centre - rotation @ centre) @ pose)
-    return copies
 
 
 def decide(
