@@ -15,7 +15,7 @@ from scenefuse.fusion.fuse_object import (
     write_scene,
 )
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud
-from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.stage import quantity, read_json, value, write_json
 
 

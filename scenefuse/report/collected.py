@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.report.values import Fields, find, load
 
 # What each step leaves, in the order in which the steps run.

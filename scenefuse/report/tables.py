@@ -8,7 +8,7 @@ from typing import Any
 
 import pandas as pd
 
-from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.values import Fields, find, number, unit_of
 

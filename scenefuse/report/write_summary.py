@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from scenefuse.logs import JobRecords
+from scenefuse.job_records import JobRecords
 from scenefuse.report.collected import Collected, collect, collect_scene, read_fields, status_of
 from scenefuse.report.summary_text import summary_text
 from scenefuse.report.tables import (

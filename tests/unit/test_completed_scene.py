@@ -8,7 +8,7 @@ import numpy as np
 from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
 from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.logs import JobRecords
+from scenefuse.job_records import JobRecords
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 

@@ -13,7 +13,7 @@ LIBRARY = ROOT / "scenefuse"
 PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
 PACKAGES += ["metrics", "report"]
 # Shared by all, and importing no package.
-SHARED = ["stage", "transforms", "cores", "checkpoints", "fingerprint", "machine", "logs"]
+SHARED = ["stage", "transforms", "cores", "checkpoints", "fingerprint", "machine", "job_records"]
 # The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.
 MAY_IMPORT = {name: {*SHARED, *PACKAGES[: PACKAGES.index(name) + 1]} for name in PACKAGES}
 MAY_IMPORT |= {name: set(SHARED) for name in SHARED}

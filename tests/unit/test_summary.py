@@ -7,7 +7,7 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from scenefuse.logs import JobRecords, why_unfinished
+from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, load, number
 from scenefuse.report.write_report import write_report
