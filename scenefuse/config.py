@@ -38,7 +38,7 @@ from scenefuse.registration.shared_features.align_models import AlignmentSetting
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.georeference import GeoreferenceSettings
-from scenefuse.sfm.mapping import MapSettings
+from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
@@ -102,7 +102,7 @@ SECTIONS: dict[str, list[Any]] = {
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings(max_features=3000, first_octave=0, camera_mode="auto")],
     "scene.matches": [MatchSettings()],
-    "scene.sparse": [MapSettings(min_registered_share=0.8)],
+    "scene.sparse": [MappingSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],
     "scene.undistort": [UndistortSettings()],
     "scene.depth_maps": [DepthMapSettings()],
@@ -111,7 +111,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.frames": [FrameSettings()],
     "object.features": [FeatureSettings()],
     "object.matches": [MatchSettings()],
-    "object.sparse": [MapSettings()],
+    "object.sparse": [MappingSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
     "object.poses": [PoseSettings()],

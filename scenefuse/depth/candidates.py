@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from scenefuse.depth.consistency import consistency_between_views, residuals_at_points
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.maps import tolerance_of
 from scenefuse.depth.self_supervision import minimum_reprojection, photometric_error, warp
 
@@ -15,7 +15,7 @@ Scores = dict[str, dict[str, float | None]]
 UNSEEN_ERROR = 0.5
 
 
-def score_candidates(candidates: dict[str, Tensor], photos: PhotoTensors) -> Scores:
+def score_candidates(candidates: dict[str, Tensor], photos: DepthPhotos) -> Scores:
     """Three measures of each set of depth maps, smaller is better, on trained photos and pixels that all sets have.
 
     Returns:
@@ -51,7 +51,7 @@ def best_candidate(scores: Scores) -> str:
 
 
 @torch.no_grad()
-def _photometric(depth: Tensor, photos: PhotoTensors, common: Tensor) -> float | None:
+def _photometric(depth: Tensor, photos: DepthPhotos, common: Tensor) -> float | None:
     """Mean error over the pixels in `common` of the photos that come closest to each photo."""
     held_out = torch.as_tensor(np.flatnonzero(~photos.trained), device=depth.device)
     centres = photos.object_from_cam[:, :3, 3]
@@ -73,7 +73,7 @@ def _photometric(depth: Tensor, photos: PhotoTensors, common: Tensor) -> float |
     return total / number if number else None
 
 
-def _residual(depth: Tensor, photos: PhotoTensors, candidates: dict[str, Tensor]) -> float | None:
+def _residual(depth: Tensor, photos: DepthPhotos, candidates: dict[str, Tensor]) -> float | None:
     """At the check points where no candidate has a hole in the four pixels around."""
     mine = residuals_at_points(depth, photos.checks)
     at_depth_one = [np.column_stack([p[:, :2], np.ones(len(p), np.float32)]) for p in photos.checks]

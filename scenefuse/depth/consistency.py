@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.self_supervision import reprojection_differences, sample
 
 Array = NDArray[np.floating]
@@ -38,7 +38,7 @@ class ViewConsistency:
 
 
 @torch.no_grad()
-def consistency_between_views(depth: Tensor, photos: PhotoTensors, tolerance: float) -> ViewConsistency:
+def consistency_between_views(depth: Tensor, photos: DepthPhotos, tolerance: float) -> ViewConsistency:
     """Forward-backward consistency of each depth map with those of its source views.
 
     A source view agrees by exp(-(e / tolerance)^2 / 2), where e is the depth that came back minus the depth. A view

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.networks import depth_from_disparity, disparity_from_depth
 from scenefuse.depth.self_supervision import points_in_cam, warp
 from scenefuse.mvs.matcher import Matcher
@@ -51,7 +51,7 @@ class NetworkInputs:
     between_points: Tensor
 
 
-def network_inputs(photos: PhotoTensors, planes: int) -> NetworkInputs:
+def network_inputs(photos: DepthPhotos, planes: int) -> NetworkInputs:
     """The network's input channels and the disparity it starts from.
 
     Args:
@@ -73,7 +73,7 @@ def network_inputs(photos: PhotoTensors, planes: int) -> NetworkInputs:
     return NetworkInputs(channels, first, between)
 
 
-def _between_points(photos: PhotoTensors, index: int) -> Tensor:
+def _between_points(photos: DepthPhotos, index: int) -> Tensor:
     """(1, 1, H, W) disparity: inverse-distance mean of the nearest SfM points, with outliers left out."""
     height, width = photos.images.shape[2:]
     points = photos.points[index]
@@ -94,7 +94,7 @@ def _between_points(photos: PhotoTensors, index: int) -> Tensor:
     return torch.from_numpy(value.astype(np.float32)).view(1, 1, height, width).to(photos.images.device)
 
 
-def _sweep(photos: PhotoTensors, index: int, planes: int) -> tuple[Tensor, Tensor]:
+def _sweep(photos: DepthPhotos, index: int, planes: int) -> tuple[Tensor, Tensor]:
     """(1, 1, H, W) disparity of the plane sweep and its score in 0..1; flat off the object.
 
     All planes at half size first; then, at full size, a few finer steps around what each pixel found there.
@@ -121,7 +121,7 @@ def _sweep(photos: PhotoTensors, index: int, planes: int) -> tuple[Tensor, Tenso
 
 
 def _best_hypothesis(
-    photos: PhotoTensors, index: int, cut: tuple[slice, slice], hypotheses: Tensor, shrink: int
+    photos: DepthPhotos, index: int, cut: tuple[slice, slice], hypotheses: Tensor, shrink: int
 ) -> tuple[Tensor, Tensor]:
     """Disparity with the best score among (D, h, w) equidistant hypotheses, to a fraction of a step, and its score."""
     chosen = photos.sources[index][:SWEEP_SOURCES]
@@ -143,7 +143,7 @@ def _best_hypothesis(
     return torch.from_numpy(smooth).to(found.device), here.clamp(0.0, 1.0)
 
 
-def _gray(photos: PhotoTensors, index: int, cut: tuple[slice, slice], shrink: int) -> View:
+def _gray(photos: DepthPhotos, index: int, cut: tuple[slice, slice], shrink: int) -> View:
     """A cut of a photo in grey, smaller by a whole number, in more contrast (CONTRAST)."""
     pixels = _smaller(photos.images[index].mean(0)[cut][None, None], shrink)[0, 0]
     intrinsics = photos.intrinsics[index].double().cpu().numpy().copy()

@@ -26,7 +26,7 @@ MIN_DEPTH = 1e-6
 
 
 @dataclass(frozen=True)
-class PhotoTensors:
+class DepthPhotos:
     """The V photos of an object as tensors.
 
     Attributes:
@@ -60,7 +60,7 @@ class PhotoTensors:
         return torch.linalg.inv(self.object_from_cam[source]) @ self.object_from_cam[target]
 
 
-def photo_tensors(views: Views, sources: int, device: torch.device) -> PhotoTensors:
+def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhotos:
     """Turn Views into tensors, find the depth range, and choose the source photos.
 
     Raises:
@@ -86,7 +86,7 @@ def photo_tensors(views: Views, sources: int, device: torch.device) -> PhotoTens
     def as_tensor(array: NDArray[np.generic]) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=device)
 
-    return PhotoTensors(
+    return DepthPhotos(
         as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
         as_tensor(views.masks)[:, None],
         as_tensor(views.intrinsics),

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from scenefuse.depth.consistency import TOLERANCE, ViewConsistency, align_to_points, residuals_at_points
 from scenefuse.depth.crops import Crops
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.self_supervision import sample
 from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.stage import quantity
@@ -17,7 +17,7 @@ from scenefuse.stage import quantity
 Content = dict[str, Any]
 
 
-def align_maps(raw: Tensor, photos: PhotoTensors, seed: int) -> Tensor:
+def align_maps(raw: Tensor, photos: DepthPhotos, seed: int) -> Tensor:
     """Each (1, H, W) depth map aligned to the SfM points of its photo, never to those kept for checking."""
     aligned = []
     for index, points in enumerate(photos.points):
@@ -46,13 +46,13 @@ def write_maps(folder: Path, crops: Crops, depth: Tensor, confidence: Tensor) ->
         write_depth(folder / "confidence_maps" / f"{name}.bin", crops.paste(index, confidence[index, 0].cpu().numpy()))
 
 
-def residual_at_checks(depth: Tensor, photos: PhotoTensors) -> float | None:
+def residual_at_checks(depth: Tensor, photos: DepthPhotos) -> float | None:
     """Median relative residual at the SfM points that no training saw; None where there are none."""
     residuals = np.concatenate(residuals_at_points(depth, photos.checks))
     return float(np.median(residuals)) if len(residuals) else None
 
 
-def map_quantities(depth: Tensor, consistency: ViewConsistency, photos: PhotoTensors) -> Content:
+def map_quantities(depth: Tensor, consistency: ViewConsistency, photos: DepthPhotos) -> Content:
     """Residual at SfM points, share of the object's pixels that other views confirm, and the typical disagreement."""
     on_object = photos.masks > 0
     confirmed = consistency.confidence[on_object] > 0.5
@@ -65,7 +65,7 @@ def map_quantities(depth: Tensor, consistency: ViewConsistency, photos: PhotoTen
     }
 
 
-def tolerance_of(photos: PhotoTensors) -> float:
+def tolerance_of(photos: DepthPhotos) -> float:
     """Difference of depth between views that still agrees, object units."""
     return TOLERANCE * photos.diagonal
 

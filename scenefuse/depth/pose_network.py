@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.networks import convolutions
 from scenefuse.stage import quantity
 from scenefuse.transforms import rotation_angle_deg
@@ -49,7 +49,7 @@ def rigid(axis_angle: Tensor, translation: Tensor) -> Tensor:
     return torch.cat([top, bottom], 1)
 
 
-def small_photos(photos: PhotoTensors) -> Tensor:
+def small_photos(photos: DepthPhotos) -> Tensor:
     """What the pose network sees: the photos at half size, unless they are tiny."""
     return functional.avg_pool2d(photos.images, 2) if min(photos.images.shape[2:]) > 64 else photos.images
 
@@ -65,7 +65,7 @@ def pose_error(found: Tensor, known: Tensor, unit: float) -> Tensor:
 
 
 @torch.no_grad()
-def pose_quantities(network: PoseNetwork, photos: PhotoTensors, poses: np.ndarray) -> dict[str, Any]:
+def pose_quantities(network: PoseNetwork, photos: DepthPhotos, poses: np.ndarray) -> dict[str, Any]:
     """The network's relative rotations and translations against those of (V, 4, 4) poses object_from_cam."""
     small = small_photos(photos)
     order = np.flatnonzero(photos.trained)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from scenefuse.depth.candidates import Scores, best_candidate, score_candidates
 from scenefuse.depth.consistency import consistency_between_views, fuse_by_inverse_variance
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.maps import Content, align_maps, map_quantities, print_quality, read_maps, tolerance_of, write_maps
 from scenefuse.depth.networks import disparity_from_depth
 from scenefuse.depth.train_depth import DepthTrainingSettings, prepare_inputs
@@ -140,7 +140,7 @@ def refine_depth(
     print_quality(content)
 
 
-def blend_depths(predicted: Tensor, rendered: Tensor, photos: PhotoTensors) -> Blend:
+def blend_depths(predicted: Tensor, rendered: Tensor, photos: DepthPhotos) -> Blend:
     """Blend two sets of (V, 1, H, W) depth maps, each weighted by its consistency between views."""
     tolerance = tolerance_of(photos)
     floor = FLOOR * tolerance
@@ -164,7 +164,7 @@ def _read_rendered(folder: Path, depth: Tensor, confidence: Tensor) -> Tensor:
     return torch.where(confidence >= MIN_RENDERED_CONFIDENCE, depth, torch.zeros_like(depth))
 
 
-def _supervision(channels: Tensor, blend: Blend, predicted: Tensor, photos: PhotoTensors) -> Supervision:
+def _supervision(channels: Tensor, blend: Blend, predicted: Tensor, photos: DepthPhotos) -> Supervision:
     """The networks start from the blend and learn it; where there is none they start from stage 1's depth."""
     farthest = torch.full_like(predicted, photos.far)
     filled = torch.where(blend.depth > 0, blend.depth, torch.where(predicted > 0, predicted, farthest))
@@ -172,7 +172,7 @@ def _supervision(channels: Tensor, blend: Blend, predicted: Tensor, photos: Phot
     return Supervision(channels, first, blend.depth, blend.weight)
 
 
-def _choice_quantities(kept: str, chosen: Tensor, scores: Scores, blend: Blend, photos: PhotoTensors) -> Content:
+def _choice_quantities(kept: str, chosen: Tensor, scores: Scores, blend: Blend, photos: DepthPhotos) -> Content:
     """Which depth was kept, the measures of all, and how much of the object each came from."""
     holes = ((chosen <= 0) & (photos.masks > 0)).sum() / photos.masks.sum().clamp_min(1)
     return {

@@ -11,7 +11,7 @@ from torch import Tensor
 from scenefuse.depth.consistency import consistency_between_views, residuals_at_points
 from scenefuse.depth.crops import Crops, crop_to_object
 from scenefuse.depth.first_depth import NetworkInputs, network_inputs
-from scenefuse.depth.inputs import PhotoTensors, photo_tensors
+from scenefuse.depth.inputs import DepthPhotos, depth_photos
 from scenefuse.depth.maps import (
     Content,
     align_maps,
@@ -126,14 +126,14 @@ def train_depth(
 
 def prepare_inputs(
     workspace: Path, masks: Path, settings: DepthTrainingSettings, hold_out_every: int, device: torch.device
-) -> tuple[Crops, PhotoTensors, NetworkInputs]:
+) -> tuple[Crops, DepthPhotos, NetworkInputs]:
     """Photos cut to the object, the same as tensors, and what the depth network is given; for stages 1 and 3."""
     crops = crop_to_object(load_views(workspace, masks, settings.width_px, hold_out_every), settings.crop_px)
-    photos = photo_tensors(crops.views, settings.sources, device)
+    photos = depth_photos(crops.views, settings.sources, device)
     return crops, photos, network_inputs(photos, settings.sweep_planes)
 
 
-def _input_quantities(crops: Crops, photos: PhotoTensors, inputs: NetworkInputs, networks: Networks) -> Content:
+def _input_quantities(crops: Crops, photos: DepthPhotos, inputs: NetworkInputs, networks: Networks) -> Content:
     """What the training had to work with, and how good depth was before it."""
 
     def residual(disparity: Tensor) -> float | None:
@@ -154,6 +154,6 @@ def _input_quantities(crops: Crops, photos: PhotoTensors, inputs: NetworkInputs,
     }
 
 
-def _residual_per_photo(depth: Tensor, photos: PhotoTensors, names: list[str]) -> dict[str, float]:
+def _residual_per_photo(depth: Tensor, photos: DepthPhotos, names: list[str]) -> dict[str, float]:
     residuals = residuals_at_points(depth, photos.points)
     return {name: float(np.median(r)) for name, r in zip(names, residuals) if len(r)}

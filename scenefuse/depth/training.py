@@ -13,7 +13,7 @@ from torch.nn import functional
 
 from scenefuse.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, require_finite
 from scenefuse.cores import use_threads
-from scenefuse.depth.inputs import PhotoTensors
+from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.networks import DepthNetwork, depth_from_disparity
 from scenefuse.depth.pose_network import PoseNetwork, pose_error, small_photos
 from scenefuse.depth.self_supervision import (
@@ -101,14 +101,14 @@ def prepare_torch(seed: int) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def new_networks(channels: int, photos: PhotoTensors) -> Networks:
+def new_networks(channels: int, photos: DepthPhotos) -> Networks:
     """Untrained networks on the photos' device; the pose network counts in typical distances to the object."""
     device = photos.images.device
     return Networks(DepthNetwork(channels).to(device), PoseNetwork((photos.near * photos.far) ** 0.5).to(device))
 
 
 def train_networks(
-    networks: Networks, photos: PhotoTensors, supervision: Supervision, recipe: Recipe, checkpoint: Path, seed: int
+    networks: Networks, photos: DepthPhotos, supervision: Supervision, recipe: Recipe, checkpoint: Path, seed: int
 ) -> list[dict[str, float]]:
     """Train both networks in place and return one row of mean losses per epoch.
 
@@ -157,7 +157,7 @@ def train_networks(
 
 
 @torch.no_grad()
-def predict(network: DepthNetwork, photos: PhotoTensors, supervision: Supervision) -> Tensor:
+def predict(network: DepthNetwork, photos: DepthPhotos, supervision: Supervision) -> Tensor:
     """(V, 1, H, W) depth of all photos, held-out ones too."""
     parts = zip(supervision.inputs.split(PHOTOS_AT_ONCE), supervision.first.split(PHOTOS_AT_ONCE))
     return depth_from_disparity(torch.cat([network(x, d) for x, d in parts]), photos.near, photos.far)
@@ -224,7 +224,7 @@ def key_of(*parts: Any) -> str:
 class _Scale:
     """The photos at one size, and the error of every pair of photos as they are (for the auto-mask)."""
 
-    def __init__(self, photos: PhotoTensors, shrink: int) -> None:
+    def __init__(self, photos: DepthPhotos, shrink: int) -> None:
         self.shrink = shrink
         self.images = self.pool(photos.images)
         self.masks = (self.pool(photos.masks) > SHARE_OF_PIXEL).to(photos.masks.dtype)
@@ -239,7 +239,7 @@ class _Scale:
 
 def _losses(
     networks: Networks,
-    photos: PhotoTensors,
+    photos: DepthPhotos,
     supervision: Supervision,
     scale: _Scale,
     chosen: Tensor,
@@ -317,7 +317,7 @@ def _huber(relative: Tensor) -> Tensor:
     return torch.where(size < SMALL_ERROR, size**2 / (2 * SMALL_ERROR), size - SMALL_ERROR / 2)
 
 
-def _padded(photos: PhotoTensors) -> tuple[Tensor, Tensor]:
+def _padded(photos: DepthPhotos) -> tuple[Tensor, Tensor]:
     """(V, N, 3) SfM points of all photos and (V, N) weights, zero for padding."""
     count, most = len(photos.points), max(1, *(len(p) for p in photos.points))
     points, weights = np.ones((count, most, 3), np.float32), np.zeros((count, most), np.float32)

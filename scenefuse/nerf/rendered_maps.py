@@ -32,7 +32,7 @@ SSIM_REACH_PX = 5
 
 
 @dataclass(frozen=True)
-class MapSettings:
+class RenderedMapSettings:
     """How depth maps are rendered and compared."""
 
     render_samples: int = 32
@@ -65,7 +65,12 @@ class RenderedMaps:
 
 
 def render_maps(
-    nerf: Nerf, photos: PhotoTensors, views: Views, poses: NDArray[np.float64], scale: float, settings: MapSettings
+    nerf: Nerf,
+    photos: PhotoTensors,
+    views: Views,
+    poses: NDArray[np.float64],
+    scale: float,
+    settings: RenderedMapSettings,
 ) -> RenderedMaps:
     """Render every photo.
 

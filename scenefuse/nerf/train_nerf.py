@@ -17,7 +17,7 @@ from scenefuse.io.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.rendered_maps import MapSettings
+from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.sfm.import_photos import import_photos
@@ -36,7 +36,7 @@ class TrainingOptions:
     """Batches, rates and samples."""
     losses: LossWeights = LossWeights()
     """Weights of the losses."""
-    maps: MapSettings = MapSettings()
+    maps: RenderedMapSettings = RenderedMapSettings()
     """Of the rendered maps."""
     gates: CloudGates = CloudGates()
     """Which points of the cloud are kept."""

@@ -21,8 +21,8 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.pose_refinement import refined_poses
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.rendered_maps import (
-    MapSettings,
     RenderedMaps,
+    RenderedMapSettings,
     measure_quality,
     read_nerf,
     render_maps,
@@ -57,7 +57,7 @@ class NerfSettings:
     """Batches, rates and samples."""
     losses: LossWeights = LossWeights()
     """Weights of the losses."""
-    maps: MapSettings = MapSettings()
+    maps: RenderedMapSettings = RenderedMapSettings()
     """Of the rendered maps, and of the depths that a prior begins with."""
     refinement: RefinementSettings = RefinementSettings()
     """Of the prior's depths by photos."""

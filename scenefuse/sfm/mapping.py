@@ -28,7 +28,7 @@ MIN_PHOTOS = 3
 
 
 @dataclass(frozen=True)
-class MapSettings:
+class MappingSettings:
     """Incremental mapping and bundle adjustment."""
 
     min_registered_share: float = setting(0.7, least=0, most=1)
@@ -36,7 +36,7 @@ class MapSettings:
 
 
 def map_photos(
-    *, folder: Path, photos: Path, database: Path, sparse: Path, report: Path, settings: MapSettings, seed: int
+    *, folder: Path, photos: Path, database: Path, sparse: Path, report: Path, settings: MappingSettings, seed: int
 ) -> None:
     """Recover cameras and sparse points by incremental mapping, then a last bundle adjustment.
 

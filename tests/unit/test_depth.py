@@ -14,7 +14,7 @@ from support.textured_plane import plane_views
 from scenefuse.depth import train_depth as stage
 from scenefuse.depth.consistency import align_to_points, consistency_between_views, fuse_by_inverse_variance
 from scenefuse.depth.first_depth import network_inputs
-from scenefuse.depth.inputs import photo_tensors
+from scenefuse.depth.inputs import depth_photos
 from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
 from scenefuse.depth.pose_network import PoseNetwork, rigid
 from scenefuse.depth.self_supervision import (
@@ -155,7 +155,7 @@ def test_inverse_variance_by_hand():
 
 def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
     views, truth = plane_views(held_out=0)
-    photos = photo_tensors(views, 4, torch.device("cpu"))
+    photos = depth_photos(views, 4, torch.device("cpu"))
     depth = torch.tensor(truth, dtype=torch.float32)[:, None]
     right = consistency_between_views(depth, photos, 0.02)
     inner = torch.nn.functional.max_pool2d(1 - photos.masks, 5, 1, 2) == 0
@@ -168,7 +168,7 @@ def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
 
 def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
     views, truth = plane_views()
-    photos = photo_tensors(views, 4, torch.device("cpu"))
+    photos = depth_photos(views, 4, torch.device("cpu"))
     assert not np.isin(np.flatnonzero(views.held_out), photos.sources.numpy()).any()
     first = network_inputs(photos, 16).first
     depth = depth_from_disparity(first, photos.near, photos.far).numpy()[:, 0]
@@ -178,7 +178,7 @@ def test_first_disparity_is_near_the_truth_and_sources_are_never_held_out():
 
 def test_the_plane_sweep_alone_is_near_the_truth():
     views, truth = plane_views(width=128, height=96)
-    photos = photo_tensors(views, 4, torch.device("cpu"))
+    photos = depth_photos(views, 4, torch.device("cpu"))
     swept = (network_inputs(photos, 24).channels[:, -2:-1] + 1) / 2
     depth = depth_from_disparity(swept, photos.near, photos.far).numpy()[:, 0]
     error = np.abs(depth - truth)[views.masks] / photos.diagonal
@@ -207,7 +207,7 @@ def _train(checkpoint, photos, stop_at=None):
 
 
 def _photos():
-    return photo_tensors(plane_views(6)[0], 3, torch.device("cpu"))
+    return depth_photos(plane_views(6)[0], 3, torch.device("cpu"))
 
 
 @pytest.fixture(scope="module")
@@ -327,6 +327,6 @@ def test_the_stage_writes_maps_near_the_truth_and_says_how_near(tmp_path, monkey
 def test_too_few_points_or_photos_is_one_sentence():
     views, _ = plane_views()
     with pytest.raises(StageError, match="SfM points lie on the object"):
-        photo_tensors(replace(views, tracks=[np.arange(3)] * 8), 4, torch.device("cpu"))
+        depth_photos(replace(views, tracks=[np.arange(3)] * 8), 4, torch.device("cpu"))
     with pytest.raises(StageError, match="needs at least 3"):
-        photo_tensors(replace(views, held_out=np.arange(8) > 1), 4, torch.device("cpu"))
+        depth_photos(replace(views, held_out=np.arange(8) > 1), 4, torch.device("cpu"))

@@ -19,7 +19,7 @@ from scenefuse.mvs.views import load_views
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates
 from scenefuse.nerf.render import RenderedView
-from scenefuse.nerf.rendered_maps import MapSettings, measure_quality
+from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
 from scenefuse.nerf.train_nerf import TrainingOptions, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
@@ -356,7 +356,7 @@ OPTIONS = TrainingOptions(
         occupancy_cells=32,
     ),
     losses=LossWeights(),
-    maps=MapSettings(map_agreement=0.03),
+    maps=RenderedMapSettings(map_agreement=0.03),
     gates=CloudGates(
         point_agreement=0.05, min_confidence=0.0, through_share=0.5, mask_share=0.3, outlier_deviations=4.0
     ),

@@ -15,7 +15,7 @@ from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.rendered_maps import MapSettings
+from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
@@ -44,7 +44,7 @@ SETTINGS = NerfSettings(
     schedule=Schedule(epochs=2, rays_per_epoch=200 * 256),
     recipe=RECIPE,
     losses=WEIGHTS,
-    maps=MapSettings(render_samples=24, map_agreement=0.03),
+    maps=RenderedMapSettings(render_samples=24, map_agreement=0.03),
     refinement=UNREFINED,
 )
 

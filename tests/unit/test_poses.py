@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.depth.inputs import photo_tensors
+from scenefuse.depth.inputs import depth_photos
 from scenefuse.mvs.views import load_views
 from scenefuse.poses.bundle_adjustment import adjust_bundle, link_tracks
 from scenefuse.poses.correspondences import PhotoFeatures, TwoViewPair, find_pairs, match, two_view_depths
@@ -200,7 +200,7 @@ def test_photos_of_a_planted_room_give_their_poses(tmp_path, known):
         # what the training stages read: these poses, the refined focal length, and points that project where seen
         assert np.allclose(views.object_from_cam, found[1:]) and len(views.sparse) == len(points)
         assert views.intrinsics[0, 0, 0] == pytest.approx(0.5 * FOCAL, rel=0.01)
-        assert photo_tensors(views, 4, torch.device("cpu")).near > 0.3  # of a median depth of 1
+        assert depth_photos(views, 4, torch.device("cpu")).near > 0.3  # of a median depth of 1
 
 
 def test_photos_without_matches_and_unreadable_photos_are_one_sentence(tmp_path):

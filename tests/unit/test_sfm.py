@@ -10,7 +10,7 @@ from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_featu
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.mapping import MapSettings, map_photos
+from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import match_features
 from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
 from scenefuse.sfm.photos import Photo, list_photos, write_photos
@@ -21,7 +21,7 @@ from scenefuse.workspace import View, write_model
 
 PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
 FEATURES = FeatureSettings(max_image_size_px=1000, max_features=800, first_octave=0, camera_mode="auto")
-MAPPING = MapSettings(min_registered_share=0.8)
+MAPPING = MappingSettings(min_registered_share=0.8)
 FRAME = LocalFrame(47.0, 8.0, 400.0)
 # COLMAP's lists separate by blanks and take # for a comment.
 NAMES = ["# 0.png", "1 {1}.png", "2 Süd.png", "3.png", "4.png", "5.png"]
