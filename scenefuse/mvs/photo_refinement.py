@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from scenefuse.mvs.matcher import Matcher
-from scenefuse.mvs.plane_sweep import refine_depth
+from scenefuse.mvs.plane_sweep import refine_by_matching
 from scenefuse.mvs.views import Views
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
@@ -79,7 +79,7 @@ def refine_by_photos(
         part = np.s_[top:bottom, left:right]
         near = [photos[s] for s in sources[index]]
         matcher = Matcher(_cut(photos[index], top, left, bottom, right), near, BEST_SOURCES, window, device)
-        found = refine_depth(matcher, depth[part], settings.match_reach_px, settings.match_min_score)
+        found = refine_by_matching(matcher, depth[part], settings.match_reach_px, settings.match_min_score)
         result.depths[index][part], result.moved[index][part], result.inconsistent[index][part] = found
     return result
 

@@ -104,7 +104,7 @@ def estimate_depth(
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
 
-def refine_depth(
+def refine_by_matching(
     matcher: Matcher, depth: NDArray[np.float32], reach_px: float, min_score: float
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_]]:
     """A depth map that is nearly right, moved to where the photos match best.

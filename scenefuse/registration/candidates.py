@@ -13,7 +13,7 @@ from scenefuse.transforms import Array, Sim3, rotation_between
 # Triples that pass the checks and are tried on all matches: as many as fit into memory at once.
 MOST_TRIPLES = 2000
 # How much the scales of a triple's three edges may differ, least over largest.
-SAME_SCALE = 0.9
+LEAST_EDGE_RATIO = 0.9
 
 
 def fpfh(surface: Surface, radius: float) -> Array:
@@ -69,7 +69,7 @@ def ransac_similarities(
     edges_y = np.stack([np.linalg.norm(y[triples[:, i]] - y[triples[:, i - 1]], axis=1) for i in range(3)])
     ratio = edges_y / np.maximum(edges_x, 1e-12)
     middle = np.exp(np.log(np.maximum(ratio, 1e-12)).mean(0))
-    good = (edges_y.min(0) > 3 * tau) & (ratio.min(0) > SAME_SCALE * ratio.max(0))
+    good = (edges_y.min(0) > 3 * tau) & (ratio.min(0) > LEAST_EDGE_RATIO * ratio.max(0))
     good &= np.abs(np.log(np.maximum(middle, 1e-12) / scales.centre)) <= scales.width + 0.05
     triples, middle = triples[good], middle[good]
     if len(triples) == 0:

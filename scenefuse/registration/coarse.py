@@ -19,7 +19,7 @@ from scenefuse.transforms import Sim3, rotation_between
 Candidate = tuple[Sim3, str]
 
 # Points kept of either cloud, and query points of the score: enough to rank poses, which differ grossly here.
-MOST_POINTS = 6000
+COARSE_POINTS = 6000
 QUERY_POINTS = 1200
 # Voxel of the upright sweep, as a share of the scene crop's diagonal: a fast Fourier transform of some 50^3 cells.
 SWEEP_VOXEL_FRACTION = 0.045
@@ -100,7 +100,7 @@ def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothes
     """Distinct hypotheses, best first: features and gravity propose, brief refinement and the score rank them."""
     scales, diagonal, seed = problem.scales, problem.scene.diagonal, problem.seed
     tau = SCORE_FRACTION * diagonal
-    obj, target = problem.surfaces(scales.centre, SCORE_FRACTION / 2, MOST_POINTS)
+    obj, target = problem.surfaces(scales.centre, SCORE_FRACTION / 2, COARSE_POINTS)
     cell, reach = SCORE_FRACTION / 2 * diagonal, GRID_REACH * diagonal
     both = (
         with_queries(with_grid(obj, cell / scales.centre, reach / scales.centre), QUERY_POINTS, seed),
@@ -126,7 +126,7 @@ def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     if ups is None:
         return []
     level = Sim3(1.0, rotation_between(ups[1], np.array([0.0, 0.0, 1.0])), np.zeros(3))
-    obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, MOST_POINTS)
+    obj, scene = problem.surfaces(scales.centre, SWEEP_VOXEL_FRACTION / 2, COARSE_POINTS)
     steps, most = (settings.scale_steps, settings.yaw_steps), settings.candidates // 2
     found = upright_candidates(obj, scene.transformed(level), ups[0], scales, *steps, voxel, most)
     return [level.inverse() @ pose for pose in found]
@@ -140,11 +140,11 @@ def _from_features(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     found: list[Sim3] = []
     for fraction in settings.voxel_fractions:
         voxel = fraction * problem.scene.diagonal
-        target = prepare(problem.scene, voxel, seed, MOST_POINTS)
+        target = prepare(problem.scene, voxel, seed, COARSE_POINTS)
         target_features = fpfh(target, 5 * voxel)
         for step in steps:
             scale = scales.centre * np.exp(scales.width * step)
-            obj = prepare(problem.object, voxel / scale, seed, MOST_POINTS)
+            obj = prepare(problem.object, voxel / scale, seed, COARSE_POINTS)
             pairs = match(fpfh(obj, 5 * voxel / scale), target_features)
             x, y = obj.points[pairs[:, 0]], target.points[pairs[:, 1]]
             found += ransac_similarities(
@@ -159,5 +159,5 @@ def _centred(problem: Problem) -> Hypothesis:
     rotation = np.eye(3) if ups is None else rotation_between(*ups)
     shift = problem.scene.points.mean(0) - scale * (rotation @ problem.object.points.mean(0))
     pose = Sim3(scale, rotation, shift)
-    surfaces = problem.surfaces(scale, SCORE_FRACTION / 2, MOST_POINTS)
+    surfaces = problem.surfaces(scale, SCORE_FRACTION / 2, COARSE_POINTS)
     return Hypothesis(pose, "centres", score(*surfaces, pose, SCORE_FRACTION * problem.scene.diagonal, scale))

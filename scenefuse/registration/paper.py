@@ -14,13 +14,12 @@ import numpy as np
 
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
-from scenefuse.registration.coarse import MOST_POINTS as COARSE_POINTS
-from scenefuse.registration.coarse import coarse_quantities
+from scenefuse.registration.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import ledger_row, pose_quantities
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.problem import Evidence, Inputs, Problem
-from scenefuse.registration.refinement import MOST_POINTS
+from scenefuse.registration.refinement import FINE_POINTS
 from scenefuse.registration.scale import estimates, scale_quantities
 from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, score
 from scenefuse.registration.uncertainty import uncertainty_quantities
@@ -65,7 +64,7 @@ def register_as_paper(
     pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
     between = time.perf_counter()
-    fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, MOST_POINTS)
+    fine = _rated(problem, paper_fine(obj, scene, pose), FineSettings().voxel_fraction, FINE_POINTS)
     end = time.perf_counter()
     if picture is not None:
         draw_alignment(picture, obj, scene, fine.pose, seed)

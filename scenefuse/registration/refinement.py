@@ -16,7 +16,7 @@ from scenefuse.registration.uncertainty import Uncertainty, half_sampling
 from scenefuse.transforms import Array, Sim3
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
-MOST_POINTS = 12000
+FINE_POINTS = 12000
 QUERY_POINTS = 1200
 POLISH_QUERY_POINTS = 3000
 # Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
@@ -75,7 +75,7 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
 def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
     """Thin and index both clouds for poses of about this scale."""
     diagonal, fraction, seed = problem.scene.diagonal, settings.voxel_fraction, problem.seed
-    obj, scene = problem.surfaces(scale, fraction, MOST_POINTS)
+    obj, scene = problem.surfaces(scale, fraction, FINE_POINTS)
     cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
     return _Work(
         replace(problem, scales=problem.scales.widened(BEYOND_PRIOR)),
@@ -86,7 +86,7 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
             with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
         ),
         (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
-        problem.surfaces(scale, 2 * fraction, MOST_POINTS),
+        problem.surfaces(scale, 2 * fraction, FINE_POINTS),
     )
 
 

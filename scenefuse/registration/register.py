@@ -27,7 +27,7 @@ from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Array, Sim3
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
-MOST_POINTS = 500_000
+SEARCHED_POINTS = 500_000
 # Points in which too few different ones are looked for before all are counted.
 SAMPLE = 20_000
 REGISTERED, UNREGISTERED = 0, 3
@@ -147,7 +147,7 @@ def register_clouds(
         _check_points(cloud, name)
     origins = np.floor(obj.points.mean(0)), np.floor(scene.points.mean(0))
     near_obj, near_scene = (
-        _at_most(replace(cloud, points=cloud.points - origin), MOST_POINTS, seed)
+        _at_most(replace(cloud, points=cloud.points - origin), SEARCHED_POINTS, seed)
         for cloud, origin in zip((obj, scene), origins)
     )
     if scales is None:

@@ -28,7 +28,7 @@ from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 # Random triples of matches drawn, those of them fitted, the matches that rank these, the best that are refined.
 RANSAC_SAMPLES, PROPOSALS, RANKED_ON, FINALISTS = 100_000, 2000, 300, 10
 # How much the scales of a triple's three edges may differ, least over largest.
-SAME_SCALE = 0.8
+LEAST_EDGE_RATIO = 0.8
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
 ROUNDS = 20
@@ -174,7 +174,7 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
     triples = rng.integers(0, len(seen.x), (RANSAC_SAMPLES, 3))
     edges = [np.linalg.norm(p[triples] - p[np.roll(triples, 1, axis=1)], axis=2) for p in (seen.x, seen.y)]
     ratio = edges[1] / np.maximum(edges[0], 1e-300)
-    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > SAME_SCALE * ratio.max(1))
+    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > LEAST_EDGE_RATIO * ratio.max(1))
     proposed = []
     for triple in triples[fair][:PROPOSALS]:
         with contextlib.suppress(ValueError):
