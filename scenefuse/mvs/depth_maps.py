@@ -10,8 +10,8 @@ import torch
 
 from scenefuse.cores import use_threads
 from scenefuse.io.maps import read_depth, write_depth, write_normals
-from scenefuse.mvs.colmap_workspace import MAPS, collect_maps, linked_workspace
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
+from scenefuse.mvs.temporary_workspace import MAPS, collect_maps, linked_workspace
 from scenefuse.mvs.view_selection import Reference, select_views
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.stage import StageError, atomic_directory, manifest, quantity, threads, write_json

@@ -1,4 +1,4 @@
-"""A temporary workspace in the convention of COLMAP's dense part, and the maps that its stereo leaves there."""
+"""The temporary workspace that COLMAP's dense stereo and fusion run in, and the maps that its stereo leaves there."""
 
 import os
 from collections.abc import Iterable, Iterator, Mapping
