@@ -37,7 +37,7 @@ bench-nerf: .venv/ready
 	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7 rich==14.0.0 markdown-it-py==3.0.0 mdurl==0.1.2
 	PYTHONPATH=tests python tests/benchmarks/nerf.py --threads $(CORES)
 
-# The schema and the tables of config/README.md, from the settings dataclasses.
+# Writes workflow/schemas/config.schema.yaml and the tables of config/README.md, from the settings dataclasses; nothing in docs/.
 docs: .venv/ready
 	PYTHONPATH=. python workflow/generate.py
 
