@@ -1,0 +1,1 @@
+"""The rendered capture with known truth: meshes, textures, cameras, photos, simulated clicks."""

@@ -1,0 +1,1 @@
+"""Files: point clouds, depth and normal maps, pictures, masks, tables, settings."""

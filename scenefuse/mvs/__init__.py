@@ -1,0 +1,1 @@
+"""Dense stereo: view selection, plane sweep, depth maps, their consistency, dense cloud; visual hull."""

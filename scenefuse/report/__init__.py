@@ -1,0 +1,1 @@
+"""Pictures, tables, summary and report page of a run."""

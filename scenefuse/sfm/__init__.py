@@ -1,0 +1,1 @@
+"""Structure from motion: photos, features, matches, mapping, georeferencing, undistortion; gravity and fiducials."""
