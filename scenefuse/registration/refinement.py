@@ -188,9 +188,9 @@ class _Work:
 
 
 def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:
-    """The pose turned about the object's centre: a full circle about the vertical and half turns about level axes.
+    """The pose turned about the object's centre in `steps` steps of a full circle, the pose itself left out.
 
-    Without gravity, the object's own principal axes take the vertical's place, each in turn.
+    The axis is the vertical; where it is not known, each of the object's principal axes.
     """
     centre = pose.apply(obj.points.mean(0))
     principal = np.linalg.svd(pose.rotate(obj.points - obj.points.mean(0)), full_matrices=False)[2]

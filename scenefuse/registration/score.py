@@ -47,7 +47,8 @@ class Score:
         precision: share of the object that the scene confirms.
         recall: share of the scene crop that the object explains.
         color: correlation of the colours over the pairs after one gain and bias per channel; None without colours.
-        blocked: share of the object that stands where the scene's cameras saw through; None where it is not known.
+        free_space_violation: share of the object in the scene's free space, where photos measured surfaces behind it;
+            None where the free space is not known.
         total: the number hypotheses are ranked by: F, with the object's area at the usual scale, times the agreement
             of colours, times the share outside free space.
     """

@@ -1,6 +1,6 @@
 """The paper's Table 4 on the demo: every registration variant over several seeds, at the full variant's thresholds.
 
-make demo, then make bench-ablation; or python tests/benchmarks/ablation.py --results results --seeds 3
+make demo, then PYTHONPATH=. python tests/benchmarks/ablation.py --results results --seeds 3
 """
 
 import tempfile
