@@ -111,6 +111,12 @@ def photos_in(path, where):
         ) from None
 
 
+def as_inputs(files):
+    """Input function: the files of another one whose names hold no brace, which Snakemake would take for a wildcard. `state_of`
+    sees the others as well."""
+    return lambda wildcards: [path for path in files(wildcards) if "{" not in path]
+
+
 def state_of(files):
     """Params function: what an input function's own files of the user hold; Snakemake takes one with an older date for the one it
     knew. (A params function that asks for `input` would not be recorded.)"""

@@ -30,7 +30,7 @@ rule fetch_sam2_weights:
 rule make_masks:
     """Where the object is in each frame: SAM 2, GrabCut, or your own masks (paper 3.2)."""
     input:
-        mask_inputs,
+        as_inputs(mask_inputs),
         photos_json="results/objects/{object}/photos.json",
         sparse="results/objects/{object}/sparse",
         workspace="results/objects/{object}/undistorted",

@@ -15,7 +15,7 @@ include: "../functions/sfm.smk"
 rule list_photos:
     """List the flight's photos, turn rotated ones upright, and stop at one that cannot be read."""
     input:
-        scene_photos,
+        as_inputs(scene_photos),
     output:
         upright=directory("results/scenes/{scene}/photos"),
         photos="results/scenes/{scene}/photos.json",
@@ -42,7 +42,7 @@ rule list_photos:
 rule extract_frames:
     """Frames from a folder of photos or a video."""
     input:
-        object_photos,
+        as_inputs(object_photos),
     output:
         frames=directory("results/objects/{object}/frames"),
         photos="results/objects/{object}/photos.json",
