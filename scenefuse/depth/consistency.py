@@ -77,7 +77,7 @@ def align_to_points(predicted: Array, measured: Array, seed: int = 0) -> tuple[f
 
     RANSAC over pairs scored by the median residual, then Tukey-weighted least squares. The shift is used, and the
     scale differs from one, only where each lowers the median residual by more than its sampling error, 1 / sqrt(N):
-    with few points the depth map itself is the better alignment (method N1).
+    with few points the depth map itself is the better evidence (method N1).
 
     Args:
         predicted: (N,) depths of the map at SfM points.
