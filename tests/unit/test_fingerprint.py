@@ -1,5 +1,6 @@
 import ast
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -122,3 +123,59 @@ def test_no_import_of_the_library_is_overlooked():
         for node in (node for node in nodes if isinstance(node, ast.ImportFrom)):
             names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
         assert names <= set(imported_names(source, module, root)), module
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    """A copy of the library and of its scripts."""
+    root, copy = Path(__file__).resolve().parents[2], tmp_path_factory.mktemp("project")
+    for part in ("scenefuse", "scripts"):
+        shutil.copytree(root / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
+
+
+def changed_by(edit, module, root):
+    """The scripts whose fingerprint changes when a module's source is edited, and not the module back again."""
+
+    def fingerprints():
+        forget()
+        return {path.relative_to(root / "scripts").as_posix(): fingerprint(path, root) for path in scripts}
+
+    scripts, path = sorted((root / "scripts").rglob("*.py")), root / module
+    source, before = path.read_text(), fingerprints()
+    path.write_text(edit(source))
+    after = fingerprints()
+    path.write_text(source)
+    return {script for script in before if before[script] != after[script]}
+
+
+def one_more_statement(source):
+    return source + "\n\ndef added():\n    return 1\n"
+
+
+def new_words(source):
+    """The same code with other comments and another docstring."""
+    return "# A comment.\n" + source.replace('"""', '"""Anew: ', 1) + "\n# Another comment.\n"
+
+
+@pytest.mark.parametrize(
+    "module, reached",
+    [
+        # Not only what runs it: the paper's recipe takes no more than a constant from it, register.py all stages.
+        (
+            "scenefuse/registration/refinement.py",
+            {"register.py", "registration/register_as_paper.py", "registration/register_finely.py"},
+        ),
+        ("scenefuse/masks/grabcut_passes.py", {"masks/make_masks.py"}),
+        ("scripts/masks/make_masks.py", {"masks/make_masks.py"}),
+    ],
+)
+def test_an_edit_changes_exactly_the_scripts_that_import_the_module_and_a_comment_none(copied, module, reached):
+    assert changed_by(one_more_statement, module, copied) == reached
+    assert changed_by(new_words, module, copied) == set()
+
+
+def test_an_edit_of_what_all_stages_share_changes_every_script(copied):
+    scripts = {path.relative_to(copied / "scripts").as_posix() for path in (copied / "scripts").rglob("*.py")}
+    assert changed_by(one_more_statement, "scenefuse/stage.py", copied) == scripts
+    assert changed_by(new_words, "scenefuse/stage.py", copied) == set()

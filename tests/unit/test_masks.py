@@ -146,20 +146,15 @@ def test_grabcut_finds_the_ball(capture, tmp_path):
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[1] == 8 * 240
 
 
-def test_a_photo_whose_colours_mislead_is_repaired_or_dropped(capture, tmp_path):
-    broken = tmp_path / "capture"
-    shutil.copytree(capture, broken)
-    photo = broken / "undistorted" / "images" / "f3.png"
-    cv2.imwrite(str(photo), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
-    output = tmp_path / "out"
-    run_stage(broken, output)
-    report = read_json(output / "masks.json")
-    mask = cv2.imread(str(output / "masks" / "f3.png"), cv2.IMREAD_GRAYSCALE)
-    truth = cv2.imread(str(capture / "truth" / "f3_mask.png"), cv2.IMREAD_GRAYSCALE) > 0
-    if mask is None:
-        assert "IoU with the visual hull" in report["dropped"]["f3.png"]
-    else:
-        assert mask_iou(mask > 0, truth) > 0.75
+def test_a_photo_that_shows_nothing_is_left_out_for_disagreeing_with_the_hull_and_no_other(capture, tmp_path):
+    grey = tmp_path / "capture"
+    shutil.copytree(capture, grey)
+    cv2.imwrite(str(grey / "undistorted" / "images" / "f3.png"), np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
+    run_stage(grey, tmp_path)
+    report = read_json(tmp_path / "masks.json")
+    assert list(report["dropped"]) == ["f3.png"]
+    assert report["dropped"]["f3.png"].startswith("IoU with the visual hull is 0.0")
+    assert sorted(path.stem for path in (tmp_path / "masks").iterdir()) == ["f0", "f1", "f2", "f4", "f5", "f6", "f7"]
 
 
 def test_supplied_masks_are_taken_as_they_are_and_strangers_are_an_error(capture, tmp_path):
@@ -193,6 +188,27 @@ def test_bad_supplied_masks_are_left_out_with_their_reason(capture, tmp_path):
     sheet = read_rgb(tmp_path / "sheet.png")
     frames = [tuple(sheet[-2, 240 * k + 120]) for k in range(PHOTOS)]
     assert [k for k in range(PHOTOS) if frames[k] == (255, 0, 0)] == [1, 4, 6]
+
+
+def test_the_one_mask_that_disagrees_with_the_visual_hull_is_left_out_and_no_other(capture, tmp_path):
+    supplied = tmp_path / "supplied"
+    shutil.copytree(capture / "truth", supplied)
+    # The fifth mask is right but for its place: half a ball too far to the right.
+    truth = cv2.imread(str(supplied / "f4_mask.png"), cv2.IMREAD_GRAYSCALE)
+    aside = np.roll(truth, np.ptp(np.nonzero(truth)[1]) // 2, axis=1)
+    cv2.imwrite(str(supplied / "f4_mask.png"), aside)
+    iou = mask_iou(aside > 0, truth > 0)
+    for name, least, dropped in (("strict", 0.6, ["f4.png"]), ("lenient", iou - 0.1, [])):
+        run_stage(capture, tmp_path / name, method="supplied", prompts=None, supplied=supplied, min_agreement=least)
+        report = read_json(tmp_path / name / "masks.json")
+        assert list(report["dropped"]) == dropped
+        kept = {path.name for path in (tmp_path / name / "masks").iterdir()}
+        assert kept == {f"f{k}.png" for k in range(PHOTOS)} - set(dropped)
+    report = read_json(tmp_path / "strict" / "masks.json")
+    agreement = {photo: numbers["agreement"] for photo, numbers in report["per_photo"].items()}
+    wrong = agreement.pop("f4.png")
+    assert wrong == pytest.approx(iou, abs=0.05) and min(agreement.values()) > 0.98
+    assert report["dropped"]["f4.png"] == f"IoU with the visual hull is {wrong:.2f}, below 0.6 (min_agreement)"
 
 
 def test_bad_supplied_masks_alone_are_an_error_in_one_sentence(capture, tmp_path):
