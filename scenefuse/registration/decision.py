@@ -102,8 +102,8 @@ def decide(
     reason = next(_reasons(best, of_clouds if decided_by == "geometry" else (), problem), None)
     words = {
         "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
-        "both": f"shared photos and clouds agree, F-score {best.score.f_score:.2f}",
-        "photos": f"by shared photos, against the clouds' best fit, F-score {best.score.f_score:.2f}",
+        "both": f"alignment and clouds agree, F-score {best.score.f_score:.2f}",
+        "photos": f"by the alignment, against the clouds' best fit, F-score {best.score.f_score:.2f}",
     }[decided_by]
     return Decision(reason is None, reason or words, decided_by, margin, rival, free_axis)
 

@@ -1,4 +1,4 @@
-"""From coarse poses to one decision: refine, turn, polish, rank, compare with the shared photos, decide."""
+"""From coarse poses to one decision: refine, turn, polish, rank, compare with the alignment, decide."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -105,8 +105,8 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
 
 _DECIDED = {
     "geometry": "by the clouds alone: no photos link object and scene",
-    "both": "clouds and shared photos agree",
-    "photos": "by shared photos, against the clouds",
+    "both": "clouds and the alignment from shared features agree",
+    "photos": "by the alignment from shared features, against the clouds",
 }
 
 
