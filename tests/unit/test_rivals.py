@@ -26,7 +26,7 @@ FINE = replace(FineSettings(), voxel_fraction=0.02)
 
 
 def hut(canopy, seed):
-    """6000 noisy points on a hut of 10 x 7 m, z up, without colours; only the canopy at one gable has no counterpart."""
+    """6000 noisy points on a hut of 10 x 7 m, z up, no colours; only the canopy at one gable has no counterpart."""
     parts = [box((5.0, -3.0, 2.6), (7.5, 3.0, 2.75), 0)] if canopy else []
     for s in (-1, 1):
         parts += [
