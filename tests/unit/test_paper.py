@@ -1,0 +1,75 @@
+"""The paper's recipe calls Open3D with the paper's numbers."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import open3d as o3d
+import pytest
+
+from scenefuse.io.clouds import Cloud
+from scenefuse.registration.icp import ScaleRange
+from scenefuse.registration.paper import paper_coarse, paper_fine
+from scenefuse.registration.problem import Evidence, Problem
+from scenefuse.transforms import Sim3
+
+SCALE = 2.5
+
+
+@pytest.fixture
+def clouds():
+    """The upper half of an ellipsoid in its own unit and in the scene's, where it is 2.5 times as large."""
+    points = np.random.default_rng(0).normal(size=(2, 3000, 3))
+    points *= [3, 2, 1] / np.linalg.norm(points, axis=2, keepdims=True)
+    points[..., 2] = np.abs(points[..., 2])
+    return Cloud(points[0]), Cloud(SCALE * points[1])
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """The arguments that Open3D's registration functions are called with; each finds that nothing has to move."""
+    recorded = {}
+    for name in ("registration_ransac_based_on_feature_matching", "registration_icp"):
+
+        def record(*args, name=name):
+            recorded[name] = args
+            return SimpleNamespace(transformation=np.eye(4))
+
+        monkeypatch.setattr(o3d.pipelines.registration, name, record)
+    return recorded
+
+
+def diagonal(points):
+    return np.linalg.norm(np.ptp(points, axis=0))
+
+
+def thinned(points, voxel):
+    return np.asarray(o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(voxel).points)
+
+
+def test_ransac_runs_on_voxels_of_4_percent_with_the_papers_distance_samples_and_confidence(clouds, calls):
+    obj, scene = clouds
+    voxel = 0.04 * diagonal(scene.points)
+    pose, _ = paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Evidence(), seed=0))
+    args, registration = calls.pop("registration_ransac_based_on_feature_matching"), o3d.pipelines.registration
+    assert not calls and pose.scale == SCALE
+    source, target, _, _, mutual, distance, estimation, points, checkers, criteria = args
+    assert np.allclose(source.points, thinned(SCALE * obj.points, voxel))
+    assert np.allclose(target.points, thinned(scene.points, voxel))
+    assert mutual and points == 3 and not estimation.with_scaling
+    assert distance == pytest.approx(1.5 * voxel)
+    limits = {type(checker): checker for checker in checkers}
+    assert limits[registration.CorrespondenceCheckerBasedOnDistance].distance_threshold == pytest.approx(1.5 * voxel)
+    assert limits[registration.CorrespondenceCheckerBasedOnEdgeLength].similarity_threshold == 0.9
+    assert (criteria.max_iteration, criteria.confidence) == (4_000_000, 0.999)
+
+
+def test_icp_pairs_points_within_two_fifths_of_a_voxel_for_35_iterations_and_holds_the_scale(clouds, calls):
+    obj, scene = clouds
+    voxel, start = 0.04 * diagonal(scene.points), Sim3(SCALE, np.eye(3), np.array([0.1, 0.0, 0.0]))
+    assert np.array_equal(paper_fine(obj, scene, start).matrix, start.matrix)
+    source, target, distance, first, estimation, criteria = calls.pop("registration_icp")
+    assert not calls
+    assert np.allclose(source.points, thinned(start.apply(obj.points), voxel / 2))
+    assert np.allclose(target.points, thinned(scene.points, voxel / 2))
+    assert distance == pytest.approx(0.4 * voxel) and np.array_equal(first, np.eye(4))
+    assert criteria.max_iteration == 35 and not estimation.with_scaling
