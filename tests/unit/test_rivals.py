@@ -11,10 +11,10 @@ from support.planted import errors
 from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.problem import Evidence, Problem
 from scenefuse.registration.refinement import refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
-from scenefuse.registration.verify import FineSettings
 from scenefuse.transforms import Sim3
 
 UP, DIAGONAL = np.array([0.0, 0.0, 1.0]), 14.0
