@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -112,17 +113,29 @@ def load_checkpoint(path: Path | None, like: State) -> State | None:
 
 
 def key_of(*parts: Any) -> str:
-    """Sixteen hex digits that change when any part changes: arrays and tensors by content, others by their repr.
+    """Sixteen hex digits that change when any part or PyTorch's version does.
 
+    Arrays and tensors count by content, dataclasses, lists and dictionaries by what they hold, others by their repr.
     A checkpoint in a folder of this name is found by no training that has other settings or inputs.
     """
-    digest = hashlib.sha256()
-    for part in parts:
-        if isinstance(part, Tensor):
-            part = part.detach().cpu().numpy()
-        if isinstance(part, np.ndarray):
-            digest.update(f"{part.dtype}{part.shape}".encode())
-        digest.update(np.ascontiguousarray(part).tobytes() if isinstance(part, np.ndarray) else repr(part).encode())
+    digest = hashlib.sha256(torch.__version__.encode())
+
+    def add(part: Any) -> None:
+        if is_dataclass(part) and not isinstance(part, type):
+            add({field.name: getattr(part, field.name) for field in fields(part)})
+        elif isinstance(part, dict):
+            add([item for pair in part.items() for item in pair])
+        elif isinstance(part, list | tuple):
+            digest.update(f"{len(part)} parts".encode())
+            for item in part:
+                add(item)
+        elif isinstance(part, Tensor | np.ndarray):
+            array = np.ascontiguousarray(part.detach().cpu().numpy() if isinstance(part, Tensor) else part)
+            digest.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
+        else:
+            digest.update(repr(part).encode())
+
+    add(parts)
     return digest.hexdigest()[:16]
 
 

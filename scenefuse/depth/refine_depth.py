@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from scenefuse.checkpoints import key_of
 from scenefuse.depth.candidates import Scores, best_candidate, score_candidates
 from scenefuse.depth.consistency import consistency_between_views, fuse_by_inverse_variance
 from scenefuse.depth.inputs import DepthPhotos
@@ -16,7 +17,6 @@ from scenefuse.depth.train_depth import DepthTrainingSettings, prepare_inputs
 from scenefuse.depth.training import (
     Recipe,
     Supervision,
-    key_of,
     load_networks,
     loss_quantities,
     new_networks,

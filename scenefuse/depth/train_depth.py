@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from scenefuse.checkpoints import key_of
 from scenefuse.depth.consistency import consistency_between_views, residuals_at_points
 from scenefuse.depth.crops import Crops, crop_to_object
 from scenefuse.depth.first_depth import NetworkInputs, network_inputs
@@ -27,7 +28,6 @@ from scenefuse.depth.training import (
     Networks,
     Recipe,
     Supervision,
-    key_of,
     loss_quantities,
     new_networks,
     predict,

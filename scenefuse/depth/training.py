@@ -1,7 +1,6 @@
 """Training the depth and pose networks on the photos of one object; a killed training resumes where it stopped."""
 
-import hashlib
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -193,32 +192,6 @@ def load_networks(path: Path) -> dict[str, Any]:
     if not {"depth", "pose", "settings"} <= set(state):
         raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
     return state
-
-
-def key_of(*parts: Any) -> str:
-    """Sixteen hex digits that change when any part or PyTorch's version does.
-
-    Arrays and tensors count by content, dataclasses, lists and dictionaries by what they hold, others by their repr.
-    """
-    digest = hashlib.sha256(torch.__version__.encode())
-
-    def add(part: Any) -> None:
-        if is_dataclass(part) and not isinstance(part, type):
-            add({field.name: getattr(part, field.name) for field in fields(part)})
-        elif isinstance(part, dict):
-            add([item for pair in part.items() for item in pair])
-        elif isinstance(part, list | tuple):
-            digest.update(f"{len(part)} parts".encode())
-            for item in part:
-                add(item)
-        elif isinstance(part, Tensor | np.ndarray):
-            array = np.ascontiguousarray(part.detach().cpu().numpy() if isinstance(part, Tensor) else part)
-            digest.update(f"{array.shape} {array.dtype}".encode() + array.tobytes())
-        else:
-            digest.update(repr(part).encode())
-
-    add(parts)
-    return digest.hexdigest()[:16]
 
 
 class _Scale:

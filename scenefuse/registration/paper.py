@@ -126,9 +126,9 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
     scaled = Sim3(problem.scales.centre, np.eye(3), np.zeros(3))
     source, source_features = _features(scaled.apply(problem.object.points), voxel)
     target, target_features = _features(problem.scene.points, voxel)
-    matches = np.asarray(
-        registration.correspondences_from_features(source_features, target_features, mutual_filter=True)
-    )
+    # A ratio of 0: this call counts the mutual matches and takes no others in their place, as RANSAC does below.
+    mutual = {"mutual_filter": True, "mutual_consistency_ratio": 0.0}
+    matches = registration.correspondences_from_features(source_features, target_features, **mutual)
     notes = []
     if len(matches) < MUTUAL_SHARE * len(source.points):
         notes.append(

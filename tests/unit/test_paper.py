@@ -73,3 +73,12 @@ def test_icp_pairs_points_within_two_fifths_of_a_voxel_for_35_iterations_and_hol
     assert np.allclose(target.points, thinned(scene.points, voxel / 2))
     assert distance == pytest.approx(0.4 * voxel) and np.array_equal(first, np.eye(4))
     assert criteria.max_iteration == 35 and not estimation.with_scaling
+
+
+@pytest.mark.parametrize(("shapes", "notes"), [("alike", 0), ("unlike", 1)])
+def test_the_note_says_when_open3d_has_too_few_mutual_matches(clouds, calls, shapes, notes):
+    obj, scene = clouds
+    if shapes == "unlike":
+        x, y = np.meshgrid(np.linspace(0, 9, 60), np.linspace(0, 9, 60))
+        obj = Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
+    assert len(paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Evidence(), seed=0))[1]) == notes
