@@ -127,8 +127,7 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
     source, source_features = _features(scaled.apply(problem.object.points), voxel)
     target, target_features = _features(problem.scene.points, voxel)
     # A ratio of 0: this call counts the mutual matches and takes no others in their place, as RANSAC does below.
-    mutual = {"mutual_filter": True, "mutual_consistency_ratio": 0.0}
-    matches = registration.correspondences_from_features(source_features, target_features, **mutual)
+    matches = registration.correspondences_from_features(source_features, target_features, True, 0.0)
     notes = []
     if len(matches) < MUTUAL_SHARE * len(source.points):
         notes.append(
