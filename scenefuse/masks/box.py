@@ -60,8 +60,7 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
         return Ground(np.array([box.low[2], 0, 0, 0, 0, 0]), middle, tolerance), False
     around = (np.abs(below[:, :2] - middle) < (box.high - box.low)[:2] / 2 + ring).all(1)
     off = ground.height_of(below[around])
-    off = off[np.abs(off) < tolerance]
-    scatter = float(np.std(off)) if len(off) else tolerance
+    scatter = float(np.std(off[np.abs(off) < tolerance]))
     ground.coefficients[0] += min(0.0, float(ground.height_of(prompts_in_box).min()) + 2 * scatter)
     return ground, True
 
