@@ -6,9 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from scenefuse.masks.box import find_ground, in_hull, span, upright_box
+from scenefuse.masks.box import Ground, find_ground, in_hull, span, upright_box
 from scenefuse.mvs.visual_hull import Box, Mask
-from scenefuse.sfm.ground import Ground
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
@@ -69,7 +68,7 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
         points: (N, 3) points on the object.
         photos: cameras, sparse points, and who observes them.
         up: (3,) the direction against gravity.
-        seed: of the ground's RANSAC.
+        seed: seed of the ground's RANSAC.
     """
     sparse, box = photos.points, upright_box(points, up, BOX_MARGIN)
     x_in_box = box.to_box(sparse)

@@ -8,7 +8,7 @@ from scenefuse.transforms import Array
 
 # Cells along each side of the square around the ring; one low point stands for each.
 CELLS = 40
-# Fewer points of a dense cloud, or cells, than these fix no ground.
+# Fewer points, or cells, than these fix no ground.
 MIN_POINTS, MIN_CELLS = 50, 20
 # Triples of cells drawn; the plane must hold this share of the cells, and rise by less than 45 degrees.
 TRIPLES, MIN_SHARE = 400, 0.3
@@ -34,20 +34,8 @@ class Ground:
         """Heights (N,) at (N, 2)."""
         return _terms(xy - self.centre) @ self.coefficients
 
-    def height_of(self, points: Array) -> Array:
-        """Heights (N,) of points (N, 3) over it."""
-        return points[:, 2] - self.height(points[:, :2])
 
-
-def fit_ground(
-    points: Array,
-    low: Array,
-    high: Array,
-    ring: float,
-    tolerance: float,
-    seed: int = 0,
-    least: tuple[int, int] = (MIN_POINTS, MIN_CELLS),
-) -> Ground | None:
+def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: float, seed: int = 0) -> Ground | None:
     """Fit the ground on a ring around a box, never inside it, so that the object itself cannot pass for ground.
 
     The lowest points of cells of the ring are fitted by a plane (RANSAC over triples), then by a parabolic height
@@ -60,25 +48,24 @@ def fit_ground(
         ring: width of the ring.
         tolerance: height within which points are ground.
         seed: of the triples.
-        least: points and cells below which there is no ground to see; sparse points need fewer than a dense cloud.
 
     Returns:
-        The ground, or None when the ring is nearly empty or no plane below 45 degrees fits at least 30 % of it.
+        The ground, or None when the ring is empty or no plane below 45 degrees fits at least 30 % of it.
     """
     xy = points[:, :2]
     near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
     inside = ((xy >= low[:2]) & (xy <= high[:2])).all(1)
     around = points[near & ~inside]
-    if len(around) < least[0]:
+    if len(around) < MIN_POINTS:
         return None
     lowest = _lowest(around, low[:2] - ring, float((high[:2] - low[:2] + 2 * ring).max()) / CELLS)
-    if len(lowest) < least[1]:
+    if len(lowest) < MIN_CELLS:
         return None
     centre = (low[:2] + high[:2]) / 2
     plane = _plane_by_triples(lowest[:, :2] - centre, lowest[:, 2], 2 * tolerance, seed)
     if plane is None:
         return None
-    coefficients = _height_field(lowest[:, :2] - centre, lowest[:, 2], plane, tolerance, least[1])
+    coefficients = _height_field(lowest[:, :2] - centre, lowest[:, 2], plane, tolerance)
     # A noisy cloud's ground is thick: its own spread about the surface widens the tolerance.
     off = around[:, 2] - _terms(around[:, :2] - centre) @ coefficients
     off = off[np.abs(off) < 4 * tolerance]
@@ -102,11 +89,10 @@ def _lowest(points: Array, corner: Array, edge: float) -> Array:
     return points[order[starts + (0.1 * counts).astype(int)]]
 
 
-def _height_field(xy: Array, z: Array, plane: Array, tolerance: float, least: int) -> Array:
+def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
     """The (6,) coefficients fitted to heights from a first plane (3,): a plane, then a parabola, by Tukey weights.
 
-    The parabola is kept only where it stays near the plane in the middle, of which a ring says little. Fewer than
-    `least` points with a weight change nothing.
+    The parabola is kept only where it stays near the plane in the middle, of which a ring says little.
     """
     terms, coefficients = _terms(xy), np.concatenate([plane, np.zeros(3)])
     flat = coefficients
@@ -115,7 +101,7 @@ def _height_field(xy: Array, z: Array, plane: Array, tolerance: float, least: in
             residual = z - terms @ coefficients
             weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
             root = np.sqrt(weight)[:, None]
-            if (weight > 0).sum() < least:
+            if (weight > 0).sum() < MIN_CELLS:
                 break
             solved = np.linalg.lstsq(root * terms[:, :columns], root[:, 0] * z, rcond=None)[0]
             coefficients = np.concatenate([solved, np.zeros(6 - columns)])
