@@ -75,3 +75,10 @@ def test_an_older_photo_of_the_object_reruns_its_frames(plan):
 @pytest.mark.parametrize("name, rule", [("prompts.tsv", "make_masks"), ("clicks.tsv", "crop_scene")])
 def test_older_clicks_rerun_what_reads_them_and_nothing_else(plan, name, rule):
     assert plan(replace(name)) == {rule}
+
+
+def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed(plan):
+    def add(project):
+        shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight/a{1}.jpg")
+
+    assert "list_photos" in plan(add)
