@@ -18,6 +18,8 @@ from scenefuse.workspace import View, read_views
 Posed = list[tuple[View, int]]
 # A sampled point counts as hidden when a surface lies farther than this before it, metres.
 HIDDEN = 0.02
+# Distances of the F-scores, as shares of the diagonal, by the ending of their keys.
+THRESHOLDS = {"025pct": 0.0025, "05pct": 0.005, "1pct": 0.01, "2pct": 0.02}
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,23 @@ def f_score(
     recall = float((truth_to_cloud <= tau).mean()) if len(truth_to_cloud) else 0.0
     total = precision + recall
     return precision, recall, 2 * precision * recall / total if total > 0 else 0.0
+
+
+def scores_at(
+    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], diagonal: float
+) -> dict[str, dict[str, float]]:
+    """F-score, precision and recall at each of THRESHOLDS (method G8): {"1pct": {"f_score": ..., ...}, ...}.
+
+    Args:
+        cloud_to_truth: (N,) distances of the cloud's points to the true surface.
+        truth_to_cloud: (M,) distances of points on the true surface to the cloud.
+        diagonal: of the object's true bounding box, in the unit of the distances.
+    """
+    found = {}
+    for ending, share in THRESHOLDS.items():
+        precision, recall, score = f_score(cloud_to_truth, truth_to_cloud, share * diagonal)
+        found[ending] = {"f_score": score, "precision": precision, "recall": recall}
+    return found
 
 
 def nearest(points: Array, cloud: Array) -> Array:
