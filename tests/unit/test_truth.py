@@ -192,7 +192,7 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     assert value(result["variants"]["no_crop"], "placed_f_score_025pct") is None
     # 2 % of scale, about a point 1.5 m away, moves the box by 2 to 5 cm: 0.25 % of its diagonal is 6 mm, 2 % is 5 cm.
     scaled = [value(result["variants"]["no_scale"], f"placed_f_score_{e}") for e in ("025pct", "05pct", "1pct", "2pct")]
-    assert scaled == sorted(scaled) and scaled[0] < 0.6 and scaled[-1] > 0.9
+    assert scaled == sorted(scaled) and scaled[0] < 0.1 and scaled[-1] > 0.8
     assert value(result, "scene_f_score_before_1pct") < 0.75 < 0.97 < value(result, "scene_f_score_after_1pct")
     assert value(result, "scene_precision_before_1pct") > 0.99
     # Half of the box is there: recall is one half where the threshold is above the cloud's spacing, and less below it.
