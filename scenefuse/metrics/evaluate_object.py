@@ -18,8 +18,8 @@ from scenefuse.metrics.object_truth import (
     scene_scores,
     surface_to_find,
 )
+from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import (
-    THRESHOLDS,
     Posed,
     camera_results,
     distances,

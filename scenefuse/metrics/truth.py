@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import Cameras
+from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.stage import StageError, quantity, threads
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.workspace import View, read_views
@@ -18,8 +19,6 @@ from scenefuse.workspace import View, read_views
 Posed = list[tuple[View, int]]
 # A sampled point counts as hidden when a surface lies farther than this before it, metres.
 HIDDEN = 0.02
-# Distances of the F-scores, as shares of the diagonal, by the ending of their keys.
-THRESHOLDS = {"025pct": 0.0025, "05pct": 0.005, "1pct": 0.01, "2pct": 0.02}
 
 
 @dataclass(frozen=True)
@@ -184,7 +183,7 @@ def scores_at(
     found = {}
     for ending, share in THRESHOLDS.items():
         precision, recall, score = f_score(cloud_to_truth, truth_to_cloud, share * diagonal)
-        found[ending] = {"f_score": score, "precision": precision, "recall": recall}
+        found[ending] = dict(zip(SCORES, (score, precision, recall)))
     return found
 
 
