@@ -28,18 +28,18 @@ _NOTES = {
     "accuracy, completeness and F-score exist only where the true surface is known.",
     "registration": "f_score: how well both surfaces explain each other, 1 is perfect; the decision is made on it. "
     "Margin: lead over the second-best pose; near zero, two poses explain the data equally well. Below its limits an "
-    "object is unregistered and left out of the scene. fitness, inlier_rmse and normal_consistency are the paper's: the "
-    "share of the crop's points with an object point within tau; the distance of the object's points that lie within "
-    "tau of the crop, in the scene's unit and as a share of the crop's diagonal; how parallel the two surfaces are "
-    "there (0.5 is chance). fitness_source: the share of the object's points within tau of the crop, which is high for "
-    "an object that is too small. fitness_f_score: both at once. `ungated`: nothing checked the pose. `failed`: a step "
-    "ended with an error; `missing`: it has not run.",
+    "object is unregistered and left out of the scene. The paper's are fitness (the share of the crop's points with an "
+    "object point within tau), inlier_rmse (the distance of the object's points that lie within tau of the "
+    "crop, in the scene's unit and as a share of the crop's diagonal) and normal_consistency (how parallel the two "
+    "surfaces are there; 0.5 is chance). fitness_source: the share of the object's points within tau of the crop, high "
+    "for an object that is too small. fitness_f_score: both at once. `ungated`: nothing checked the pose. `failed`: a "
+    "step ended with an error; `missing`: it has not run.",
     "completion": "value: of the added points. null: of a random cloud in their place; only a clear distance from it "
     "says something. before, after: of all points of the object in the scene, without and with them. Surface "
-    "variation: 0 smooth to 1/3. NUE: evenness of the density after against before, at or below 1 as even as the scene, "
-    "to 1.3 seamless; the density-invariant form ignores that one cloud is denser. Primitive fitting: share of points "
-    "on planes, spheres or cylinders. scene_*: against truth, the scene around the object at a share of its diagonal "
-    "(025pct: 0.25 %).",
+    "variation: 0 smooth to 1/3. NUE: evenness of the density after against before; at or below 1 as even as the "
+    "scene, to 1.3 seamless; the density-invariant form ignores that one cloud is denser. Primitive fitting: share of "
+    "points on planes, spheres or cylinders. scene_*: against truth, the scene around the object at a share of its "
+    "diagonal (025pct: 0.25 %).",
     "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
     "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the "
     "crop.",
