@@ -25,7 +25,7 @@ _NOTES = {
     "in the unit named in the row: metres only where GPS made it so.",
     "objects": "PSNR (dB) and SSIM compare renders with photos: higher is better; `measured_on` says whether training "
     "saw those photos. Depth error, "
-    "accuracy, completeness and F-score exist only where the true surface is known.",
+    "accuracy, precision, recall and F-score exist only where the true surface is known.",
     "registration": "f_score: how well both surfaces explain each other, 1 is perfect; the decision is made on it. "
     "Margin: lead over the second-best pose; near zero, two poses explain the data equally well. Below its limits an "
     "object is unregistered and left out of the scene. The paper's are fitness (the share of the crop's points with an "
