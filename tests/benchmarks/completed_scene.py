@@ -1,7 +1,7 @@
 """The completed scene of a finished demo against truth, for every way to fuse, and the harm that a bad object does.
 
 make demo, then PYTHONPATH=. python tests/benchmarks/completed_scene.py --results results
-The same with --harm: displaced and scaled objects, and a bad object in a perfect scene.
+The same with --harm True: displaced and scaled objects, and a bad object in a perfect scene.
 
 A quarter of an object's masks wrong needs its stages to run again: spoil the masks in a copy of the results, run up to
 objects/NAME/object.ply there, and give that cloud with --objects NAME --object CLOUD.
@@ -22,6 +22,7 @@ from scenefuse.fusion.fuse_object import FROM_SCENE, FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
+from scenefuse.metrics.truth import registration_error
 from scenefuse.stage import StageError, read_json, run, threads, value
 from scenefuse.transforms import Array, Sim3
 
@@ -67,6 +68,17 @@ class Case:
     def diagonal(self) -> float:
         """The object's true diagonal in the scene's unit."""
         return self.known.diagonal / self.truth_from_scene.scale
+
+    @property
+    def true_pose(self) -> Sim3:
+        """scene_from_object by the true cameras on both sides."""
+        return self.truth_from_scene.inverse() @ self.known.fit.truth_from_model
+
+    @property
+    def shift(self) -> float:
+        """How far the pose puts the object's middle from its true place, over the diagonal."""
+        middle = self.known.fit.truth_from_model.inverse().apply(self.known.middle)
+        return registration_error(self.pose, self.true_pose, middle, self.diagonal).translation_over_diagonal
 
 
 def fuse(case: Case, settings: FusionSettings) -> Cloud:
@@ -164,14 +176,14 @@ def perfect_scene(case: Case) -> Case:
     closest = caster.compute_closest_points(o3d.core.Tensor.from_numpy(case.surface.astype(np.float32)), threads())
     normals = scene_from_truth.rotate(closest["primitive_normals"].numpy()).astype(np.float32)
     good = read_cloud(case.results / "objects" / case.name / "object.ply")
-    truth_from_object = case.known.fit.truth_from_model
     colors = None
     if good.colors is not None:
-        colors = good.colors[cKDTree(truth_from_object.apply(good.points)).query(case.surface, workers=threads())[1]]
+        placed = case.known.fit.truth_from_model.apply(good.points)
+        colors = good.colors[cKDTree(placed).query(case.surface, workers=threads())[1]]
     perfect = with_provenance(Cloud(scene_from_truth.apply(case.surface), normals, colors), FROM_SCENE)
     own = around_object(case.truth_from_scene.apply(case.scene.points), case.known)
     whole = concatenate([case.scene[~own], perfect])
-    return replace(case, scene=whole, crop=perfect, pose=scene_from_truth @ truth_from_object)
+    return replace(case, scene=whole, crop=perfect, pose=case.true_pose)
 
 
 def harm_rows(case: Case) -> Iterator[dict[str, Any]]:
@@ -207,7 +219,7 @@ def completed_scene(
     for folder in results:
         for case in read_cases(folder, objects, object):
             for row in harm_rows(case) if harm else completed_rows(case):
-                rows.append({"run": str(folder), "object": case.name, **row})
+                rows.append({"run": str(folder), "object": case.name, "shift_over_diagonal": case.shift, **row})
                 print(f"{folder}, {case.name}: {row.get('wrong', '')} {row['cloud']}", flush=True)
     table = pd.DataFrame(rows)
     out = results[0] / f"bench/completed_scene{'_harm' if harm else ''}.tsv"
@@ -235,13 +247,14 @@ def summary(table: pd.DataFrame) -> str:
     runs, heads = table["run"].nunique(), "".join(f"{f'{100 * share:g} %':>16}" for share in THRESHOLDS.values())
     lines = [f"F-score at a share of the diagonal, {runs} run{'s' if runs > 1 else ''} (mean ± standard deviation)"]
     for name, part in table.groupby("object", sort=False):
-        lines += ["", f"{name:32s}{heads}   over the better source"]
+        shift = f"{name}, {100 * part['shift_over_diagonal'].mean():.2f} % from its true place"
+        lines += ["", f"{shift:40s}{heads}   over the better source"]
         scores = part.set_index(["run", "cloud"])[F_SCORES]
         better = np.maximum(scores.xs(BEFORE, level="cloud"), scores.xs(ALONE, level="cloud"))
         for cloud in part["cloud"].unique():
             own = scores.xs(cloud, level="cloud")
             over = "" if cloud in (BEFORE, ALONE) else f"{(own - better).mean().min():+25.3f}"
-            lines.append(f"{cloud:32s}" + "".join(_mean(own[column]) for column in F_SCORES) + over)
+            lines.append(f"{cloud:40s}" + "".join(_mean(own[column]) for column in F_SCORES) + over)
     return "\n".join(lines)
 
 

@@ -97,7 +97,11 @@ def test_every_mode_of_fusion_is_in_the_table_of_the_completed_scene():
 def test_the_table_of_the_completed_scene_compares_with_the_better_source_of_each_run():
     def rows(run, before, fused, alone):
         clouds = ((completed_scene.BEFORE, before), ("fill", fused), (completed_scene.ALONE, alone))
-        return [{"run": run, "object": "x", "cloud": c} | dict.fromkeys(completed_scene.F_SCORES, f) for c, f in clouds]
+        return [
+            {"run": run, "object": "x", "shift_over_diagonal": 0, "cloud": c}
+            | dict.fromkeys(completed_scene.F_SCORES, f)
+            for c, f in clouds
+        ]
 
     lines = completed_scene.summary(pd.DataFrame(rows("a", 0.9, 0.8, 0.5) + rows("b", 0.5, 0.8, 0.8))).splitlines()
     fill = next(line for line in lines if line.startswith("fill"))
