@@ -40,9 +40,9 @@ _NOTES = {
     "scene, to 1.3 seamless; the density-invariant form ignores that one cloud is denser. Primitive fitting: share of "
     "points on planes, spheres or cylinders. scene_*: against truth, the scene around the object at a share of its "
     "diagonal (025pct: 0.25 %).",
-    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
-    "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the "
-    "crop.",
+    "ablation": "All variants at the same thresholds, except f_score and margin, which are each decision's own. `full` "
+    "is fused, `paper` follows the published recipe, which checks no pose, `clouds_only` uses the clouds alone, "
+    "`no_scale` leaves out scale rectification, `no_crop` the crop.",
     "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
     "largest resident size of one job.",
 }

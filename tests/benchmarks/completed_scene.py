@@ -139,7 +139,7 @@ def harmed(case: Case) -> Iterator[tuple[str, Case]]:
     yield "nothing", case
     for axis in range(3):
         for sign in (1, -1):
-            yield f"displaced by {SHIFT:.0%}", replace(case, pose=displaced(case, axis, sign))
+            yield f"displaced by {100 * SHIFT:g} %", replace(case, pose=displaced(case, axis, sign))
     for factor in SCALES:
         yield "scaled by 3 %", replace(case, pose=scaled(case, factor))
     yield "bad object, perfect scene", perfect_scene(replace(case, object=bad_object(case)))
