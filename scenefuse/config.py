@@ -17,7 +17,7 @@ from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
-from scenefuse.fusion.fuse_object import FusionSettings
+from scenefuse.fusion.modes import FusionSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.completion import MetricSettings
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings

@@ -1,22 +1,18 @@
-"""The completed scene: all registered objects fused into one cloud, each point naming where it is from."""
+"""The completed scene: all registered objects in one cloud, each point naming where it is from."""
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from scenefuse.fusion.fuse_object import (
-    FROM_SCENE,
-    FusionSettings,
-    fuse_registered,
-    is_placed,
-    with_provenance,
-    write_scene,
-)
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud
+from scenefuse.fusion.evidence import FIELDS, KEPT, unchecked
+from scenefuse.fusion.fuse_object import FROM_OBJECT, FROM_SCENE, together, with_source, write_scene
+from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.job_records import JobRecords, why_unfinished
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import quantity, read_json, threads, value, write_json
 
 
 @dataclass(frozen=True)
@@ -26,24 +22,21 @@ class CompletionInputs:
     scene: Path
     """Dense scene cloud (PLY)."""
     objects: list[Path]
-    """Result folders of all the scene's objects; of each, object.ply, registration/full/crop.ply and fine.json are
-    read."""
+    """Result folders of all the scene's objects; of each, fused.ply, checked.ply and fusion.json are read."""
     jobs: JobRecords
     """For the reason why an object failed."""
     failed: tuple[str, ...] = ()
-    """Names of the objects that failed before a decision on their pose; whatever is in their folders is out of date."""
+    """Names of the objects that failed before they were fused; whatever is in their folders is out of date."""
     georeference_json: Path | None = None
     """JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing."""
 
 
-def complete_scene(
-    *, inputs: CompletionInputs, completed: Path, completed_laz: Path, report: Path, settings: FusionSettings
-) -> None:
-    """Fuse every registered object of a scene into it, one after the other (method F3).
+def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: Path, report: Path) -> None:
+    """Put into the scene what every object adds, and leave out what any takes away (method F3).
 
-    Each is fused into what the ones before it left, so that objects that overlap are not doubled. The field `source`
-    is 0 on the scene's points and the object's place among the scene's objects, counted from 1, on what it added; the
-    others keep their number when one fails.
+    Where objects overlap, a later one's points that lie on an earlier one's are left out. The field `source` is 0 on
+    the scene's points and the object's place among the scene's objects, counted from 1, on what it added; the others
+    keep their number when one fails.
 
     Args:
         inputs: see CompletionInputs.
@@ -51,11 +44,10 @@ def complete_scene(
         completed_laz: output LAZ of the same, in the CRS where the scene is georeferenced.
         report: output JSON: what each `source` is, the points that each object added, and the objects that are not in
             it, unregistered or failed, each with its reason.
-        settings: see FusionSettings.
     """
     start = time.perf_counter()
-    before = read_cloud(inputs.scene)
-    whole = _from(with_provenance(before, FROM_SCENE), FROM_SCENE)
+    scene = unchecked(read_cloud(inputs.scene))
+    kept, added = np.ones(len(scene), dtype=bool), list[Cloud]()
     failed = {
         name: why_unfinished(inputs.jobs, name, f"{name}-full") or "its jobs did not run" for name in inputs.failed
     }
@@ -64,21 +56,42 @@ def complete_scene(
         if folder.name in failed:
             print(f"{folder.name} failed: {failed[folder.name]}", flush=True)
             continue
-        registration = read_json(folder / "registration/full/fine.json")
-        crop = read_cloud(folder / "registration/full/crop.ply")
-        fusion = fuse_registered(read_cloud(folder / "object.ply"), whole, crop, registration, settings)
-        if not is_placed(registration):
-            unregistered[folder.name] = value(registration, "reason")
-        kept = whole[fusion.kept]
-        whole = concatenate([kept, _from(fusion.added, number)]) if len(fusion.added) else kept
-        print(f"{folder.name}: {unregistered.get(folder.name) or f'{len(fusion.added)} points'}", flush=True)
+        fusion = read_json(folder / "fusion.json")
+        if value(fusion, "status") != "fused":
+            unregistered[folder.name] = value(fusion, "reason")
+            continue
+        _take_away(scene, kept, read_cloud(folder / "checked.ply"))
+        mine = read_cloud(folder / "fused.ply")
+        mine = _apart(mine[mine.fields["source"] == FROM_OBJECT], added)
+        added.append(with_source(mine, number))
+        print(f"{folder.name}: {len(mine)} points", flush=True)
+    whole = with_source(scene[kept], FROM_SCENE)
+    for cloud in added:
+        whole = together(whole, cloud)
     crs = write_scene(completed, completed_laz, whole, inputs.georeference_json)
-    content = _report(whole, len(before), [folder.name for folder in inputs.objects], unregistered, failed) | {
-        "mode": quantity(settings.mode, ""),
+    content = _report(whole, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
         "crs": quantity(crs, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)
+
+
+def _take_away(scene: Cloud, kept: NDArray[np.bool_], checked: Cloud) -> None:
+    """Mark in `kept` what an object took away, and put what photos know of the checked points into the scene's."""
+    if len(checked) == 0:
+        return
+    rows = checked.fields["row"].astype(np.int64)
+    kept[rows[checked.fields["reason"] != KEPT]] = False
+    for name in FIELDS:
+        scene.fields[name][rows] = checked.fields[name]
+
+
+def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:
+    """The points farther than a spacing from those that other objects added."""
+    if not before or len(cloud) < 2:
+        return cloud
+    there = np.concatenate([other.points for other in before])
+    return cloud[cKDTree(there).query(cloud.points, workers=threads())[0] > spacing(cloud.points)]
 
 
 def _report(
@@ -96,8 +109,3 @@ def _report(
         "unregistered": quantity(unregistered, ""),
         "failed": quantity(failed, ""),
     }
-
-
-def _from(cloud: Cloud, source: int) -> Cloud:
-    """The cloud with its `source` set, wide enough for 65535 objects."""
-    return replace(cloud, fields=cloud.fields | {"source": np.full(len(cloud), source, dtype=np.uint16)})

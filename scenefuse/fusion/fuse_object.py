@@ -1,43 +1,46 @@
-"""Fusion: what the object knows and the scene lacks, added to the scene with its provenance."""
+"""Fusion: a registered object comes into the scene, each point with what photos know of it."""
 
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
+from scenefuse.cores import use_threads
+from scenefuse.fusion.evidence import (
+    FIELDS,
+    KEPT,
+    MEASURED,
+    NERF_ONLY,
+    REASONS,
+    REPLACED,
+    STEREO_ONLY,
+    Side,
+    Weighed,
+    around,
+    unchecked,
+    weigh,
+)
+from scenefuse.fusion.modes import (
+    FEATHER_SPACINGS,
+    FILL_SPACINGS,
+    FusionSettings,
+    feathered,
+    fuse_clouds,
+    thinned,
+    with_colors_of,
+)
+from scenefuse.fusion.photo_check import Photos, moved_photos, pack, read_photos
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.stage import quantity, read_json, setting, threads, value, write_json
+from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import read_workspace
 
 FROM_SCENE, FROM_OBJECT = 0, 1
-
-
-@dataclass(frozen=True)
-class FusionSettings:
-    """How the object is added. Spacing is the median distance between neighbours in the scene crop."""
-
-    mode: Literal["fill", "append", "replace"] = setting("fill")
-    """`fill` adds the object points that the scene lacks, `append` all of them; `replace` puts the object in the place
-    of the scene's points on it."""
-    fill_spacings: float = setting(1.5, least=0)
-    """Object points farther than this many spacings from every scene point are new."""
-    density: float = setting(1, least=0)
-    """Spacing of the added points over the scene's; 0 keeps every object point."""
-    match_colors: bool = setting(True)
-    """Whether the object's colours get a gain and bias per channel from the overlap."""
-    fill_residuals: float = 1.5
-    """Points are new at no less than this many median distances between the clouds where both exist, so that noise
-    does not add a second layer."""
-    feather_spacings: float = 4
-    """Width of the seam in spacings: colours, and in `replace` positions too, blend over it."""
-    min_confidence: float = 0
-    """Object points with a lower confidence are not used; the object's cloud has a limit of its own."""
 
 
 @dataclass(frozen=True)
@@ -54,82 +57,213 @@ class FusionInputs:
     """JSON of the crop stage, for the box."""
     fine_json: Path
     """JSON of the fine registration."""
+    object_workspace: Path | None = None
+    """The object's undistorted COLMAP workspace; without it the object is judged by the scene's photos."""
+    scene_workspace: Path | None = None
+    """The scene's, in the frame of its cloud; without it the scene is judged by the object's photos."""
     georeference_json: Path | None = None
     """JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing."""
 
 
 @dataclass(frozen=True)
-class Fusion:
-    """The parts of a fused scene.
+class FusionOutputs:
+    """What the fusion of one object writes."""
+
+    fused: Path
+    """PLY, the object's surroundings: the scene in the crop's box and what was added."""
+    fused_scene: Path
+    """PLY, the whole scene with what was added."""
+    fused_laz: Path
+    """LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one."""
+    checked: Path
+    """PLY, the scene's points near the object: `row` in the scene's cloud, `reason` why it was taken away or 0."""
+    evidence: Path
+    """JSON: what photos say of both sides' points."""
+    report: Path
+    """JSON: counts, distances, gain, status."""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A scene with an object in it.
 
     Attributes:
-        kept: (N,) bool over the scene's points.
-        added: new points in the scene frame, with `source`, `confidence`, `views`.
+        scene: all of its points with `photos`, `match`, `deviation`, `evidence`.
+        rows: (M,) of the scene's points that were checked.
+        reason: (M,) uint8, KEPT or why the point is taken away.
+        added: the object's points that come in, with the same fields.
         gain: (3,) colour gain of the object.
         bias: (3,) colour bias, 0..255.
-        fill_distance: distance from the scene at which object points are new.
+        same_distance: distance within which both show the same place.
+        weighed: of `evidence`, else None.
     """
 
-    kept: NDArray[np.bool_]
+    scene: Cloud
+    rows: NDArray[np.int64]
+    reason: NDArray[np.uint8]
     added: Cloud
     gain: Array
     bias: Array
-    fill_distance: float
+    same_distance: float
+    weighed: Weighed | None = None
+
+    @property
+    def removed(self) -> NDArray[np.int64]:
+        """(R,) rows of the scene's points that are taken away."""
+        return self.rows[self.reason != KEPT]
+
+    @property
+    def kept(self) -> Cloud:
+        """The scene without them."""
+        left = np.ones(len(self.scene), dtype=bool)
+        left[self.removed] = False
+        return self.scene[left]
 
 
-def fuse_object(
-    *, inputs: FusionInputs, fused: Path, fused_scene: Path, fused_laz: Path, report: Path, settings: FusionSettings
-) -> None:
-    """Add a registered object to the scene (method F1, F2); an unregistered one leaves the scene as it is.
-
-    `append` adds every object point; `fill` those the scene lacks; `replace` takes the scene's points on the object
-    away and puts the object in their place, with a feathered seam.
+def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: FusionSettings) -> None:
+    """Add a registered object to the scene (method F1 to F4); an unregistered one leaves the scene as it is.
 
     Args:
         inputs: see FusionInputs.
-        fused: output PLY, the object's surroundings: the scene in the crop's box and what was added.
-        fused_scene: output PLY, the whole scene with what was added.
-        fused_laz: output LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one.
-        report: output JSON: counts, distances, gain, status.
+        outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
+            point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit), `evidence`
+            (0 not checked, 1 measured, 2 NeRF only, 3 stereo only).
         settings: see FusionSettings.
     """
     start = time.perf_counter()
-    whole = with_provenance(read_cloud(inputs.scene), FROM_SCENE)
+    use_threads(threads())
+    scene, part, obj = (read_cloud(path) for path in (inputs.scene, inputs.crop, inputs.object))
     registration = read_json(inputs.fine_json)
-    part, obj = read_cloud(inputs.crop), read_cloud(inputs.object)
-    fusion = fuse_registered(obj, whole, part, registration, settings)
     if not is_placed(registration):
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
-    kept = whole[fusion.kept]
-    around = _in_box(kept, read_json(inputs.crop_json))
-    write_cloud(fused, _together(around, fusion.added))
-    crs = write_scene(fused_scene, fused_laz, _together(kept, fusion.added), inputs.georeference_json)
+        fused = _unchanged(obj, scene)
+    else:
+        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
+        if settings.mode == "evidence":
+            placed = obj.transformed(pose)
+            photos = _photos(inputs.object_workspace, obj.points, pose), _photos(inputs.scene_workspace, placed.points)
+            fused = fuse_by_evidence(placed, scene, *photos, settings)
+        else:
+            fused = fuse_by_distance(obj, scene, part, pose, settings)
+    _write(fused, read_json(inputs.crop_json), inputs, outputs)
     unit = length_unit(inputs.georeference_json)
-    content = _report(fusion, registration, spacing(part.points), unit) | {
+    write_json(outputs.evidence, evidence_report(fused, unit))
+    content = _report(fused, registration, spacing(part.points), unit) | {
         "mode": quantity(settings.mode, ""),
         "object_points": quantity(len(obj), "points"),
-        "surroundings_points": quantity(len(around) + len(fusion.added), "points"),
-        "crs": quantity(crs, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
-    write_json(report, content)
+    write_json(outputs.report, content)
 
 
-def _report(fusion: Fusion, registration: dict[str, Any], scene_spacing: float, unit: str) -> dict[str, Any]:
+def is_placed(registration: dict[str, Any]) -> bool:
+    """Whether a fine registration's JSON puts the object into the scene: accepted, or made without any check."""
+    return value(registration, "status") in ("registered", "ungated")
+
+
+def fuse_by_evidence(obj: Cloud, scene: Cloud, of_obj: Photos, of_scene: Photos, settings: FusionSettings) -> Fused:
+    """Fuse by what photos know of the points of both sides; see `weigh`.
+
+    Args:
+        obj: the object in the scene's frame, registered.
+        scene: the whole scene.
+        of_obj: the object's photos in the scene's frame.
+        of_scene: the scene's photos that see the object.
+        settings: see FusionSettings.
+    """
+    rows = np.flatnonzero(around(scene, obj))
+    near = scene[rows]
+    weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only)
+    step = spacing(near.points) if len(near) > 1 else 0.0
+    moved, gain, bias = with_colors_of(weighed.obj, near, FILL_SPACINGS * step, settings.match_colors)
+    added = thinned(moved[weighed.added], settings.density * step)
+    if len(near):
+        kept = near[weighed.reason == KEPT]
+        added = feathered(added, kept, FEATHER_SPACINGS * step, FILL_SPACINGS * step)
+    whole = unchecked(scene)
+    for name, values in whole.fields.items():
+        values[rows] = weighed.scene.fields[name]
+    return Fused(whole, rows, weighed.reason, added, gain, bias, FILL_SPACINGS * step, weighed)
+
+
+def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings: FusionSettings) -> Fused:
+    """Fuse without asking photos; see `fuse_clouds`."""
+    fusion = fuse_clouds(obj, scene, part, pose, settings)
+    rows = np.flatnonzero(~fusion.kept)
+    reason = np.full(len(rows), REPLACED, np.uint8)
+    added = unchecked(fusion.added)
+    return Fused(unchecked(scene), rows, reason, added, fusion.gain, fusion.bias, fusion.fill_distance)
+
+
+def _unchanged(obj: Cloud, scene: Cloud) -> Fused:
+    """The scene as it is, with nothing of the object."""
+    nothing = unchecked(obj[np.zeros(len(obj), dtype=bool)])
+    none = np.zeros(0, np.int64)
+    return Fused(unchecked(scene), none, none.astype(np.uint8), nothing, np.ones(3), np.zeros(3), 0.0)
+
+
+def _photos(workspace: Path | None, points: Array, frame: Sim3 | None = None) -> Photos:
+    """The photos that see points (N, 3; the workspace's frame), moved by `frame`; none without a workspace."""
+    if workspace is None:
+        return pack([])
+    photos = read_photos(read_workspace(workspace), points)
+    return moved_photos(photos, frame) if frame else photos
+
+
+def _write(fused: Fused, crop_json: dict[str, Any], inputs: FusionInputs, outputs: FusionOutputs) -> None:
+    """The clouds."""
+    kept, added = with_source(fused.kept, FROM_SCENE), with_source(fused.added, FROM_OBJECT)
+    write_cloud(outputs.fused, together(_in_box(kept, crop_json), added))
+    write_scene(outputs.fused_scene, outputs.fused_laz, together(kept, added), inputs.georeference_json)
+    checked = fused.scene[fused.rows]
+    checked.fields["row"], checked.fields["reason"] = fused.rows.astype(np.uint32), fused.reason
+    write_cloud(outputs.checked, checked)
+
+
+def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, unit: str) -> dict[str, Any]:
     """What was added and taken away, with units."""
-    added = fusion.added
+    added, weighed = fused.added, fused.weighed
     return {
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
         "registration": quantity(value(registration, "status"), ""),
         "reason": quantity(value(registration, "reason"), ""),
-        "scene_points": quantity(len(fusion.kept), "points"),
-        "removed_points": quantity(int((~fusion.kept).sum()), "points"),
+        "scene_points": quantity(len(fused.scene), "points"),
+        "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(added), "points"),
+        "nerf_only_points": quantity(int((added.fields["evidence"] == NERF_ONLY).sum()), "points"),
         "scene_spacing": quantity(scene_spacing, unit),
         "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
-        "fill_distance": quantity(fusion.fill_distance, unit),
-        "color_gain": quantity(fusion.gain, "1"),
-        "color_bias": quantity(fusion.bias, "of 255"),
+        "settled_by": quantity(None if weighed is None else weighed.moved, "diagonals"),
+        "fill_distance": quantity(fused.same_distance, unit),
+        "color_gain": quantity(fused.gain, "1"),
+        "color_bias": quantity(fused.bias, "of 255"),
+    }
+
+
+def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
+    """What photos say of both sides' points; without `evidence`, only what was taken away."""
+    removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
+    content = {"scene_removed": quantity(removed, "points")}
+    weighed = fused.weighed
+    if weighed is None:
+        return content | {"notes": quantity(["no photo was asked"], "")}
+    kinds, left = weighed.obj.fields["evidence"], weighed.reason == KEPT
+    measured = kinds == MEASURED
+    middle = float(np.median(weighed.obj.fields["deviation"][measured])) if measured.any() else None
+    return content | {
+        "object_points": quantity(len(kinds), "points"),
+        "object_measured": quantity(int(measured.sum()), "points"),
+        "object_nerf_only": quantity(int((kinds == NERF_ONLY).sum()), "points"),
+        "object_contradicted": quantity(int(weighed.contradicted.sum()), "points"),
+        "object_better_in_scene": quantity(int((measured & ~weighed.contradicted & ~weighed.added).sum()), "points"),
+        "object_added": quantity(int(weighed.added.sum()), "points"),
+        "deviation_median": quantity(middle, unit),
+        "scene_checked": quantity(len(left), "points"),
+        "scene_measured": quantity(int((left & (weighed.scene.fields["evidence"] == MEASURED)).sum()), "points"),
+        "scene_stereo_only": quantity(int((left & (weighed.scene.fields["evidence"] == STEREO_ONLY)).sum()), "points"),
+        "settled_from_placed": quantity(weighed.settled.matrix, "1"),
+        "settled_by": quantity(weighed.moved, "diagonals"),
+        "notes": quantity(list(weighed.notes), ""),
     }
 
 
@@ -140,88 +274,15 @@ def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:
     return cloud[((levelled >= low) & (levelled <= high)).all(1)]
 
 
-def _together(kept: Cloud, added: Cloud) -> Cloud:
+def together(kept: Cloud, added: Cloud) -> Cloud:
+    """Both clouds in one; normals and colours that only the object has are left out, never those of the scene."""
     return concatenate([kept, added]) if len(added) else kept
 
 
-def is_placed(registration: dict[str, Any]) -> bool:
-    """Whether a fine registration's JSON puts the object into the scene: accepted, or made without any check."""
-    return value(registration, "status") in ("registered", "ungated")
-
-
-def fuse_registered(
-    obj: Cloud, scene: Cloud, part: Cloud, registration: dict[str, Any], settings: FusionSettings
-) -> Fusion:
-    """`fuse_clouds` at the pose of a fine registration's JSON; an unregistered object leaves the scene as it is."""
-    if is_placed(registration):
-        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-        return fuse_clouds(obj, scene, part, pose, settings)
-    nothing = with_provenance(obj, FROM_OBJECT)[np.zeros(len(obj), dtype=bool)]
-    return Fusion(np.ones(len(scene), dtype=bool), nothing, np.ones(3), np.zeros(3), 0.0)
-
-
-def fuse_clouds(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, settings: FusionSettings) -> Fusion:
-    """Decide what is added and what is taken away; see `fuse_object`.
-
-    Args:
-        obj: the object in its own frame.
-        scene: the whole scene, with provenance.
-        part: the scene's points on the object.
-        scene_from_object: the registration.
-        settings: see FusionSettings.
-    """
-    moved = with_provenance(obj, FROM_OBJECT).transformed(scene_from_object)
-    moved = moved[moved.fields["confidence"] >= settings.min_confidence]
-    step = spacing(part.points)
-    low, high = moved.points.min(0), moved.points.max(0)
-    reach = 10 * step
-    near = ((scene.points >= low - reach) & (scene.points <= high + reach)).all(1)
-    tree = cKDTree(scene.points[near] if near.any() else scene.points)
-    local = scene[near] if near.any() else scene
-    distance, partner = tree.query(moved.points, workers=threads())
-    fill = settings.fill_spacings * step
-    overlap = distance <= 3 * fill
-    if overlap.sum() > 50:
-        fill = max(fill, settings.fill_residuals * float(np.median(distance[overlap])))
-    gain, bias = np.ones(3), np.zeros(3)
-    if settings.match_colors and moved.colors is not None and local.colors is not None:
-        close = distance <= fill
-        if close.sum() >= 50:
-            gain, bias = match_colors(moved.colors[close], local.colors[partner[close]])
-            moved = replace(moved, colors=_bytes(moved.colors * gain + bias))
-    kept = np.ones(len(scene), dtype=bool)
-    if settings.mode == "fill":
-        moved = moved[distance > fill]
-    elif settings.mode == "replace":
-        index = np.flatnonzero(near)
-        to_object = cKDTree(moved.points).query(scene.points[index], workers=threads())[0]
-        kept[index[to_object <= fill]] = False
-    added = _thin(moved, settings.density * step) if settings.density > 0 and len(moved) > 10 else moved
-    if settings.mode != "append" and len(added) and kept.any():
-        width = settings.feather_spacings * step
-        added = _feather(added, scene[kept & near], width, settings.mode == "replace", fill)
-    return Fusion(kept, added, gain, bias, fill)
-
-
-def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
-    """Gain and bias (3,) per channel with gain a + bias = b, from medians and median deviations of pairs (M, 3)."""
-    mine, theirs = a.astype(np.float64), b.astype(np.float64)
-    middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
-    wide_a = np.abs(mine - middle_a).mean(0)
-    wide_b = np.abs(theirs - middle_b).mean(0)
-    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), 0.5, 2.0)
-    return gain, middle_b - gain * middle_a
-
-
-def with_provenance(cloud: Cloud, source: int) -> Cloud:
-    """The cloud with `source` (uint8), `confidence` (float32) and `views` (int32), measured ones where it has them."""
-    n, had = len(cloud), cloud.fields
-    fields: dict[str, NDArray[Any]] = {
-        "source": had.get("source", np.full(n, source)).astype(np.uint8),
-        "confidence": had.get("confidence", np.ones(n)).astype(np.float32),
-        "views": had.get("views", np.zeros(n)).astype(np.int32),
-    }
-    return replace(cloud, fields=fields)
+def with_source(cloud: Cloud, source: int) -> Cloud:
+    """The cloud with its fields of evidence and `source`, wide enough for 65535 objects."""
+    known = {name: cloud.fields[name] for name in FIELDS}
+    return replace(cloud, fields=known | {"source": np.full(len(cloud), source, dtype=np.uint16)})
 
 
 def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
@@ -234,44 +295,3 @@ def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -
     origin = frame.in_crs(np.zeros((1, 3)))[0]
     write_laz(laz, replace(cloud, points=frame.in_crs(cloud.points) - origin), origin, frame.crs)
     return frame.crs
-
-
-def _thin(cloud: Cloud, wanted: float) -> Cloud:
-    """Thin a cloud to a median spacing of `wanted`; one that is sparser already stays as it is."""
-    if spacing(cloud.points) >= wanted:
-        return cloud
-    low, high = 0.3 * wanted, 2.0 * wanted
-    best = cloud
-    for _ in range(8):
-        middle = float(np.sqrt(low * high))
-        best = voxel_downsample(cloud, middle)
-        if len(best) < 10 or spacing(best.points) > wanted:
-            high = middle
-        else:
-            low = middle
-    return best
-
-
-def _feather(added: Cloud, kept: Cloud, width: float, move: bool, fill: float) -> Cloud:
-    """Blend added points into what is kept, over `width` from the seam: colours, and positions when `move` is set.
-
-    At the seam a point takes the mean of its own and its nearest kept neighbours' values; the share of the
-    neighbours falls linearly to nothing.
-    """
-    if width <= 0 or len(kept) < 8:
-        return added
-    distance, partner = cKDTree(kept.points).query(added.points, k=4, workers=threads())
-    share = 0.5 * np.clip(1 - (distance[:, :1] - fill) / width, 0, 1)
-    if added.colors is not None and kept.colors is not None:
-        around = kept.colors[partner].astype(np.float64).mean(1)
-        added = replace(added, colors=_bytes((1 - share) * added.colors + share * around))
-    if move and added.normals is not None:
-        offset = kept.points[partner].mean(1) - added.points
-        normal = added.normals.astype(np.float64)
-        height = np.clip((offset * normal).sum(1, keepdims=True), -fill, fill)
-        added = replace(added, points=added.points + share * height * normal)
-    return added
-
-
-def _bytes(colors: Array) -> NDArray[np.uint8]:
-    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)

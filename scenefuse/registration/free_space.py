@@ -82,14 +82,14 @@ def read_free_space(
     if not seeing:
         return None
     views = []
-    for path, view in (seeing[k] for k in _most_different([v for _, v in seeing], points.mean(0), most)):
+    for path, view in (seeing[k] for k in most_different([v for _, v in seeing], points.mean(0), most)):
         measured = read_depth(path)
         sized = view.resized(measured.shape[1], measured.shape[0])
         views.append(without_edges(replace(sized, pixels=measured)))
     return FreeSpace(views, tolerance)
 
 
-def _most_different(views: list[View], place: Array, most: int) -> list[int]:
+def most_different(views: list[View], place: Array, most: int) -> list[int]:
     """Rows of at most `most` views, each next one as far as possible in direction from those before; sorted."""
     directions = np.array([v.centre - place for v in views])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)

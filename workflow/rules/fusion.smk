@@ -1,12 +1,13 @@
 # Registered objects added to their scene.
 #
-# INPUTS    results/objects/{object}/object.ply, registration/full/; results/scenes/{scene}/dense.ply; config: fusion
-# OUTPUTS   results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, fusion.json
+# INPUTS    results/objects/{object}/object.ply, undistorted/, registration/full/; results/scenes/{scene}/dense.ply, undistorted/;
+#           config: fusion
+# OUTPUTS   results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, checked.ply, evidence.json, fusion.json
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 
 
 rule fuse_object:
-    """Add the registered object to the scene; an unregistered one leaves the scene as it is (F1, F2)."""
+    """Add the registered object to the scene, checked in the photos of both (F1, F2, F4); an unregistered one leaves it as it is."""
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
@@ -14,11 +15,15 @@ rule fuse_object:
         crop_json="results/objects/{object}/registration/full/crop.json",
         fine="results/objects/{object}/registration/full/fine.json",
         scene=in_scene("dense.ply"),
+        workspace=POSED,
+        scene_workspace=in_scene("undistorted"),
         georeference=in_scene("georeference.json"),
     output:
         fused="results/objects/{object}/fused.ply",
         scene="results/objects/{object}/fused_scene.ply",
         laz="results/objects/{object}/fused_scene.laz",
+        checked="results/objects/{object}/checked.ply",
+        evidence="results/objects/{object}/evidence.json",
         report="results/objects/{object}/fusion.json",
     log:
         "results/logs/fuse_object/{object}.log",
@@ -26,6 +31,7 @@ rule fuse_object:
         "results/benchmarks/fuse_object/{object}.tsv"
     conda:
         "../../envs/registration.yaml"
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -37,8 +43,9 @@ rule fuse_object:
         "{wildcards.object}: fusion"
     shell:
         "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-json {input.crop_json}"
-        " --fine-json {input.fine} --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
-        " --fused-laz {output.laz} --report {output.report} {params.options} &> {log}"
+        " --fine-json {input.fine} --object-workspace {input.workspace} --scene-workspace {input.scene_workspace}"
+        " --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
+        " --fused-laz {output.laz} --checked {output.checked} --evidence {output.evidence} --report {output.report} {params.options} &> {log}"
 
 
 rule complete_scene:
@@ -46,9 +53,9 @@ rule complete_scene:
     input:
         scene="results/scenes/{scene}/dense.ply",
         georeference="results/scenes/{scene}/georeference.json",
-        objects=of_objects("object.ply"),
-        crops=of_objects("registration/full/crop.ply"),
-        fines=of_objects("registration/full/fine.json"),
+        objects=of_objects("fused.ply"),
+        checked=of_objects("checked.ply"),
+        fusions=of_objects("fusion.json"),
     output:
         cloud="results/scenes/{scene}/completed.ply",
         laz="results/scenes/{scene}/completed.laz",
@@ -63,7 +70,6 @@ rule complete_scene:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["fusion"]),
         objects=object_folders,
         script=script("fusion/complete_scene.py"),
         code=code("fusion/complete_scene.py"),
@@ -72,4 +78,4 @@ rule complete_scene:
     shell:
         "exec python {params.script} --scene {input.scene} --objects {params.objects} --georeference-json {input.georeference}"
         " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-laz {output.laz}"
-        " --report {output.report} {params.options} &> {log}"
+        " --report {output.report} &> {log}"

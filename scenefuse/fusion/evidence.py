@@ -1,0 +1,228 @@
+"""Evidence: points of the object and of the scene around it, kept where photos confirm them, dropped where photos
+contradict them (method F4)."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.fusion.photo_check import LEAST_PHOTOS, Matches, Photos, match_in, moved_photos
+from scenefuse.fusion.settle import settle
+from scenefuse.fusion.visibility import Visibility, see
+from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing
+from scenefuse.stage import threads
+from scenefuse.transforms import Array, Sim3
+
+UNCHECKED, MEASURED, NERF_ONLY, STEREO_ONLY = 0, 1, 2, 3
+"""Values of the field `evidence`."""
+FIELDS = ("photos", "match", "deviation", "evidence")
+"""What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
+KEPT, SEEN_THROUGH, ENCLOSED, REPLACED = 0, 1, 2, 3
+"""What becomes of a point of the scene, field `reason` of those taken away."""
+REASONS = {
+    SEEN_THROUGH: "photos see a surface behind it",
+    ENCLOSED: "no photo can see it: a measured surface stands before it in all",
+    REPLACED: "the object measured the place better",
+}
+NEAR = 0.05
+"""The scene is checked in the object's box, widened by this share of its diagonal."""
+MARGIN = 0.01
+"""Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden."""
+LEAST_THROUGH = 2
+"""Photos that must see through a point."""
+LEAST_VIEWS = 3
+"""Photos that must have a point in their picture for it to count as enclosed."""
+SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
+"""Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
+the sparser side where that is more; never farther than this share of the diagonal."""
+SMOOTH_POINTS = 8
+"""Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
+NORMAL_POINTS = 16
+"""Neighbours that a missing normal is fitted to."""
+
+
+@dataclass(frozen=True)
+class Side:
+    """A cloud with the photos it was made from, in the same frame; without photos where there are none."""
+
+    cloud: Cloud
+    photos: Photos
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """What becomes of both sides.
+
+    Attributes:
+        settled: settled_from_placed, by which the object was moved before its points were compared.
+        moved: RMS distance of that, over the object's diagonal; None where it could not be settled.
+        obj: the object's points, moved, with `photos`, `match`, `deviation`, `evidence`.
+        added: (N,) of the object's points that come into the scene.
+        contradicted: (N,) of the object's points that photos see through.
+        scene: the scene's points around it with the same fields.
+        reason: (M,) uint8 of the scene's points: KEPT, or why it is taken away.
+        notes: what a user should know.
+    """
+
+    settled: Sim3
+    moved: float | None
+    obj: Cloud
+    added: NDArray[np.bool_]
+    contradicted: NDArray[np.bool_]
+    scene: Cloud
+    reason: NDArray[np.uint8]
+    notes: tuple[str, ...]
+
+
+def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
+    """Check the points of an object and of the scene around it in the photos of both.
+
+    A point is measured where three photos of its own side confirm it; a scene's point also where three of the object's
+    do. A side without photos is judged by the other's. Measured points are the surface that hides and is seen: what
+    photos see through, and what no photo can see, is not there. Where both sides measured a place, the smaller
+    standard deviation stays.
+
+    Args:
+        obj: the object in the scene's frame, registered.
+        scene: the scene's points around it.
+        nerf_only: whether points of the object that no photo confirms are added where the scene has none.
+    """
+    obj, scene = replace(obj, cloud=_with_normals(obj.cloud)), replace(scene, cloud=_with_normals(scene.cloud))
+    diagonal = obj.cloud.diagonal
+    of_obj, of_scene = _own(obj, scene), _own(scene, obj)
+    found = settle(obj.cloud[of_obj.measured], scene.cloud[of_scene.measured], diagonal)
+    settled, moved = found or (Sim3.identity(), None)
+    obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
+    across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
+    measured = of_scene.measured | across.measured
+    surface = obj.cloud[of_obj.measured]
+    seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
+    reason = np.zeros(len(scene.cloud), np.uint8)
+    reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
+    reason[seen.through >= LEAST_THROUGH] = SEEN_THROUGH
+    left = measured & (reason == KEPT)
+    behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
+    contradicted = behind.through >= LEAST_THROUGH
+    added = of_obj.measured & ~contradicted
+    worse, better = _compare(obj.cloud.points, of_obj, added, scene.cloud.points, of_scene, left, diagonal)
+    reason[(reason == KEPT) & worse] = REPLACED
+    added &= ~better
+    if nerf_only:
+        added |= _gaps(obj.cloud.points, ~of_obj.measured & ~contradicted, added, scene.cloud.points[reason == KEPT])
+    sure = replace(of_scene, photos=np.maximum(of_scene.photos, across.photos),
+                   match=np.maximum(of_scene.match, across.match),
+                   deviation=np.minimum(of_scene.deviation, across.deviation))  # fmt: skip
+    return Weighed(
+        settled, moved, with_evidence(obj.cloud, of_obj, NERF_ONLY), added, contradicted,
+        with_evidence(scene.cloud, sure, STEREO_ONLY), reason, _notes(obj, scene, of_obj, moved),
+    )  # fmt: skip
+
+
+def _notes(obj: Side, scene: Side, of_obj: Matches, moved: float | None) -> tuple[str, ...]:
+    """What a user should know of the check."""
+    notes = []
+    for side, name, other in ((obj, "object", "scene"), (scene, "scene", "object")):
+        if len(side.photos.views) < LEAST_PHOTOS:
+            notes.append(f"fewer than {LEAST_PHOTOS} photos of the {name} see it: it is judged by those of the {other}")
+    if not of_obj.measured.any():
+        notes.append("no photo confirms any point of the object, so nothing is added")
+    if moved is None:
+        notes.append(
+            "the object stays where the registration put it: too little is measured on both sides, or it would move far"
+        )
+    return tuple(notes)
+
+
+def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
+    """(N,) points of the scene that are checked: in the object's box, widened by NEAR."""
+    low, high, margin = obj.points.min(0), obj.points.max(0), NEAR * obj.diagonal
+    return ((scene.points >= low - margin) & (scene.points <= high + margin)).all(1)
+
+
+def with_evidence(cloud: Cloud, matches: Matches, otherwise: int) -> Cloud:
+    """The cloud with only these fields: what photos know of its points, and `evidence`, `otherwise` if not MEASURED."""
+    fields: dict[str, NDArray[Any]] = {
+        "photos": matches.photos.astype(np.uint16),
+        "match": np.where(matches.tested > 0, matches.match, np.nan).astype(np.float32),
+        "deviation": np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32),
+        "evidence": np.where(matches.measured, MEASURED, otherwise).astype(np.uint8),
+    }
+    return replace(cloud, fields=fields)
+
+
+def unchecked(cloud: Cloud) -> Cloud:
+    """The cloud with the same fields, empty: no photo was asked."""
+    nothing = np.full(len(cloud), np.nan)
+    return with_evidence(
+        cloud, Matches(nothing, np.zeros(len(cloud), np.int64), np.zeros(len(cloud), np.int64), nothing, nothing),
+        UNCHECKED,
+    )  # fmt: skip
+
+
+def _with_normals(cloud: Cloud) -> Cloud:
+    """The cloud, with normals of local planes where it has none; their side is unknown then."""
+    if cloud.normals is not None or len(cloud) < 3:
+        return cloud
+    index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_POINTS, len(cloud)), workers=threads())[1]
+    return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
+
+
+def _own(side: Side, other: Side) -> Matches:
+    """A side's points in its own photos, or in the other's where it has none."""
+    photos = side.photos if len(side.photos.views) >= LEAST_PHOTOS else other.photos
+    return match_in(side.cloud.points, side.cloud.normals, photos)
+
+
+def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float) -> Visibility:
+    """How the photos of both sides see points beside a measured surface."""
+    if len(surface) < 2:
+        none = np.zeros(len(points), np.int64)
+        return Visibility(none, none, none)
+    views = obj.photos.views + scene.photos.views
+    return see(points, surface, views, spacing(surface.points), MARGIN * diagonal)
+
+
+def _compare(
+    obj: Array, of_obj: Matches, on_obj: NDArray[np.bool_], scene: Array, of_scene: Matches,
+    on_scene: NDArray[np.bool_], diagonal: float,
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
+    """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
+
+    obj, scene: points (N, 3), (M, 3); on_obj (N,), on_scene (M,): those that are measured and stay.
+    """
+    worse, better = np.zeros(len(scene), dtype=bool), np.zeros(len(obj), dtype=bool)
+    if not on_obj.any() or len(scene) == 0:
+        return worse, better
+    mine = _smooth(obj[on_obj], of_obj.deviation[on_obj])
+    theirs = np.full(len(scene), np.inf)
+    theirs[on_scene] = _smooth(scene[on_scene], of_scene.deviation[on_scene])
+    # What the scene did not measure lies as far off as what it measured, at least.
+    typical = float(np.median(theirs[on_scene])) if on_scene.any() else 0.0
+    step = SAME_SPACINGS * max(spacing(obj[on_obj]), spacing(scene) if len(scene) > 1 else 0.0)
+    distance, partner = cKDTree(obj[on_obj]).query(scene, workers=threads())
+    common = np.hypot(mine[partner], np.where(np.isfinite(theirs), theirs, typical))
+    same = distance <= np.clip(SAME_DEVIATIONS * common, step, SAME_MOST * diagonal)
+    worse = same & (mine[partner] <= theirs)
+    if on_scene.any():
+        distance, partner = cKDTree(scene[on_scene]).query(obj, workers=threads())
+        ours = np.full(len(obj), np.inf)
+        ours[on_obj] = mine
+        better = (ours > theirs[on_scene][partner]) & (distance <= step)
+    return worse, better
+
+
+def _smooth(points: Array, deviation: Array) -> Array:
+    """Median standard deviation (N,) of the points around each."""
+    near = cKDTree(points).query(points, k=min(SMOOTH_POINTS, len(points)), workers=threads())[1]
+    return np.median(deviation[near.reshape(len(points), -1)], axis=1)
+
+
+def _gaps(points: Array, wanted: NDArray[np.bool_], added: NDArray[np.bool_], scene: Array) -> NDArray[np.bool_]:
+    """(N,) of the wanted points those where neither the added ones nor the scene have any."""
+    there = np.concatenate([points[added], scene])
+    if len(there) == 0 or not wanted.any():
+        return wanted
+    free = cKDTree(there).query(points, workers=threads())[0] > SAME_SPACINGS * spacing(points)
+    return wanted & free

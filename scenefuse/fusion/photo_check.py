@@ -1,0 +1,144 @@
+"""Points checked in photos: where windows around a point match, it is measured, and how exactly is known.
+
+Sources: Furukawa and Ponce 2010 (patches in the tangent plane, photo-consistency from the best photos); Goesele et al.
+2006 (of several views the best count); Yoon and Kweon 2006 (weights that keep a window on one surface); Foerstner and
+Gruelich 1987 (variance of a match from the gradients and the noise).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.fusion.photo_kernel import OFFSETS, match_points
+from scenefuse.registration.free_space import most_different
+from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import View, Workspace
+
+MIN_MATCH = 0.6
+"""Least weighted NCC of a photo that confirms a point."""
+SLACK = 0.1
+"""A photo whose score is better by more at another offset does not confirm a point."""
+LEAST_PHOTOS = 3
+"""Photos that must confirm a point for it to be measured."""
+MOST_PHOTOS = 64
+"""Photos of one side that points are checked in at most: from the most different directions."""
+SEEN_SHARE = 0.02
+"""A photo that has less of an object in its picture is not asked."""
+PIXEL_ERROR = 0.2
+"""Of a step (about a pixel): what is common to a point's matches, cameras and interpolation above all, and does not
+average out. With NOISE_FACTOR from the demo's house and sculpture."""
+NOISE_FACTOR = 5.0
+"""The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
+beside each other their pixels."""
+
+
+@dataclass(frozen=True)
+class Photos:
+    """V photos in one frame, packed for the kernel.
+
+    Attributes:
+        views: their cameras, without pixels.
+        pixels: uint8 grey values, one photo behind the other.
+        starts: (V,) int64 place of each in `pixels`.
+    """
+
+    views: list[View]
+    pixels: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """(V, 2) width and height."""
+        return np.array([(v.width, v.height) for v in self.views], dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def projections(self) -> Array:
+        """(V, 3, 4)."""
+        return np.array([v.projection for v in self.views]).reshape(-1, 3, 4)
+
+    @property
+    def centres(self) -> Array:
+        """(V, 3)."""
+        return np.array([v.centre for v in self.views]).reshape(-1, 3)
+
+    @property
+    def rights(self) -> Array:
+        """(V, 3) x axes of the cameras."""
+        return np.array([v.cam_from_world[0, :3] for v in self.views]).reshape(-1, 3)
+
+    @property
+    def focals(self) -> Array:
+        """(V,) in pixels."""
+        return np.array([np.sqrt(v.intrinsics[0, 0] * v.intrinsics[1, 1]) for v in self.views])
+
+
+def pack(views: list[View]) -> Photos:
+    """Views with grey pixels (H, W) uint8, made ready for the kernel."""
+    lengths = [view.width * view.height for view in views]
+    pixels = np.concatenate([view.pixels.reshape(-1) for view in views]) if views else np.zeros(0, np.uint8)
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64) if views else np.zeros(0, np.int64)
+    return Photos([replace(view, pixels=None) for view in views], pixels, starts)
+
+
+def read_photos(workspace: Workspace, points: Array) -> Photos:
+    """The photos of a workspace that have points (N, 3; its frame) in their picture, packed for the kernel."""
+    sample = points[:: max(1, len(points) // 2000)]
+    seeing = [view for view in workspace.views if len(view.visible(sample)[0]) > SEEN_SHARE * len(sample)]
+    if len(seeing) > MOST_PHOTOS:
+        seeing = [seeing[k] for k in most_different(seeing, sample.mean(0), MOST_PHOTOS)]
+    return pack([workspace.gray(view) for view in seeing])
+
+
+def moved_view(view: View, b_from_a: Sim3) -> View:
+    """A camera of frame a in frame b, whose unit its depths have then."""
+    pose = np.eye(4)
+    pose[:3, :3] = view.cam_from_world[:3, :3] @ b_from_a.rotation.T
+    pose[:3, 3] = b_from_a.scale * view.cam_from_world[:3, 3] - pose[:3, :3] @ b_from_a.translation
+    return replace(view, cam_from_world=pose)
+
+
+def moved_photos(photos: Photos, b_from_a: Sim3) -> Photos:
+    """Photos of frame a in frame b."""
+    return replace(photos, views=[moved_view(view, b_from_a) for view in photos.views])
+
+
+@dataclass(frozen=True)
+class Matches:
+    """How well N points match in a set of photos.
+
+    Attributes:
+        match: (N,) mean score of the best photos at the point, -1..1; -1 where fewer than three photos see it.
+        photos: (N,) photos that confirm the point.
+        tested: (N,) photos that it was matched in, its reference not counted.
+        deviation: (N,) standard deviation of its place, unit of the points; infinite where no photo confirms it.
+        texture: (N,) standard deviation of the reference's window, grey levels.
+    """
+
+    match: Array
+    photos: NDArray[np.int64]
+    tested: NDArray[np.int64]
+    deviation: Array
+    texture: Array
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(N,) points that enough photos confirm."""
+        return self.photos >= LEAST_PHOTOS
+
+
+def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
+    """Match points (N, 3) with unit normals (N, 3), towards the photos, in photos of the same frame."""
+    count = len(points)
+    curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
+    tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    texture, step = np.zeros(count), np.zeros(count)
+    if count and len(photos.views) >= LEAST_PHOTOS:
+        match_points(
+            np.ascontiguousarray(points), np.ascontiguousarray(normals, dtype=np.float64), photos.pixels, photos.starts,
+            photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
+            curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
+        )  # fmt: skip
+    deviation = np.sqrt((PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
+    return Matches(curve[:, OFFSETS], confirming, tested, np.where(confirming > 0, deviation, np.inf), texture)

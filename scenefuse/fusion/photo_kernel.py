@@ -1,0 +1,283 @@
+"""CPU kernel in Numba: small patches around points, compared between the photos that see them."""
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+RADIUS = 3
+"""Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart."""
+OFFSETS = 4
+"""Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos."""
+OTHERS = 10
+"""Photos at most that one point is compared in, beside its reference."""
+BEST = 3
+"""Of these so many count at each offset: the others may not see the place (Goesele et al. 2006)."""
+SIGMA_GREY = 25.0
+"""Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon and Kweon
+2006)."""
+MIN_COSINE = 0.25
+"""Photos that look along a surface (beyond 75 degrees) show little of it."""
+MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radians(60)
+"""Between two rays to a point: under the first a match says nothing about its place, over the last patches look
+different; the second is as good as any up to half way to the last."""
+REFERENCES, REFERENCE_ANGLE = 3, math.radians(20)
+"""Photos that a point is seen from as reference, one after the other, and the least angle between them."""
+ENOUGH = 4
+"""Photos that confirm a point after which no other reference is tried."""
+NOISE = 1.5
+"""Grey levels (one standard deviation) that a photo's pixels are off at least."""
+
+_BLOCK = 64
+_SIDE = 2 * RADIUS + 1
+_SAMPLES = _SIDE * _SIDE
+_STEPS = 2 * OFFSETS + 1
+
+
+@njit(error_model="numpy")
+def _suitability(angle):
+    """How well a photo at an angle (radians) to the reference locates a point, 0..1."""
+    if angle < MIN_ANGLE or angle > MAX_ANGLE:
+        return 0.0
+    half = 0.5 * MAX_ANGLE
+    falling = 1.0 if angle < half else 1.0 - 0.8 * (angle - half) / half
+    return min(angle / GOOD_ANGLE, 1.0) * falling
+
+
+@njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _sample(pixels, start, width, height, x, y):
+    """Bilinear grey value at (x, y), pixel centres at +0.5; negative outside the photo."""
+    px, py = x - 0.5, y - 0.5
+    if not (px >= 0.0 and py >= 0.0 and px < width - 1.0 and py < height - 1.0):
+        return np.float32(-1.0)
+    x0, y0 = int(px), int(py)
+    fx, fy = np.float32(px - x0), np.float32(py - y0)
+    at = start + y0 * width + x0
+    upper = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
+    at += width
+    lower = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
+    return upper * (np.float32(1.0) - fy) + lower * fy
+
+
+@njit(error_model="numpy")
+def _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine):
+    """Quality (V,) of the photos for one point, cosine over footprint, 0 where it is not seen; and that cosine (V,)."""
+    for v in range(len(focals)):
+        quality[v] = 0.0
+        p = projections[v]
+        z = p[2, 0] * point[0] + p[2, 1] * point[1] + p[2, 2] * point[2] + p[2, 3]
+        if z <= 0.0:
+            continue
+        x = (p[0, 0] * point[0] + p[0, 1] * point[1] + p[0, 2] * point[2] + p[0, 3]) / z
+        y = (p[1, 0] * point[0] + p[1, 1] * point[1] + p[1, 2] * point[2] + p[1, 3]) / z
+        if x < RADIUS + 1 or y < RADIUS + 1 or x > sizes[v, 0] - RADIUS - 1 or y > sizes[v, 1] - RADIUS - 1:
+            continue
+        towards = centres[v] - point
+        cosine[v] = (normal * towards).sum() / math.sqrt((towards * towards).sum())
+        if cosine[v] < MIN_COSINE:
+            continue
+        quality[v] = cosine[v] * focals[v] / z
+
+
+@njit(error_model="numpy")
+def _choose(point, reference, centres, quality, chosen, angles):
+    """Put the photos that locate the point best beside the reference into chosen (OTHERS,); returns their number."""
+    ray = point - centres[reference]
+    ray /= math.sqrt((ray * ray).sum())
+    count = 0
+    worth = np.zeros(OTHERS)
+    for v in range(len(quality)):
+        if quality[v] <= 0.0 or v == reference:
+            continue
+        other = point - centres[v]
+        cosine = (ray * other).sum() / math.sqrt((other * other).sum())
+        angle = math.acos(min(max(cosine, -1.0), 1.0))
+        value = quality[v] * _suitability(angle)
+        if value <= 0.0 or (count == OTHERS and value <= worth[OTHERS - 1]):
+            continue
+        k = min(count, OTHERS - 1)
+        while k > 0 and worth[k - 1] < value:
+            worth[k], chosen[k], angles[k] = worth[k - 1], chosen[k - 1], angles[k - 1]
+            k -= 1
+        worth[k], chosen[k], angles[k] = value, v, angle
+        count = min(count + 1, OTHERS)
+    return count
+
+
+@njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _reference_patch(pixels, start, width, height, p, point, across, down, patch, weight):
+    """The reference's samples and weights (SAMPLES,); their weighted mean and variance, -1 outside the photo."""
+    k = 0
+    for b in range(-RADIUS, RADIUS + 1):
+        for a in range(-RADIUS, RADIUS + 1):
+            q = point + a * across + b * down
+            z = p[2, 0] * q[0] + p[2, 1] * q[1] + p[2, 2] * q[2] + p[2, 3]
+            x = (p[0, 0] * q[0] + p[0, 1] * q[1] + p[0, 2] * q[2] + p[0, 3]) / z
+            y = (p[1, 0] * q[0] + p[1, 1] * q[1] + p[1, 2] * q[2] + p[1, 3]) / z
+            patch[k] = _sample(pixels, start, width, height, x, y)
+            if patch[k] < 0:
+                return 0.0, -1.0
+            k += 1
+    middle = patch[_SAMPLES // 2]
+    total = mean = 0.0
+    for k in range(_SAMPLES):
+        a, b = k % _SIDE - RADIUS, k // _SIDE - RADIUS
+        grey = (patch[k] - middle) / SIGMA_GREY
+        weight[k] = math.exp(-0.5 * (a * a + b * b) / (RADIUS * RADIUS) - 0.5 * grey * grey)
+        total += weight[k]
+        mean += weight[k] * patch[k]
+    mean /= total
+    variance = 0.0
+    for k in range(_SAMPLES):
+        weight[k] /= total
+        variance += weight[k] * (patch[k] - mean) ** 2
+    return mean, variance
+
+
+@njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _correlate(patch, weight, mean, variance, other):
+    """Weighted normalised cross-correlation of a patch with another photo's samples, and the variance of these."""
+    theirs = both = square = 0.0
+    for k in range(_SAMPLES):
+        theirs += weight[k] * other[k]
+    for k in range(_SAMPLES):
+        difference = other[k] - theirs
+        both += weight[k] * (patch[k] - mean) * difference
+        square += weight[k] * difference * difference
+    # The noise of both photos keeps patches without texture from matching.
+    return both / math.sqrt((variance + NOISE * NOISE) * (square + NOISE * NOISE)), square
+
+
+@njit(error_model="numpy")
+def _match(
+    pixels, start, width, height, p, centre, point, across, down, step, patch, weight, mean, variance, samples, ncc
+):
+    """Scores ncc (STEPS,) of one photo for the patch at all offsets along the reference's ray; -1 outside it.
+
+    Returns how much the photo's samples change with the offset, as information on it: 1 / variance, the square of a
+    step being the unit.
+    """
+    # A patch moved along the ray is scaled about the reference's centre, which leaves it as it is in the reference.
+    base = p[:, 0] * centre[0] + p[:, 1] * centre[1] + p[:, 2] * centre[2] + p[:, 3]
+    ray, spread = point - centre, 0.0
+    for j in range(_STEPS):
+        scale = 1.0 + (j - OFFSETS) * step
+        k, inside = 0, True
+        for b in range(-RADIUS, RADIUS + 1):
+            for a in range(-RADIUS, RADIUS + 1):
+                qx = scale * (ray[0] + a * across[0] + b * down[0])
+                qy = scale * (ray[1] + a * across[1] + b * down[1])
+                qz = scale * (ray[2] + a * across[2] + b * down[2])
+                z = base[2] + p[2, 0] * qx + p[2, 1] * qy + p[2, 2] * qz
+                x = (base[0] + p[0, 0] * qx + p[0, 1] * qy + p[0, 2] * qz) / z
+                y = (base[1] + p[1, 0] * qx + p[1, 1] * qy + p[1, 2] * qz) / z
+                samples[j, k] = _sample(pixels, start, width, height, x, y)
+                inside &= samples[j, k] >= 0
+                k += 1
+        ncc[j] = -1.0
+        if inside:
+            ncc[j], square = _correlate(patch, weight, mean, variance, samples[j])
+            if j == OFFSETS:
+                spread = square
+    if ncc[OFFSETS] <= 0.0 or ncc[OFFSETS - 1] == -1.0 or ncc[OFFSETS + 1] == -1.0:
+        return 0.0
+    slope = squares = middle = 0.0
+    for k in range(_SAMPLES):
+        middle += weight[k] * 0.5 * (samples[OFFSETS + 1, k] - samples[OFFSETS - 1, k])
+    for k in range(_SAMPLES):
+        change = 0.5 * (samples[OFFSETS + 1, k] - samples[OFFSETS - 1, k]) - middle
+        slope += weight[k] * change * change
+        squares += weight[k] * weight[k]
+    residual = spread * (1.0 - ncc[OFFSETS] ** 2) + NOISE * NOISE
+    return slope / (squares * residual)
+
+
+@njit(error_model="numpy")
+def _next_reference(point, centres, quality, asked, count):
+    """The best photo that looks from more than REFERENCE_ANGLE beside all `asked` so far, or -1."""
+    best = -1
+    for v in range(len(quality)):
+        if quality[v] <= 0.0 or (best >= 0 and quality[v] <= quality[best]):
+            continue
+        ray, apart = point - centres[v], True
+        ray /= math.sqrt((ray * ray).sum())
+        for k in range(count):
+            other = point - centres[asked[k]]
+            apart &= (ray * other).sum() < math.cos(REFERENCE_ANGLE) * math.sqrt((other * other).sum())
+        if apart:
+            best = v
+    return best
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def match_points(  # type: ignore[no-untyped-def]
+    points, normals, pixels, starts, sizes, projections, centres, rights, focals,
+    curve, spread, tested, confirming, texture, step_length, min_match, slack,
+):  # fmt: skip
+    """Match a patch around each point between the photos that see it, there and at offsets along the ray.
+
+    The sharpest photo is the reference; where fewer than three photos confirm a point, others from elsewhere are tried,
+    since a point may be hidden in one. The reference with the most photos that confirm counts, of equal ones the first.
+
+    points, normals (N, 3) float64; pixels (sum of W x H,) uint8 of V photos, one behind the other from starts (V,);
+    sizes (V, 2) width and height; projections (V, 3, 4), centres (V, 3), rights (V, 3) x axes of cameras, focals (V,);
+    min_match, slack: a photo confirms a point where its score is at
+    least the first, and no more than the second below its best one. Written: curve (N, STEPS) mean score of the best
+    photos at each offset, -1 where there are none; spread (N,) standard deviation along the ray in the points' unit,
+    infinite where nothing confirms; tested (N,) photos compared with the reference; confirming (N,) photos that
+    confirm, with the reference; texture (N,) standard deviation of the reference's patch in grey levels; step_length
+    (N,) of an offset.
+    """
+    count, views = len(points), len(focals)
+    for block in prange((count + _BLOCK - 1) // _BLOCK):
+        quality, cosine = np.zeros(views), np.zeros(views)
+        chosen, angles, asked = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
+        patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
+        samples, ncc = np.zeros((_STEPS, _SAMPLES), np.float32), np.zeros((OTHERS, _STEPS))
+        information, at_offset = np.zeros(OTHERS), np.zeros(OTHERS)
+        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+            curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
+            point, normal = points[i], normals[i]
+            _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
+            for attempt in range(REFERENCES):
+                ref = _next_reference(point, centres, quality, asked, attempt)
+                if ref < 0 or confirming[i] >= ENOUGH:
+                    break
+                asked[attempt] = ref
+                others = _choose(point, ref, centres, quality, chosen, angles)
+                if others < 2:
+                    continue
+                footprint = cosine[ref] / quality[ref]
+                across = rights[ref] - (rights[ref] * normal).sum() * normal
+                across *= footprint / math.sqrt((across * across).sum())
+                down = np.cross(normal, across)
+                mean, variance = _reference_patch(
+                    pixels, starts[ref], sizes[ref, 0], sizes[ref, 1], projections[ref], point, across, down, patch,
+                    weight,
+                )  # fmt: skip
+                if variance < 0:
+                    continue
+                ray = point - centres[ref]
+                step = footprint / math.sin(np.median(angles[:others]))
+                seen, agreeing, known = 0, 0, 0.0
+                for k in range(others):
+                    v = chosen[k]
+                    information[k] = _match(
+                        pixels, starts[v], sizes[v, 0], sizes[v, 1], projections[v], centres[ref], point, across, down,
+                        step / math.sqrt((ray * ray).sum()), patch, weight, mean, variance, samples, ncc[k],
+                    )  # fmt: skip
+                    seen += ncc[k, OFFSETS] > -1.0
+                    if ncc[k, OFFSETS] >= min_match and ncc[k, OFFSETS] >= ncc[k].max() - slack:
+                        agreeing += 1
+                        known += information[k]
+                if seen < 2 or (tested[i] > 0 and agreeing + 1 <= confirming[i]):
+                    continue
+                tested[i], texture[i], step_length[i] = seen, math.sqrt(variance), step
+                for j in range(_STEPS):
+                    at_offset[:others] = -ncc[:others, j]
+                    at_offset[others:] = 1.0
+                    order = np.sort(at_offset)
+                    curve[i, j] = -order[: min(BEST, seen)].mean()
+                if agreeing > 0:
+                    confirming[i] = agreeing + 1
+                    spread[i] = step / math.sqrt(known) if known > 0 else np.inf

@@ -1,0 +1,82 @@
+"""Which photos see a point: surfaces that photos confirmed hide what is behind them, and nothing stands before them.
+
+Source: Merrell et al. 2007 (visibility constraints between depth maps), here between measured points and photos.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.io.clouds import Cloud
+from scenefuse.transforms import Array
+from scenefuse.workspace import View
+
+FACING = 0.1
+"""Cosine of the angle between a normal and the direction to a camera, from which on a surface stands in the way."""
+CELL_SPACINGS = 2.0
+"""Side of a cell in spacings of the surface's points, so that a surface has no holes between them."""
+LEAST_KNOWN_HIDDEN, LEAST_KNOWN_THROUGH = 5, 7
+"""Cells of 3 x 3 that must hold a surface to say that a point is hidden behind it, or that a photo sees through it."""
+
+
+@dataclass(frozen=True)
+class Visibility:
+    """How V photos see N points.
+
+    Attributes:
+        in_view: (N,) photos that have the point in their picture.
+        hidden: (N,) of these, photos in which a surface stands before it.
+        through: (N,) of these, photos that see a surface behind it: nothing can be where it is.
+    """
+
+    in_view: NDArray[np.int64]
+    hidden: NDArray[np.int64]
+    through: NDArray[np.int64]
+
+
+def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin: float) -> Visibility:
+    """Hold points (N, 3) against the measured points of a surface, with normals, in each photo.
+
+    Args:
+        points: in the frame of the surface and the cameras.
+        surface: measured points.
+        views: cameras.
+        spacing: of the surface's points.
+        margin: how far before or behind the surface a point must lie to count, unit of the frame.
+    """
+    in_view, hidden, through = (np.zeros(len(points), dtype=np.int64) for _ in range(3))
+    for view in views:
+        buffer = _depth_buffer(surface, view, spacing)
+        nearest, farthest, known = _around(buffer.pixels)
+        rows, pixels, depth = buffer.visible(points)
+        at = pixels[:, 1], pixels[:, 0]
+        in_view[rows] += 1
+        hidden[rows] += (known[at] >= LEAST_KNOWN_HIDDEN) & (depth > farthest[at] + margin)
+        through[rows] += (known[at] >= LEAST_KNOWN_THROUGH) & (depth < nearest[at] - margin)
+    return Visibility(in_view, hidden, through)
+
+
+def _depth_buffer(surface: Cloud, view: View, spacing: float) -> View:
+    """The photo in cells, `pixels` (H, W) the least depth of the surface's points in each; infinite without one."""
+    points, normals = surface.points, surface.normals
+    assert normals is not None
+    towards = view.centre - points
+    facing = (normals * towards).sum(1) > FACING * np.linalg.norm(towards, axis=1)
+    _, depth = view.project(points)
+    ahead = depth[depth > 0]
+    cell = CELL_SPACINGS * spacing * view.intrinsics[0, 0] / (np.median(ahead) if len(ahead) else 1.0)
+    small = view.at_most(max(4, round(max(view.width, view.height) / max(1.0, cell))))
+    rows, pixels, depth = small.visible(points[facing])
+    nearest = np.full((small.height, small.width), np.inf)
+    np.minimum.at(nearest, (pixels[:, 1], pixels[:, 0]), depth)
+    return View(small.name, small.intrinsics, small.cam_from_world, small.width, small.height, nearest)
+
+
+def _around(nearest: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    """Least and largest depth (H, W) of the 3 x 3 cells around each, of those that have one, and their number."""
+    height, width = nearest.shape
+    padded = np.pad(nearest, 1, constant_values=np.inf)
+    shifted = np.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)])
+    known = np.isfinite(shifted)
+    return shifted.min(0), np.where(known, shifted, -np.inf).max(0), known.sum(0)
