@@ -60,7 +60,8 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
         if value(fusion, "status") != "fused":
             unregistered[folder.name] = value(fusion, "reason")
             continue
-        _take_away(scene, kept, read_cloud(folder / "checked.ply"))
+        if value(fusion, "checked_points"):
+            _take_away(scene, kept, read_cloud(folder / "checked.ply"))
         mine = read_cloud(folder / "fused.ply")
         mine = _apart(mine[mine.fields["source"] == FROM_OBJECT], added)
         added.append(with_source(mine, number))
@@ -78,8 +79,6 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
 
 def _take_away(scene: Cloud, kept: NDArray[np.bool_], checked: Cloud) -> None:
     """Mark in `kept` what an object took away, and put what photos know of the checked points into the scene's."""
-    if len(checked) == 0:
-        return
     rows = checked.fields["row"].astype(np.int64)
     kept[rows[checked.fields["reason"] != KEPT]] = False
     for name in FIELDS:

@@ -39,6 +39,9 @@ SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
 the sparser side where that is more; never farther than this share of the diagonal."""
 SMOOTH_POINTS = 8
 """Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
+SUPPORT = 0.5
+"""Share of the neighbours of a measured point that are measured too, for it to be part of the surface that hides and is
+seen: here and there a point matches by chance."""
 NORMAL_POINTS = 16
 """Neighbours that a missing normal is fitted to."""
 
@@ -97,13 +100,14 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
     obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
     across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
     measured = of_scene.measured | across.measured
-    surface = obj.cloud[of_obj.measured]
+    surface = obj.cloud[_supported(obj.cloud.points, of_obj.measured)]
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
     reason[seen.through >= LEAST_THROUGH] = SEEN_THROUGH
     left = measured & (reason == KEPT)
-    behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
+    surface = concatenate([surface, scene.cloud[_supported(scene.cloud.points, left)]])
+    behind = _seen(obj.cloud.points, surface, obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
     added = of_obj.measured & ~contradicted
     worse, better = _compare(obj.cloud.points, of_obj, added, scene.cloud.points, of_scene, left, diagonal)
@@ -156,7 +160,7 @@ def unchecked(cloud: Cloud) -> Cloud:
     """The cloud with the same fields, empty: no photo was asked."""
     nothing = np.full(len(cloud), np.nan)
     return with_evidence(
-        cloud, Matches(nothing, np.zeros(len(cloud), np.int64), np.zeros(len(cloud), np.int64), nothing, nothing),
+        cloud, Matches(nothing, np.zeros(len(cloud), np.int64), np.zeros(len(cloud), np.int64), *[nothing] * 3),
         UNCHECKED,
     )  # fmt: skip
 
@@ -211,6 +215,16 @@ def _compare(
         ours[on_obj] = mine
         better = (ours > theirs[on_scene][partner]) & (distance <= step)
     return worse, better
+
+
+def _supported(points: Array, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) measured points among whose neighbours measured ones are in the majority."""
+    if not measured.any():
+        return measured
+    near = cKDTree(points).query(points[measured], k=min(SMOOTH_POINTS + 1, len(points)), workers=threads())[1]
+    found = measured.copy()
+    found[measured] = measured[near.reshape(int(measured.sum()), -1)].mean(1) >= SUPPORT
+    return found
 
 
 def _smooth(points: Array, deviation: Array) -> Array:

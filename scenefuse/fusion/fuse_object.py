@@ -228,6 +228,7 @@ def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, un
         "registration": quantity(value(registration, "status"), ""),
         "reason": quantity(value(registration, "reason"), ""),
         "scene_points": quantity(len(fused.scene), "points"),
+        "checked_points": quantity(len(fused.rows), "points"),
         "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(added), "points"),
         "nerf_only_points": quantity(int((added.fields["evidence"] == NERF_ONLY).sum()), "points"),

@@ -22,14 +22,17 @@ SLACK = 0.1
 """A photo whose score is better by more at another offset does not confirm a point."""
 LEAST_PHOTOS = 3
 """Photos that must confirm a point for it to be measured."""
+MOST_DEVIATION = 1.5
+"""Of a step (about a pixel), the largest standard deviation of a measured point: windows that match as well farther on
+measure nothing, sky and blank walls above all."""
 MOST_PHOTOS = 64
 """Photos of one side that points are checked in at most: from the most different directions."""
 SEEN_SHARE = 0.02
 """A photo that has less of an object in its picture is not asked."""
-PIXEL_ERROR = 0.2
+PIXEL_ERROR = 0.15
 """Of a step (about a pixel): what is common to a point's matches, cameras and interpolation above all, and does not
 average out. With NOISE_FACTOR from the demo's house and sculpture."""
-NOISE_FACTOR = 5.0
+NOISE_FACTOR = 3.0
 """The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
 beside each other their pixels."""
 
@@ -114,6 +117,7 @@ class Matches:
         tested: (N,) photos that it was matched in, its reference not counted.
         deviation: (N,) standard deviation of its place, unit of the points; infinite where no photo confirms it.
         texture: (N,) standard deviation of the reference's window, grey levels.
+        step: (N,) how far a point moves along the ray for about a pixel in the other photos, unit of the points.
     """
 
     match: Array
@@ -121,11 +125,12 @@ class Matches:
     tested: NDArray[np.int64]
     deviation: Array
     texture: Array
+    step: Array
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(N,) points that enough photos confirm."""
-        return self.photos >= LEAST_PHOTOS
+        """(N,) points that enough photos confirm, where a match says where they are: to a pixel."""
+        return (self.photos >= LEAST_PHOTOS) & (self.deviation <= MOST_DEVIATION * self.step)
 
 
 def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
@@ -140,5 +145,15 @@ def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Mat
             photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
             curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
         )  # fmt: skip
-    deviation = np.sqrt((PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
-    return Matches(curve[:, OFFSETS], confirming, tested, np.where(confirming > 0, deviation, np.inf), texture)
+    deviation = np.sqrt((_peak(curve) * step) ** 2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
+    return Matches(curve[:, OFFSETS], confirming, tested, np.where(confirming > 0, deviation, np.inf), texture, step)
+
+
+def _peak(curve: Array) -> Array:
+    """Where scores (N, STEPS) are largest, in steps from the point: a parabola through the best and its sides."""
+    best = np.clip(curve.argmax(1), 1, curve.shape[1] - 2)
+    rows = np.arange(len(curve))
+    before, middle, after = (curve[rows, best + k] for k in (-1, 0, 1))
+    bend = before - 2 * middle + after
+    part = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    return np.asarray(best + np.clip(part, -1, 1) - OFFSETS, dtype=np.float64)

@@ -18,13 +18,16 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.fusion.fuse_object import FROM_SCENE, FusionSettings, fuse_clouds, with_provenance
+from scenefuse.fusion.fuse_object import fuse_by_distance, fuse_by_evidence, together
+from scenefuse.fusion.modes import FusionSettings
+from scenefuse.fusion.photo_check import moved_photos, read_photos
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
 from scenefuse.stage import StageError, read_json, run, threads, value
 from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import read_workspace
 
 # Points drawn on the true surface, as the workflow's evaluation draws them.
 SAMPLES = 60000
@@ -83,9 +86,14 @@ class Case:
 
 def fuse(case: Case, settings: FusionSettings) -> Cloud:
     """The completed scene. All calls of the library's fusion go through here."""
-    fusion = fuse_clouds(case.object, case.scene, case.crop, case.pose, settings)
-    kept = case.scene[fusion.kept]
-    return concatenate([kept, fusion.added]) if len(fusion.added) else kept
+    if settings.mode == "evidence":
+        placed = case.object.transformed(case.pose)
+        own = read_photos(read_workspace(case.results / "objects" / case.name / "undistorted"), case.object.points)
+        theirs = read_photos(read_workspace(case.results / "scenes/demo/undistorted"), placed.points)
+        fused = fuse_by_evidence(placed, case.scene, moved_photos(own, case.pose), theirs, settings)
+    else:
+        fused = fuse_by_distance(case.object, case.scene, case.crop, case.pose, settings)
+    return together(fused.kept, fused.added)
 
 
 def fusions() -> dict[str, FusionSettings]:
@@ -180,7 +188,7 @@ def perfect_scene(case: Case) -> Case:
     if good.colors is not None:
         placed = case.known.fit.truth_from_model.apply(good.points)
         colors = good.colors[cKDTree(placed).query(case.surface, workers=threads())[1]]
-    perfect = with_provenance(Cloud(scene_from_truth.apply(case.surface), normals, colors), FROM_SCENE)
+    perfect = Cloud(scene_from_truth.apply(case.surface), normals, colors)
     own = around_object(case.truth_from_scene.apply(case.scene.points), case.known)
     whole = concatenate([case.scene[~own], perfect])
     return replace(case, scene=whole, crop=perfect, pose=case.true_pose)
@@ -236,7 +244,7 @@ def read_cases(results: Path, objects: tuple[str, ...], cloud: Path | None) -> I
     names = objects or sorted(path.parent.name for path in truth.glob("*/mesh.ply"))
     if cloud is not None and len(names) != 1:
         raise StageError(f"--object {cloud} is one object's cloud; name that object with --objects")
-    scene = with_provenance(read_cloud(results / "scenes/demo/dense.ply"), FROM_SCENE)
+    scene = read_cloud(results / "scenes/demo/dense.ply")
     for name in names:
         case = read_case(results, name, scene)
         yield case if cloud is None else replace(case, object=read_cloud(cloud))

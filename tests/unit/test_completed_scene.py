@@ -6,13 +6,14 @@ import laspy
 import numpy as np
 
 from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
-from scenefuse.fusion.fuse_object import FusionSettings, fuse_clouds
+from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.job_records import JobRecords
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
-SETTINGS = FusionSettings(fill_spacings=1.5, fill_residuals=2.5, density=0.0, feather_spacings=4.0, match_colors=True)
+SETTINGS = FusionSettings(mode="fill")
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
 
 
@@ -25,15 +26,39 @@ def strip(low, high, y=0.0, color=(200, 100, 50)):
 
 
 def run(folder, scene, objects, mode="fill", refused=(), failed=()):
-    """The stage on objects given in the scene's frame; each one's crop is the scene itself."""
+    """Each object fused, then the stage, on objects given in the scene's frame; each one's crop is the scene itself."""
     write_cloud(folder / "scene.ply", scene)
+    write_json(
+        folder / "crop.json",
+        {
+            "level_from_scene": quantity(np.eye(3), ""),
+            "box_low": quantity([-1, -1, -1], ""),
+            "box_high": quantity([30, 9, 1], ""),
+        },
+    )
     for name, cloud in objects.items():
-        write_cloud(folder / name / "object.ply", cloud.transformed(POSE.inverse()))
-        write_cloud(folder / name / "registration/full/crop.ply", scene)
+        mine = folder / name
+        write_cloud(mine / "object.ply", cloud.transformed(POSE.inverse()))
         status = "unregistered" if name in refused else "registered"
         fine = {"status": quantity(status, ""), "reason": quantity("weak", "")}
-        write_json(
-            folder / name / "registration/full/fine.json", fine | {"scene_from_object": quantity(POSE.matrix, "")}
+        write_json(mine / "fine.json", fine | {"scene_from_object": quantity(POSE.matrix, "")})
+        fuse_object(
+            inputs=FusionInputs(
+                object=mine / "object.ply",
+                scene=folder / "scene.ply",
+                crop=folder / "scene.ply",
+                crop_json=folder / "crop.json",
+                fine_json=mine / "fine.json",
+            ),
+            outputs=FusionOutputs(
+                fused=mine / "fused.ply",
+                fused_scene=mine / "fused_scene.ply",
+                fused_laz=mine / "fused_scene.laz",
+                checked=mine / "checked.ply",
+                evidence=mine / "evidence.json",
+                report=mine / "fusion.json",
+            ),
+            settings=replace(SETTINGS, mode=mode),
         )
     complete_scene(
         inputs=CompletionInputs(
@@ -45,7 +70,6 @@ def run(folder, scene, objects, mode="fill", refused=(), failed=()):
         completed=folder / "completed.ply",
         completed_laz=folder / "completed.laz",
         report=folder / "completed.json",
-        settings=replace(SETTINGS, mode=mode),
     )
     return read_cloud(folder / "completed.ply"), read_json(folder / "completed.json")
 

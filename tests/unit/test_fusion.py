@@ -5,19 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.fusion.fuse_object import FusionInputs, FusionSettings, fuse_clouds, fuse_object, match_colors
+from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fusion.modes import FusionSettings, feathered, fuse_clouds, match_colors
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
-SETTINGS = FusionSettings(
-    fill_spacings=1.5,
-    fill_residuals=2.5,
-    density=1.0,
-    feather_spacings=4.0,
-    match_colors=True,
-)
+SETTINGS = FusionSettings(mode="fill", density=1.0)
 
 
 def sheet(low, high, step, color, z=0.0):
@@ -46,7 +41,6 @@ def test_fill_adds_only_what_the_scene_lacks(scene, obj):
     fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), SETTINGS)
     assert fusion.kept.all()
     assert fusion.added.points[:, 0].min() > 4.0
-    assert set(fusion.added.fields["source"]) == {1}
     assert spacing(fusion.added.points) == pytest.approx(0.1, rel=0.2)
 
 
@@ -62,13 +56,12 @@ def test_replace_takes_the_scene_away_under_the_object(scene, obj):
     assert not fusion.kept[scene.points[:, 0] > 2.2].any()
 
 
-def test_the_feathered_seam_moves_a_shifted_object_half_way_to_the_scene(scene):
-    raised = sheet(2, 8, 0.05, [200, 100, 50], z=0.1)
-    settings = replace(SETTINGS, mode="replace", density=0.0, fill_residuals=0.0)
-    added = fuse_clouds(raised, scene, scene, Sim3.identity(), settings).added
-    at_seam, far = added.points[:, 0] < 2.05, added.points[:, 0] > 4
-    assert np.allclose(added.points[far, 2], 0.1)
-    assert 0.04 < added.points[at_seam, 2].mean() < 0.09
+def test_the_seam_blends_colors_and_moves_no_point(scene):
+    raised = sheet(2, 8, 0.05, [100, 100, 250], z=0.1)
+    blended = feathered(raised, scene[scene.points[:, 0] < 2], width=1.0, fill=0.1)
+    change = np.abs(blended.colors.astype(int) - raised.colors).max(1)
+    assert np.array_equal(blended.points, raised.points)
+    assert change[raised.points[:, 0] < 2.1].min() > 20 and change[raised.points[:, 0] > 4].max() == 0
 
 
 def test_colors_of_what_is_added_follow_the_scene(scene, obj):
@@ -122,10 +115,14 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
             fine_json=tmp_path / "fine.json",
             georeference_json=tmp_path / "georeference.json",
         ),
-        fused=tmp_path / "fused.ply",
-        fused_scene=tmp_path / "fused_scene.ply",
-        fused_laz=tmp_path / "fused_scene.laz",
-        report=tmp_path / "fusion.json",
+        outputs=FusionOutputs(
+            fused=tmp_path / "fused.ply",
+            fused_scene=tmp_path / "fused_scene.ply",
+            fused_laz=tmp_path / "fused_scene.laz",
+            checked=tmp_path / "checked.ply",
+            evidence=tmp_path / "evidence.json",
+            report=tmp_path / "fusion.json",
+        ),
         settings=SETTINGS,
     )
     whole, around, report = (
@@ -137,8 +134,8 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     added = value(report, "added_points")
     assert (added > 0) == (status != "unregistered") and value(report, "registration") == status
     assert len(whole) == len(scene) + added and (whole.fields["source"] == 1).sum() == added
-    assert whole.fields["source"].dtype == np.uint8
-    assert whole.fields["confidence"].dtype == np.float32 and whole.fields["views"].dtype == np.int32
+    assert whole.fields["source"].dtype == np.uint16 and not whole.fields["evidence"].any()
+    assert value(read_json(tmp_path / "evidence.json"), "notes") == ["no photo was asked"]
     assert len(around) == (scene.points[:, 0] <= 3).sum() + added
     import laspy
 

@@ -1,0 +1,45 @@
+"""A painted plane z = 0 photographed from above, for checks of points in photos; rays and colours are exact."""
+
+import cv2
+import numpy as np
+
+from scenefuse.workspace import View
+
+BLANK = 1.5
+"""Where x is larger, the plane has no texture."""
+
+
+def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """Grey values 0..255 of places on the plane: smooth noise of several wavelengths, none beyond x = BLANK."""
+    rng = np.random.default_rng(3)
+    grey = np.zeros_like(x)
+    for _ in range(40):
+        angle, wavelength, phase = rng.uniform(0, np.pi), rng.uniform(0.12, 0.8), rng.uniform(0, 6.3)
+        grey += np.sin((x * np.cos(angle) + y * np.sin(angle)) * 2 * np.pi / wavelength + phase)
+    return np.where(x > BLANK, 128.0, np.clip(128 + 12 * grey, 0, 255))
+
+
+def photographs(count: int, height: float, size: int = 320, radius: float = 2.0, noise: float = 1.0) -> list[View]:
+    """Views from a ring of cameras at a height over the plane that look at the origin; `pixels` (H, W) uint8."""
+    rng = np.random.default_rng(0)
+    views = []
+    for k in range(count):
+        turn = 2 * np.pi * k / count
+        centre = np.array([radius * np.cos(turn), radius * np.sin(turn), height])
+        forward = -centre / np.linalg.norm(centre)
+        right = np.cross(forward, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+        pose[:3, 3] = -pose[:3, :3] @ centre
+        intrinsics = np.array([[size * 0.8, 0, size / 2], [0, size * 0.8, size / 2], [0, 0, 1.0]])
+        # Four rays a pixel, averaged, as a sensor does.
+        u, v = np.meshgrid(np.arange(2 * size) / 2 + 0.25, np.arange(2 * size) / 2 + 0.25)
+        rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3]
+        with np.errstate(divide="ignore"):
+            ground = centre + rays * (-centre[2] / rays[..., 2:])
+        grey = cv2.resize(np.where(rays[..., 2] < 0, paint(ground[..., 0], ground[..., 1]), 255.0), (size, size),
+                          interpolation=cv2.INTER_AREA)  # fmt: skip
+        pixels = np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
+        views.append(View(f"{k}.png", intrinsics, pose, size, size, pixels))
+    return views

@@ -1,0 +1,130 @@
+"""Evidence on a painted plane: what photos of both sides say decides what is added, kept and taken away."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.photographed_plane import BLANK, photographs
+
+from scenefuse.fusion.evidence import (
+    ENCLOSED,
+    FIELDS,
+    KEPT,
+    MEASURED,
+    NERF_ONLY,
+    REPLACED,
+    SEEN_THROUGH,
+    STEREO_ONLY,
+    Side,
+    weigh,
+)
+from scenefuse.fusion.fuse_object import evidence_report, fuse_by_evidence
+from scenefuse.fusion.modes import FusionSettings
+from scenefuse.fusion.photo_check import moved_photos, pack
+from scenefuse.io.clouds import Cloud, concatenate
+from scenefuse.stage import value
+from scenefuse.transforms import Sim3
+
+NOBODY = pack([])
+
+
+def sheet(low, high, step, noise=0.0, z=0.0):
+    """Points of the plane, x and y from low to high, with noise along z."""
+    rng = np.random.default_rng(0)
+    x, y = np.meshgrid(np.arange(low, high, step), np.arange(-1, 1, step))
+    points = np.stack([x.ravel(), y.ravel(), z + noise * rng.normal(size=x.size)], axis=1)
+    colors = np.full((len(points), 3), 120, np.uint8)
+    return Cloud(points, np.tile(np.array([0, 0, 1], np.float32), (len(points), 1)), colors)
+
+
+@pytest.fixture(scope="module")
+def near():
+    """The close-ups."""
+    return pack(photographs(8, 3.0))
+
+
+@pytest.fixture(scope="module")
+def far():
+    """The scene's photos, from twice as far."""
+    return pack(photographs(8, 6.0, radius=4.0))
+
+
+def test_the_sharper_side_stays_where_both_measured(near, far):
+    obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    assert found.added.mean() > 0.97
+    inside, outside = scene.points[:, 0] < 0.3, scene.points[:, 0] > 0.5
+    assert (found.reason[inside] == REPLACED).mean() > 0.95 and (found.reason[outside] == KEPT).all()
+    assert (found.scene.fields["evidence"][outside] == MEASURED).mean() > 0.9
+    # The other way round the scene is the sharper one, and nothing comes in where it is.
+    found = weigh(Side(scene, far), Side(obj, near), nerf_only=False)
+    assert not found.added[scene.points[:, 0] < 0.3].any() and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
+    assert (found.reason == KEPT).all()
+
+
+def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_object(near, far):
+    floating, under = sheet(-0.2, 0.2, 0.06, z=0.3), sheet(-0.2, 0.2, 0.06, z=-0.3)
+    scene = concatenate([sheet(-0.8, 0.8, 0.06), floating, under])
+    part = np.repeat([0, 1, 2], [len(scene) - len(floating) - len(under), len(floating), len(under)])
+    obj = concatenate([sheet(-0.8, 0.8, 0.03), floating])
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=True)
+    assert (found.reason[part == 1] == SEEN_THROUGH).all() and (found.reason[part == 2] == ENCLOSED).all()
+    assert not found.added[-len(floating) :].any() and found.contradicted[-len(floating) :].all()
+
+
+def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far):
+    blank = sheet(BLANK + 0.15, BLANK + 0.4, 0.03)
+    obj = concatenate([sheet(-0.5, 0.5, 0.03), blank])
+    scene = concatenate([sheet(-0.5, 0.0, 0.06), sheet(BLANK + 0.4, BLANK + 0.5, 0.06)])
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    last = slice(-len(blank), None)
+    assert (found.obj.fields["evidence"][last] == NERF_ONLY).all() and not found.added[last].any()
+    beyond = scene.points[:, 0] > BLANK
+    assert (found.scene.fields["evidence"][beyond] == STEREO_ONLY).all() and (found.reason[beyond] == KEPT).all()
+    assert weigh(Side(obj, near), Side(scene, far), nerf_only=True).added[last].mean() > 0.8
+
+
+def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
+    wall = np.array([[0, 0, 1.0], [0, 1, 0], [-1, 0, 0]])  # a second plane would need photos of its own
+    assert np.linalg.det(wall) == pytest.approx(1)
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
+    off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
+    found = weigh(Side(obj.transformed(off), moved_photos(near, off)), Side(scene, far), nerf_only=False)
+    assert np.abs(found.obj.points[:, 2]).max() < 0.005 and found.moved == pytest.approx(0.04 / obj.diagonal, rel=0.2)
+    far_off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.3]))
+    found = weigh(Side(obj.transformed(far_off), moved_photos(near, far_off)), Side(scene, far), nerf_only=False)
+    assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
+
+
+@pytest.mark.parametrize("without", ["object", "scene", "both"])
+def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
+    sides = NOBODY if without != "scene" else near, NOBODY if without != "object" else far
+    fused = fuse_by_evidence(obj, scene, *sides, FusionSettings())
+    notes = value(evidence_report(fused, "m"), "notes")
+    if without == "both":
+        assert len(fused.added) == len(fused.removed) == 0 and any("nothing is added" in note for note in notes)
+    else:
+        assert any(f"photos of the {without} see it" in note for note in notes)
+        assert (fused.added.points[:, 0] > 0.3).sum() > 500 and (fused.added.fields["evidence"] == MEASURED).all()
+
+
+def test_clouds_without_normals_or_colors_and_a_scene_far_away(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
+    plain = Cloud(obj.points), Cloud(scene.points)
+    fused = fuse_by_evidence(*plain, near, far, FusionSettings())
+    assert (fused.added.points[:, 0] > 0.3).sum() > 500
+    fused = fuse_by_evidence(obj, replace(scene, points=scene.points + 50), near, far, FusionSettings())
+    assert len(fused.rows) == 0 and len(fused.added) > 0.9 * len(obj)
+
+
+def test_every_point_says_what_is_known_of_it(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), concatenate([sheet(-0.8, 0.2, 0.06), sheet(8, 9, 0.06)])
+    fused = fuse_by_evidence(obj, scene, near, far, FusionSettings())
+    assert set(FIELDS) == set(fused.added.fields) == set(fused.scene.fields)
+    assert (fused.added.fields["photos"] >= 3).all() and (fused.added.fields["deviation"] < 0.02).all()
+    beyond = fused.scene.points[:, 0] > 5
+    assert not fused.scene.fields["evidence"][beyond].any() and np.isnan(fused.scene.fields["deviation"][beyond]).all()
+    report = evidence_report(fused, "m")
+    kept = value(report, "scene_measured") + value(report, "scene_stereo_only")
+    assert kept + sum(value(report, "scene_removed").values()) == value(report, "scene_checked") == len(fused.rows)
