@@ -28,6 +28,7 @@ ENOUGH = 4
 NOISE = 1.5
 """Grey levels (one standard deviation) that a photo's pixels are off at least."""
 
+_REFERENCE_COSINE = math.cos(REFERENCE_ANGLE)
 _BLOCK = 64
 _SIDE = 2 * RADIUS + 1
 _SAMPLES = _SIDE * _SIDE
@@ -60,6 +61,14 @@ def _sample(pixels, start, width, height, x, y):
 
 
 @njit(error_model="numpy")
+def _cosine(point, first, second):
+    """Of the angle at a point between the rays from two centres; written out, since arrays here would be allocated."""
+    ax, ay, az = point[0] - first[0], point[1] - first[1], point[2] - first[2]
+    bx, by, bz = point[0] - second[0], point[1] - second[1], point[2] - second[2]
+    return (ax * bx + ay * by + az * bz) / math.sqrt((ax * ax + ay * ay + az * az) * (bx * bx + by * by + bz * bz))
+
+
+@njit(error_model="numpy")
 def _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine):
     """Quality (V,) of the photos for one point, cosine over footprint, 0 where it is not seen; and that cosine (V,)."""
     for v in range(len(focals)):
@@ -72,26 +81,22 @@ def _photos_of(point, normal, projections, centres, focals, sizes, quality, cosi
         y = (p[1, 0] * point[0] + p[1, 1] * point[1] + p[1, 2] * point[2] + p[1, 3]) / z
         if x < RADIUS + 1 or y < RADIUS + 1 or x > sizes[v, 0] - RADIUS - 1 or y > sizes[v, 1] - RADIUS - 1:
             continue
-        towards = centres[v] - point
-        cosine[v] = (normal * towards).sum() / math.sqrt((towards * towards).sum())
+        tx, ty, tz = centres[v, 0] - point[0], centres[v, 1] - point[1], centres[v, 2] - point[2]
+        along = normal[0] * tx + normal[1] * ty + normal[2] * tz
+        cosine[v] = along / math.sqrt(tx * tx + ty * ty + tz * tz)
         if cosine[v] < MIN_COSINE:
             continue
         quality[v] = cosine[v] * focals[v] / z
 
 
 @njit(error_model="numpy")
-def _choose(point, reference, centres, quality, chosen, angles):
+def _choose(point, reference, centres, quality, chosen, angles, worth):
     """Put the photos that locate the point best beside the reference into chosen (OTHERS,); returns their number."""
-    ray = point - centres[reference]
-    ray /= math.sqrt((ray * ray).sum())
     count = 0
-    worth = np.zeros(OTHERS)
     for v in range(len(quality)):
         if quality[v] <= 0.0 or v == reference:
             continue
-        other = point - centres[v]
-        cosine = (ray * other).sum() / math.sqrt((other * other).sum())
-        angle = math.acos(min(max(cosine, -1.0), 1.0))
+        angle = math.acos(min(max(_cosine(point, centres[reference], centres[v]), -1.0), 1.0))
         value = quality[v] * _suitability(angle)
         if value <= 0.0 or (count == OTHERS and value <= worth[OTHERS - 1]):
             continue
@@ -110,10 +115,12 @@ def _reference_patch(pixels, start, width, height, p, point, across, down, patch
     k = 0
     for b in range(-RADIUS, RADIUS + 1):
         for a in range(-RADIUS, RADIUS + 1):
-            q = point + a * across + b * down
-            z = p[2, 0] * q[0] + p[2, 1] * q[1] + p[2, 2] * q[2] + p[2, 3]
-            x = (p[0, 0] * q[0] + p[0, 1] * q[1] + p[0, 2] * q[2] + p[0, 3]) / z
-            y = (p[1, 0] * q[0] + p[1, 1] * q[1] + p[1, 2] * q[2] + p[1, 3]) / z
+            qx = point[0] + a * across[0] + b * down[0]
+            qy = point[1] + a * across[1] + b * down[1]
+            qz = point[2] + a * across[2] + b * down[2]
+            z = p[2, 0] * qx + p[2, 1] * qy + p[2, 2] * qz + p[2, 3]
+            x = (p[0, 0] * qx + p[0, 1] * qy + p[0, 2] * qz + p[0, 3]) / z
+            y = (p[1, 0] * qx + p[1, 1] * qy + p[1, 2] * qz + p[1, 3]) / z
             patch[k] = _sample(pixels, start, width, height, x, y)
             if patch[k] < 0:
                 return 0.0, -1.0
@@ -199,11 +206,9 @@ def _next_reference(point, centres, quality, asked, count):
     for v in range(len(quality)):
         if quality[v] <= 0.0 or (best >= 0 and quality[v] <= quality[best]):
             continue
-        ray, apart = point - centres[v], True
-        ray /= math.sqrt((ray * ray).sum())
+        apart = True
         for k in range(count):
-            other = point - centres[asked[k]]
-            apart &= (ray * other).sum() < math.cos(REFERENCE_ANGLE) * math.sqrt((other * other).sum())
+            apart &= _cosine(point, centres[v], centres[asked[k]]) < _REFERENCE_COSINE
         if apart:
             best = v
     return best
@@ -234,7 +239,7 @@ def match_points(  # type: ignore[no-untyped-def]
         chosen, angles, asked = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
         patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
         samples, ncc = np.zeros((_STEPS, _SAMPLES), np.float32), np.zeros((OTHERS, _STEPS))
-        information, at_offset = np.zeros(OTHERS), np.zeros(OTHERS)
+        information, at_offset, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
         for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
             curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
             point, normal = points[i], normals[i]
@@ -244,7 +249,7 @@ def match_points(  # type: ignore[no-untyped-def]
                 if ref < 0 or confirming[i] >= ENOUGH:
                     break
                 asked[attempt] = ref
-                others = _choose(point, ref, centres, quality, chosen, angles)
+                others = _choose(point, ref, centres, quality, chosen, angles, worth)
                 if others < 2:
                     continue
                 footprint = cosine[ref] / quality[ref]
