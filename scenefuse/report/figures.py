@@ -118,15 +118,6 @@ def _added(cloud: Cloud) -> NDArray[np.bool_]:
     return cloud.fields["source"] == 1 if "source" in cloud.fields else np.zeros(len(cloud), dtype=bool)
 
 
-def _radii(cloud: Cloud) -> NDArray[np.float32]:
-    """Disc radii from the spacing of scene points and of added points each: neither closes the other's holes."""
-    radii, added = np.zeros(len(cloud), dtype=np.float32), _added(cloud)
-    for part in (added, ~added):
-        if part.any():
-            radii[part] = point_radii(cloud.points[part])
-    return radii
-
-
 def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     """The 3D view of an object: its surroundings before and after, thinned."""
     points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
@@ -142,7 +133,7 @@ def _before_after(name: str, join: Surroundings) -> Image:
     margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
     rows: list[list[Image | None]] = []
     for cloud in (join.before, join.after):
-        radii = _radii(cloud)
+        radii = point_radii(cloud.points)
         sides = [render(cloud, orbit_camera(join.framed, a, 22.0, tile), radii) for a in SIDES_DEG]
         near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
         from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
@@ -154,7 +145,7 @@ def _before_after(name: str, join: Surroundings) -> Image:
 
 def _provenance(name: str, join: Surroundings) -> Image:
     """Scene points grey, added points coloured."""
-    tile, added, radii = (430, 350), _added(join.after), _radii(join.after)
+    tile, added, radii = (430, 350), _added(join.after), point_radii(join.after.points)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = (np.where(added[:, None], ADDED_COLOR, SCENE_COLOR) * shade).astype(np.uint8)
     images: list[Image | None] = [
@@ -188,7 +179,7 @@ def _registration(name: str, join: Surroundings) -> Image:
 def _large(join: Surroundings, azimuth_deg: float, size_px: tuple[int, int] = (840, 600)) -> tuple[Image, Image]:
     """The same view before and after."""
     camera = orbit_camera(join.framed, azimuth_deg, 15.0, size_px, margin=0.1)
-    first, second = (render(cloud, camera, _radii(cloud)) for cloud in (join.before, join.after))
+    first, second = (render(cloud, camera, point_radii(cloud.points)) for cloud in (join.before, join.after))
     return first, second
 
 
