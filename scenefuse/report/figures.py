@@ -12,7 +12,7 @@ from scenefuse.report.object_sheet import SIDES_DEG, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view_file import View, write_view
-from scenefuse.report.view_points import merge, thin, within
+from scenefuse.report.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import atomic_directory
 from scenefuse.transforms import Array
 from scenefuse.workspace import read_views
@@ -122,7 +122,8 @@ def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     """The 3D view of an object: its surroundings before and after, thinned."""
     points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
     thinned = thin(points, within(points.points, low, high), VIEW_POINTS)
-    sources = {0: "scene", 1: f"added from {name}"}
+    found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
+    sources = {0: "scene"} | {number: f"added from {name}" for number in found}
     return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, len(join.before), len(join.after))
 
 

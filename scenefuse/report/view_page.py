@@ -87,7 +87,8 @@ def _choice(key: str, kind: str, legend: str, options: list[tuple[str, str]], ch
 
 def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     """The ways to colour the points that the view's fields allow; the first one is chosen."""
-    fields, modes = view.cloud.fields, []
+    fields = view.cloud.fields
+    modes: list[Mode] = []
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
         modes.append({"name": "photo", "button": "Photo", "label": "Colours of the photos"})
@@ -96,15 +97,15 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
     modes.append({"name": "source", "button": "Source", "other": other, "entries": _entries(view, "source", sources)})
     if "evidence" in fields and np.isin(fields["evidence"], [code for code in CLASSES if code > 0]).any():
-        classes = CLASSES | {UNKNOWN: (UNKNOWN_COLOR, "removed by fusion")}
-        entries = _entries(view, "evidence", classes)
-        modes.append({"name": "evidence", "button": "Class", "other": other, "entries": entries})
+        classes = CLASSES | {UNKNOWN: (UNKNOWN_COLOR, "not in the completed scene")}
+        found = _entries(view, "evidence", classes)
+        modes.append({"name": "evidence", "button": "Class", "other": other, "entries": found})
     if deviations is not None:
         ramp = [to_hex(color) for color in colormaps["viridis"](np.linspace(0, 1, LEVELS))]
         low, high = (f"{number(end)} {view.unit}" for end in deviations)
         entries = [{"code": k + 1, "color": color} for k, color in enumerate(ramp)]
-        mode = {"name": "deviation", "button": "Std. deviation", "entries": entries, "ramp": ramp[::3]}
-        modes.append(mode | {"low": low, "high": high, "other": {"color": UNKNOWN_COLOR, "label": "not known"}})
+        ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
+        modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)
     return modes
 
 
