@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from scenefuse.report.values import number
 from scenefuse.report.view_file import LEVELS, View, encode
 from scenefuse.report.view_points import AFTER, BEFORE, REMOVED, UNKNOWN
 
@@ -102,7 +101,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
         modes.append({"name": "evidence", "button": "Class", "other": other, "entries": found})
     if deviations is not None:
         ramp = [to_hex(color) for color in colormaps["viridis"](np.linspace(0, 1, LEVELS))]
-        low, high = (f"{number(end)} {view.unit}" for end in deviations)
+        low, high = (f"{end:.2g} {view.unit}" for end in deviations)
         entries = [{"code": k + 1, "color": color} for k, color in enumerate(ramp)]
         ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
         modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)

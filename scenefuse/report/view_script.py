@@ -6,17 +6,18 @@ pixels between them. Picking follows the same rule, here, because K3D's own woul
 
 VIEW_STYLE = """
 .view { border: 1px solid var(--line); border-radius: 6px; margin: 14px 0 22px; overflow: hidden; background: #fff; }
-.view-stage { position: relative; height: clamp(300px, 62vh, 640px); background: #f7f8f9; cursor: grab; }
+.view-stage { position: relative; height: clamp(300px, 62vh, 640px); background: #f7f8f9; cursor: grab;
+  isolation: isolate; }
 .view-stage:active { cursor: grabbing; } .view-stage.measuring { cursor: crosshair; }
 .view-stage:focus-visible { outline: 3px solid var(--accent); outline-offset: -3px; }
-.view-canvas { position: absolute; inset: 0; touch-action: none; }
-.view-stage svg.marks { position: absolute; inset: 0; width: 100%; height: 100%; pointer-events: none; }
+.view-canvas { position: absolute; z-index: 0; inset: 0; touch-action: none; }
+.view-stage svg.marks { position: absolute; z-index: 1; inset: 0; width: 100%; height: 100%; pointer-events: none; }
 .marks line { stroke: #fff; stroke-width: 5; } .marks line + line { stroke: var(--ink); stroke-width: 2; }
 .marks circle { fill: var(--accent); stroke: #fff; stroke-width: 2; }
 .marks text { font: 600 14px system-ui, sans-serif; fill: var(--ink); stroke: #fff; stroke-width: 4;
   paint-order: stroke; text-anchor: middle; }
-.view-note { position: absolute; inset: auto 0 0 0; margin: 0; padding: 4px 10px; max-width: none; font-size: 12.5px;
-  background: #ffffffd9; pointer-events: none; }
+.view-note { position: absolute; z-index: 1; inset: auto 0 0 0; margin: 0; padding: 4px 10px; max-width: none;
+  font-size: 12.5px; background: #ffffffd9; pointer-events: none; }
 .view-tools { display: flex; flex-wrap: wrap; gap: 8px 16px; align-items: center; padding: 8px 10px;
   border-bottom: 1px solid var(--line); }
 .view-tools fieldset { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0; align-items: center; }

@@ -143,11 +143,13 @@ def _object_section(folder: Path, registration: list[dict[str, str]], view: View
     if reason not in ("-", ""):
         parts.append(f"<p>{escape(reason)}</p>")
     if status in ("failed", "missing"):
-        return "\n".join([*parts, "<p>No figures: the object's stages did not finish.</p>"])
+        return "\n".join([*parts, "<p>No 3D view and no figures: the object's stages did not finish.</p>"])
     if view is not None:
         parts.append(view_section(f"object-{folder.name}", folder.name, view))
     elif status == "unregistered":
         parts.append("<p>No 3D view: the object has no accepted pose and was not added to the scene.</p>")
+    else:
+        parts.append("<p>No 3D view: figures/view.json is missing; draw the figures again.</p>")
     figure_folder = folder / "figures"
     before, after = figure_folder / "before.png", figure_folder / "after.png"
     if before.is_file() and after.is_file():
