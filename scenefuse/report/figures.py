@@ -121,7 +121,8 @@ def _added(cloud: Cloud) -> NDArray[np.bool_]:
 def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     """The 3D view of an object: its surroundings before and after, thinned."""
     points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
-    thinned = thin(points, within(points.points, low, high), VIEW_POINTS)
+    points.fields["near"][:] = within(points.points, low, high)
+    thinned = thin(points, VIEW_POINTS)
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
     sources = {0: "scene"} | {number: f"added from {name}" for number in found}
     return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, len(join.before), len(join.after))

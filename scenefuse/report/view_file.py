@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.report.render import point_radii
 from scenefuse.report.view_points import AFTER, BEFORE, BOTH
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array
 
 Bytes = NDArray[np.uint8]
@@ -24,6 +25,7 @@ LIGHT = np.array([-0.39, -0.55, 0.74])
 """Where the light comes from that shades what is not in photo colours: high, from the left of the first picture."""
 DARKEST = 0.55
 """Shade of a surface that faces away from the light."""
+_SMOOTHED = 12
 LEVELS = 31
 """Steps of radii, shades and deviations: nobody sees more, and five bits compress better than eight."""
 
@@ -166,12 +168,20 @@ def _log_bytes(values: NDArray[np.float32]) -> tuple[Bytes, Bytes, list[float]]:
 
 
 def _shade(cloud: Cloud) -> Array:
-    """(N,) brightness from DARKEST to 1: of the light on the normals, else of the photo colours, else 1."""
+    """(N,) brightness from DARKEST to 1: the mean of the light on the normals and of the photo colours' brightness."""
+    parts = []
     if cloud.normals is not None:
-        return DARKEST + (1 - DARKEST) * np.clip(0.5 + 0.5 * (cloud.normals @ LIGHT), 0, 1)
+        parts.append(np.clip(0.5 + 0.5 * (_smooth(cloud.points, cloud.normals) @ LIGHT), 0, 1))
     if cloud.colors is not None:
-        return DARKEST + (1 - DARKEST) * (cloud.colors @ np.array([0.299, 0.587, 0.114])) / 255
-    return np.ones(len(cloud))
+        parts.append(cloud.colors @ np.array([0.299, 0.587, 0.114]) / 255)
+    return DARKEST + (1 - DARKEST) * np.mean(parts, axis=0) if parts else np.ones(len(cloud))
+
+
+def _smooth(points: Array, normals: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Normals averaged over the nearest points: those of stereo are too noisy to be lit one by one."""
+    nearest = cKDTree(points).query(points, k=min(_SMOOTHED, len(points)), workers=threads())[1]
+    mean = normals[nearest.reshape(len(points), -1)].mean(1)
+    return np.asarray(mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-6), dtype=np.float32)
 
 
 def _deviation(values: NDArray[np.float32]) -> tuple[Bytes, list[float]]:

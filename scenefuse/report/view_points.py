@@ -1,7 +1,8 @@
 """The points of a 3D view: a scene before and after, told apart, and thinned to what a page can hold.
 
-A view is a cloud with the fields `shown` (BOTH, BEFORE or AFTER) and `source`; `evidence` and `deviation` where the
-completed cloud has them. Every point of it is a point of one of the two clouds: none is averaged or moved.
+A view is a cloud with the fields `shown` (BOTH, BEFORE or AFTER), `source`, and `near` (1 on what one wants to see);
+`evidence` and `deviation` where the completed cloud has them. Every point of it is a point of one of the two clouds:
+none is averaged or moved.
 """
 
 from dataclasses import replace
@@ -16,7 +17,7 @@ BOTH, BEFORE, AFTER = 0, 1, 2
 REMOVED, UNKNOWN = 255, 255
 """`source` of a point that fusion took away; `evidence` of a point that the completed cloud does not hold."""
 SURROUNDINGS_SPACING = 2.0
-"""How much coarser than the object its surroundings are thinned: one looks at the object."""
+"""How much farther apart points stand that are not near: one looks at the objects."""
 _SAME = 5e-7
 """Points closer than this share of the diagonal are the same: 21 bits an axis, a twentieth of a millimetre on 100 m."""
 
@@ -24,7 +25,8 @@ _SAME = 5e-7
 def merge(before: Cloud, after: Cloud) -> Cloud:
     """Both clouds as one view; a point in both, of the same colour, is held once, as it is in `after`.
 
-    A point that is in both with two colours is held twice; one that only `before` has gets the source REMOVED.
+    A point that is in both with two colours is held twice; one that only `before` has gets the source REMOVED. All are
+    near.
     """
     low = np.minimum(before.points.min(0), after.points.min(0))
     high = np.maximum(before.points.max(0), after.points.max(0))
@@ -39,17 +41,17 @@ def merge(before: Cloud, after: Cloud) -> Cloud:
     return concatenate([first, second]) if len(first) else second
 
 
-def thin(view: Cloud, near: NDArray[np.bool_], most: int) -> Cloud:
-    """At most that many points of a view, evenly spaced; where `near` is not set (N,), they stand farther apart.
+def thin(view: Cloud, most: int) -> Cloud:
+    """At most that many points of a view, evenly spaced; those that are not near stand farther apart.
 
     What is shown before, after or both is thinned by itself, so that neither picture gets holes from the other.
     """
     if len(view) <= most:
         return view
     parts = [
-        (view[(view.fields["shown"] == shown) & (near == close)], 1.0 if close else SURROUNDINGS_SPACING)
+        (view[(view.fields["shown"] == shown) & (view.fields["near"] == near)], 1.0 if near else SURROUNDINGS_SPACING)
         for shown in (BOTH, BEFORE, AFTER)
-        for close in (True, False)
+        for near in (1, 0)
     ]
     parts = [(part, factor) for part, factor in parts if len(part)]
     voxel = view.diagonal / np.sqrt(most)
@@ -86,6 +88,7 @@ def _view(cloud: Cloud, source: NDArray[np.generic], shown: int, after: Cloud) -
     """The cloud with the fields of a view, and those of `after` filled up where it lacks them."""
     count = len(cloud)
     fields = {"shown": np.full(count, shown, dtype=np.uint8), "source": np.asarray(source).astype(np.uint8)}
+    fields["near"] = np.ones(count, dtype=np.uint8)
     for name, kind, absent in (("evidence", np.uint8, UNKNOWN), ("deviation", np.float32, np.nan)):
         if name in after.fields:
             fields[name] = np.asarray(cloud.fields.get(name, np.full(count, absent))).astype(kind)

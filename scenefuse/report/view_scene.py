@@ -3,11 +3,12 @@
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
-from scenefuse.io.clouds import read_cloud
+from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.report.view_file import View, write_view
-from scenefuse.report.view_points import merge, thin, within
+from scenefuse.report.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import read_json, value
 
 VIEW_POINTS = 250_000
@@ -36,8 +37,22 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     before, after = (cloud[within(cloud.points, low, high, margin=0.1)] for cloud in (before, after))
     low, high = np.percentile(before.points, [1, 99], axis=0)
     points = merge(before, after)
-    thinned = thin(points, np.ones(len(points), dtype=bool), VIEW_POINTS)
+    points.fields["near"][:] = _near_objects(points)
+    thinned = thin(points, VIEW_POINTS)
     unit = length_unit(georeference_json)
     view = View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
     write_view(folder, view)
     print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points", flush=True)
+
+
+def _near_objects(points: Cloud) -> NDArray[np.bool_]:
+    """(N,) whether points lie in the box of what was added from an object; all where nothing was added."""
+    source = points.fields["source"]
+    boxes = [
+        np.percentile(points.points[source == number], [1, 99], axis=0)
+        for number in np.unique(source)
+        if number not in (0, REMOVED)
+    ]
+    if not boxes:
+        return np.ones(len(points), dtype=bool)
+    return np.any([within(points.points, low, high) for low, high in boxes], axis=0)

@@ -112,18 +112,20 @@ const norm = (a) => Math.hypot(...a);
 const toward = (azimuth, elevation) =>
   [Math.cos(azimuth) * Math.cos(elevation), Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation)];
 
-// Eye, target and up so that the box fills a picture of that aspect (width over height).
-const firstCamera = (about, aspect) => {
+// Eye, target and up so that the points in the box fill a picture of that aspect (width over height).
+const firstCamera = (about, positions, aspect) => {
   const { low, high } = about, middle = scaled(plus(low, high), 0.5), azimuth = about.azimuth * Math.PI / 180;
   const away = toward(azimuth, about.elevation * Math.PI / 180);
   const right = [-Math.sin(azimuth), Math.cos(azimuth), 0], up = cross(away, right);
   const slope = Math.tan(FIELD_OF_VIEW * Math.PI / 360);
   let distance = 0;
-  for (let k = 0; k < 8; k++) {
-    const corner = minus([k & 1 ? high[0] : low[0], k & 2 ? high[1] : low[1], k & 4 ? high[2] : low[2]], middle);
-    const along = (axis) => corner.reduce((sum, x, i) => sum + x * axis[i], 0);
+  const every = 3 * Math.ceil(positions.length / 30000);
+  for (let i = 0; i < positions.length; i += every) {
+    const point = [positions[i], positions[i + 1], positions[i + 2]];
+    if (point.some((x, k) => x < low[k] || x > high[k])) continue;
+    const along = (axis) => axis.reduce((sum, a, k) => sum + a * (point[k] - middle[k]), 0);
     const wide = Math.max(Math.abs(along(right)) / aspect, Math.abs(along(up)));
-    distance = Math.max(distance, along(away) + 1.06 * wide / slope);
+    distance = Math.max(distance, along(away) + 1.1 * wide / slope);
   }
   return [...plus(middle, scaled(away, distance)), ...middle, 0, 0, 1];
 };
@@ -163,10 +165,12 @@ class View {
       this.canvas.className = "view-canvas";
       this.plot = new K3D(ThreeJsProvider, this.canvas, {
         menuVisibility: false, gridVisible: false, gridAutoFit: false, cameraAutoFit: false, axesHelper: 0,
+        grid: [...this.about.corner, ...scaled(this.about.corner, -1)],
         cameraMode: "orbit", cameraUpAxis: "z", cameraFov: FIELD_OF_VIEW, clearColor: 0xf7f8f9, antialias: 1,
       });
       this.plot.on(this.plot.events.RENDERED, () => this.drawMarks());
       await this.show();
+      if (!this.plot) return;
       this.plot.setCamera(this.camera ?? this.home());
       this.plot.render();
       this.section.dataset.state = "ready";
@@ -194,7 +198,7 @@ class View {
     this.starting = true;
   }
 
-  home() { return firstCamera(this.about, this.stage.clientWidth / this.stage.clientHeight); }
+  home() { return firstCamera(this.about, this.data.positions, this.stage.clientWidth / this.stage.clientHeight); }
 
   // The points of the chosen picture in the chosen colours.
   async show() {
@@ -331,6 +335,13 @@ class View {
     this.plot.render();
   }
 
+  // Turn about a point from now on.
+  center(point) {
+    const camera = this.plot.getWorld().controls.getCameraArray();
+    this.plot.setCamera([...camera.slice(0, 3), ...point, 0, 0, 1]);
+    this.plot.render();
+  }
+
   key(event) {
     const step = 0.12, moves = {
       ArrowLeft: [-step, 0, 1], ArrowRight: [step, 0, 1], ArrowUp: [0, step, 1], ArrowDown: [0, -step, 1],
@@ -367,6 +378,11 @@ class View {
       stage.focus({ preventScroll: true });
       down = event.isPrimary ? [event.clientX, event.clientY] : null;
     }, { capture: true });
+    stage.addEventListener("dblclick", (event) => {
+      if (this.measuring || !this.plot) return;
+      const box = stage.getBoundingClientRect(), point = this.pick(event.clientX - box.left, event.clientY - box.top);
+      if (point) this.center(point);
+    });
     stage.addEventListener("pointerup", (event) => {
       const still = down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 6;
       down = null;

@@ -13,7 +13,7 @@ from scenefuse.report.page import SCRIPT, STYLE
 from scenefuse.report.values import number
 from scenefuse.report.view_file import View, read_view
 from scenefuse.report.view_page import view_library, view_section
-from scenefuse.report.view_points import thin, within
+from scenefuse.report.view_points import thin
 from scenefuse.report.view_script import VIEW_SCRIPT, VIEW_STYLE
 from scenefuse.stage import StageError, atomic_file
 
@@ -108,11 +108,7 @@ def _views(folders: list[Path]) -> dict[Path, View]:
     found = {folder: view for folder in folders if (view := read_view(folder)) is not None}
     most = PAGE_POINTS / max(PAGE_POINTS, sum(len(view.cloud) for view in found.values()))
     return {
-        folder: replace(
-            view,
-            cloud=thin(view.cloud, within(view.cloud.points, view.low, view.high), int(most * len(view.cloud))),
-        )
-        for folder, view in found.items()
+        folder: replace(view, cloud=thin(view.cloud, int(most * len(view.cloud)))) for folder, view in found.items()
     }
 
 

@@ -37,8 +37,8 @@ def completed(before, added, **fields):
     )
 
 
-def view_of(before, after):
-    cloud, corner = merge(before, after), np.array([1.0, 1.0, 0.5])
+def view_of(before, after, reach=1.0):
+    cloud, corner = merge(before, after), reach * np.array([1.0, 1.0, 0.5])
     return View(cloud, {0: "scene", 1: "added"}, "m", -corner, corner, -90.0, 60.0, len(before), len(after))
 
 
@@ -60,7 +60,7 @@ def report(folder, views, status="registered"):
 
 @pytest.fixture(scope="module")
 def page(tmp_path_factory):
-    """Two objects: a house with all fields, whose scene holds a red and a blue point 1.2 m apart; a shed without."""
+    """A house with all fields, whose scene holds a red and a blue point 1.2 m apart; a shed without; a large scene."""
     before = grid()
     marked = [np.flatnonzero(np.isclose(before.points, [x, -0.4, 0]).all(1))[0] for x in (-0.6, 0.6)]
     before.colors[marked] = RED, BLUE
@@ -69,8 +69,9 @@ def page(tmp_path_factory):
     evidence = np.repeat([0, 1, 2, 3], [200, 141, 100, 81]).astype(np.uint8)
     deviation = np.linspace(0.001, 0.05, count).astype(np.float32)
     house = view_of(before, completed(before, added, evidence=evidence, deviation=deviation))
-    plain = grid()
-    return report(tmp_path_factory.mktemp("run"), {"house": house, "shed": view_of(plain, completed(plain, added))})
+    plain, large = grid(), grid(step=100.0)
+    views = {"house": house, "shed": view_of(plain, completed(plain, added)), "land": view_of(large, large, 1000.0)}
+    return report(tmp_path_factory.mktemp("run"), views)
 
 
 @pytest.fixture(scope="module")
@@ -144,6 +145,13 @@ def test_photo_colours_are_those_of_the_points(opened):
     picture = opened.picture(STAGE)
     for color in (RED, BLUE, (140, 150, 140), (200, 190, 60)):
         assert (np.abs(picture.astype(int) - color).max(2) <= 3).sum() > 20, color
+
+
+def test_a_scene_of_kilometres_fills_its_view(browser, page):
+    browser.open(page)
+    ready(browser, "land")
+    picture = browser.picture("[aria-label='3D view of land'] .view-stage")
+    assert (np.abs(picture.astype(int) - (140, 150, 140)).max(2) <= 3).mean() > 0.2
 
 
 def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
@@ -262,6 +270,29 @@ def test_a_browser_without_webgl_says_so(page):
         assert "The 3D view cannot be shown" in old.find(note).text and "WebGL" in old.find(note).text
 
 
+def test_a_page_of_many_views_keeps_few_of_them_alive(browser, tmp_path):
+    view = view_of(grid(), completed(grid(), grid(9, 0.05, 0.4, (200, 190, 60))))
+    names = [f"house{k}" for k in range(6)]
+    browser.open(report(tmp_path, dict.fromkeys(names, view)))
+    for name in names:
+        ready(browser, name)
+        assert browser.value("return live.length;") <= 4
+    ready(browser, names[0])
+    assert browser.picture(f"[aria-label='3D view of {names[0]}'] .view-stage").reshape(-1, 3).std(0).max() > 20
+    assert [line for line in browser.complaints() if "Context Lost" not in line] == []
+
+
+def test_a_double_click_moves_the_centre_of_turning(opened):
+    point = middle_of(opened.picture(STAGE), RED)
+    for _ in range(2):
+        click(opened, opened.find(STAGE), *point)
+    np.testing.assert_allclose(camera_of(opened)[3:6], [-0.6, -0.4, -0.2], atol=1e-3)
+    opened.value(SETTLE)
+    moved = middle_of(opened.picture(STAGE), RED)
+    box = opened.find(STAGE).size
+    np.testing.assert_allclose(moved, [box["width"] / 2, box["height"] / 2], atol=12)
+
+
 def test_objects_that_are_not_in_the_scene_have_no_view(tmp_path):
     text = report(tmp_path, {"house": None}, status="unregistered").read_text()
     assert "No 3D view: the object has no accepted pose and was not added to the scene." in text
@@ -279,10 +310,7 @@ def test_a_page_of_three_objects_of_a_million_points_stays_below_15_mb(tmp_path)
     }
     after = Cloud(points, (points / 5).astype(np.float32), colors.astype(np.uint8), fields)
     whole = view_of(after[fields["source"] == 0], after)
-    of_object, of_scene = (
-        replace(whole, cloud=thin(whole.cloud, np.ones(1_000_000, dtype=bool), most))
-        for most in (VIEW_POINTS, SCENE_POINTS)
-    )
+    of_object, of_scene = (replace(whole, cloud=thin(whole.cloud, most)) for most in (VIEW_POINTS, SCENE_POINTS))
     views = {"house": of_object, "shed": of_object, "barn": of_object, "all": of_scene}
     assert sum(len(view.cloud) for view in views.values()) > 600_000
     page = report(tmp_path, views)

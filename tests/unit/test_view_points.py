@@ -69,7 +69,7 @@ def test_fields_of_the_completed_cloud_are_kept_and_unknown_where_only_the_scene
     assert gone.sum() == 10
     assert (view.fields["evidence"][gone] == UNKNOWN).all() and (view.fields["evidence"][~gone] == 1).all()
     assert np.isnan(view.fields["deviation"][gone]).all()
-    assert set(merge(before, before).fields) == {"shown", "source"}
+    assert set(merge(before, before).fields) == {"shown", "source", "near"}
 
 
 def test_points_that_moved_by_rounding_alone_are_the_same():
@@ -81,7 +81,7 @@ def test_points_that_moved_by_rounding_alone_are_the_same():
 def test_thinning_a_million_points_keeps_the_budget_and_the_even_spacing():
     before, added = square(700_000), square(300_000, 1, 0.2)
     view = merge(before, completed(before, np.arange(700_000) >= 100_000, added))
-    thinned = thin(view, np.ones(len(view), dtype=bool), 60_000)
+    thinned = thin(view, 60_000)
     assert 50_000 < len(thinned) <= 60_000
     for code in (BOTH, BEFORE, AFTER):
         part = thinned.points[thinned.fields["shown"] == code]
@@ -90,14 +90,15 @@ def test_thinning_a_million_points_keeps_the_budget_and_the_even_spacing():
         assert np.isin(part[:, 0], view.points[:, 0]).all()
         assert spacing(part) > 3 * spacing(view.points[view.fields["shown"] == code])
     few = square(50)
-    assert thin(merge(few, few), np.ones(50, dtype=bool), 100).points.shape == (50, 3)
+    assert thin(merge(few, few), 100).points.shape == (50, 3)
 
 
 def test_surroundings_are_thinned_more_than_the_object():
     view = merge(square(200_000), square(200_000))
-    near = within(view.points, np.array([0.3, 0.3, -1]), np.array([0.5, 0.5, 1]), margin=0.0)
-    thinned = thin(view, near, 10_000)
-    inside = within(thinned.points, np.array([0.3, 0.3, -1]), np.array([0.5, 0.5, 1]), margin=0.0)
+    box = np.array([[0.3, 0.3, -1], [0.5, 0.5, 1]])
+    view.fields["near"][:] = within(view.points, *box, margin=0.0)
+    thinned = thin(view, 10_000)
+    inside = within(thinned.points, *box, margin=0.0)
     density = inside.sum() / 0.04, (~inside).sum() / 0.96
     assert density[0] / density[1] == pytest.approx(4, rel=0.15)
 
