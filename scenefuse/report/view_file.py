@@ -23,7 +23,7 @@ Bytes = NDArray[np.uint8]
 
 LIGHT = np.array([-0.39, -0.55, 0.74])
 """Where the light comes from that shades what is not in photo colours: high, from the left of the first picture."""
-DARKEST = 0.55
+DARKEST = 0.35
 """Shade of a surface that faces away from the light."""
 _SMOOTHED = 12
 LEVELS = 31
@@ -171,7 +171,7 @@ def _shade(cloud: Cloud) -> Array:
     """(N,) brightness from DARKEST to 1: the mean of the light on the normals and of the photo colours' brightness."""
     parts = []
     if cloud.normals is not None:
-        parts.append(np.clip(0.5 + 0.5 * (_smooth(cloud.points, cloud.normals) @ LIGHT), 0, 1))
+        parts.append(np.clip(0.4 + 0.7 * (_smooth(cloud.points, cloud.normals) @ LIGHT), 0, 1))
     if cloud.colors is not None:
         parts.append(cloud.colors @ np.array([0.299, 0.587, 0.114]) / 255)
     return DARKEST + (1 - DARKEST) * np.mean(parts, axis=0) if parts else np.ones(len(cloud))

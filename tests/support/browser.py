@@ -75,6 +75,11 @@ class Browser:
     def drag(self, element, right: float, down: float) -> None:
         self._actions().drag_and_drop_by_offset(element, right, down).perform()
 
+    def double_click(self, element, x: float, y: float) -> None:
+        """At pixels from an element's upper left corner."""
+        right, down = round(x - element.size["width"] / 2), round(y - element.size["height"] / 2)
+        self._actions().move_to_element_with_offset(element, right, down).double_click().perform()
+
     def wheel(self, element, down: float) -> None:
         from selenium.webdriver.common.actions.wheel_input import ScrollOrigin
 
