@@ -53,11 +53,10 @@ def view_section(key: str, name: str, view: View) -> str:
     return (
         f'<section class="view" aria-label="3D view of {escape(name)}"><div class="view-tools">{tools}</div>'
         f'<div class="view-stage" tabindex="0" role="application" aria-label="{escape(label)}">'
-        '<svg class="marks" aria-hidden="true"></svg>'
+        '<svg class="marks" aria-hidden="true"></svg></div>'
         '<p class="view-note">Drag to turn; wheel (after a click) or pinch to zoom; right button or two fingers to '
         "move; double click to turn about a point."
-        "<noscript> This view needs JavaScript.</noscript></p></div>"
-        '<div class="view-legend"></div>'
+        '<noscript> This view needs JavaScript.</noscript></p><div class="view-legend"></div>'
         f'<script type="application/json" class="about">{described}</script>'
         f'<script type="text/plain" class="points">{base64.b64encode(planes).decode()}</script></section>'
     )

@@ -6,8 +6,8 @@ pixels between them. Picking follows the same rule, here, because K3D's own woul
 
 VIEW_STYLE = """
 .view { border: 1px solid var(--line); border-radius: 6px; margin: 14px 0 22px; overflow: hidden; background: #fff; }
-.view-stage { position: relative; height: clamp(300px, 62vh, 640px); background: #f7f8f9; cursor: grab;
-  isolation: isolate; }
+.view-stage { position: relative; isolation: isolate; height: clamp(300px, 62vh, 640px); background: #f7f8f9;
+  border-bottom: 1px solid var(--line); cursor: grab; }
 .view-stage:active { cursor: grabbing; } .view-stage.measuring { cursor: crosshair; }
 .view-stage:focus-visible { outline: 3px solid var(--accent); outline-offset: -3px; }
 .view-canvas { position: absolute; z-index: 0; inset: 0; touch-action: none; }
@@ -16,8 +16,9 @@ VIEW_STYLE = """
 .marks circle { fill: var(--accent); stroke: #fff; stroke-width: 2; }
 .marks text { font: 600 14px system-ui, sans-serif; fill: var(--ink); stroke: #fff; stroke-width: 4;
   paint-order: stroke; text-anchor: middle; }
-.view-note { position: absolute; z-index: 1; inset: auto 0 0 0; margin: 0; padding: 4px 10px; max-width: none;
-  font-size: 12.5px; background: #ffffffd9; pointer-events: none; }
+.view-note { margin: 0; padding: 6px 10px 0; max-width: none; font-size: 12.5px; }
+.view[data-state=failed] > :not(.view-note) { display: none; }
+.view[data-state=failed] .view-note { padding: 10px; font-size: 15px; }
 .view-tools { display: flex; flex-wrap: wrap; gap: 8px 16px; align-items: center; padding: 8px 10px;
   border-bottom: 1px solid var(--line); }
 .view-tools fieldset { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0; align-items: center; }
@@ -32,8 +33,8 @@ VIEW_STYLE = """
   border-color: var(--ink); }
 .view-tools input:focus-visible + span, .view-tools button:focus-visible { outline: 3px solid var(--accent);
   outline-offset: 1px; position: relative; z-index: 1; }
-.view-legend { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: center; padding: 6px 10px; min-height: 34px;
-  border-top: 1px solid var(--line); font-size: 13px; color: var(--soft); }
+.view-legend { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: center; padding: 2px 10px 6px;
+  min-height: 34px; font-size: 13px; color: var(--soft); }
 .view-legend i { display: inline-block; width: 12px; height: 12px; border-radius: 50%; margin-right: 6px;
   vertical-align: -1px; border: 1px solid #0003; }
 .view-legend .ramp { width: 140px; height: 12px; border-radius: 6px; margin: 0 6px; }
