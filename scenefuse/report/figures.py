@@ -160,7 +160,8 @@ def _provenance(name: str, join: Surroundings) -> Image:
 
 def _registration(name: str, join: Surroundings) -> Image:
     """The object over the crop from three sides."""
-    tile, radii = (480, 390), 0.6 * point_radii(join.crop.points)
+    tile, radii = (480, 390), point_radii(join.crop.points)
+    radii = 0.5 * np.minimum(radii, np.median(radii))
     colors, framed = np.tile(np.array(CROP_COLOR, dtype=np.uint8), (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 WHITE = (255, 255, 255)
 _SUPERSAMPLING = 2
-_EDGE_ON = 0.5
+_EDGE_ON = 0.65
 """Least cosine between a disc's normal and the ray: its width over its length."""
 _STRAY = 1.4
 """Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small."""
@@ -109,7 +109,7 @@ def orbit_camera(
     return Camera(rotation, middle + distance * direction, float(focal), *size_px)
 
 
-def point_radii(points: Array, neighbours: int = 4, factor: float = 0.8, limit: float = 3.0) -> NDArray[np.float32]:
+def point_radii(points: Array, neighbours: int = 4, factor: float = 0.9, limit: float = 3.0) -> NDArray[np.float32]:
     """Disc radii (N,) in the cloud's unit: `factor` x the spacing around a point, at most `limit` x its median.
 
     The spacing is the distance to the k-th neighbour, but not more than that of the neighbours themselves: a stray

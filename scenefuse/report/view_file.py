@@ -26,6 +26,8 @@ LIGHT = np.array([-0.39, -0.55, 0.74])
 DARKEST = 0.35
 """Shade of a surface that faces away from the light."""
 _SMOOTHED = 12
+_RADIUS = 0.8
+"""Radius over spacing: less than in the figures, as these discs face the camera from every side."""
 LEVELS = 31
 """Steps of radii, shades and deviations: nobody sees more, and five bits compress better than eight."""
 
@@ -154,7 +156,7 @@ def _radii(points: Array, shown: Bytes) -> NDArray[np.float32]:
     """(2, N) disc radii before and after, from the spacing of what is shown with a point; 0 where it is not shown."""
     radii = np.zeros((2, len(points)), dtype=np.float32)
     for row, absent in zip(radii, (AFTER, BEFORE)):
-        row[shown != absent] = point_radii(points[shown != absent])
+        row[shown != absent] = point_radii(points[shown != absent], factor=_RADIUS)
     return radii
 
 
