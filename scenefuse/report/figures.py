@@ -160,8 +160,8 @@ def _provenance(name: str, join: Surroundings) -> Image:
 
 def _registration(name: str, join: Surroundings) -> Image:
     """The object over the crop from three sides."""
-    tile, radii = (480, 390), point_radii(join.crop.points)
-    radii = 0.5 * np.minimum(radii, np.median(radii))
+    tile, dots = (480, 390), point_radii(join.crop.points)
+    radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
     colors, framed = np.tile(np.array(CROP_COLOR, dtype=np.uint8), (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])

@@ -25,6 +25,8 @@ _EDGE_ON = 0.65
 """Least cosine between a disc's normal and the ray: its width over its length."""
 _STRAY = 1.4
 """Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small."""
+_AT_ONCE = 1_000_000
+"""Points whose neighbours are looked up at once: bounds the memory."""
 _SHARPNESS = 3
 """Power of the blending weight's fall: with more, single points show; with less, fine texture blurs."""
 
@@ -117,10 +119,15 @@ def point_radii(points: Array, neighbours: int = 4, factor: float = 0.9, limit: 
     """
     if len(points) <= neighbours:
         return np.full(len(points), max(float(np.ptp(points, axis=0).max()) * 0.01, 1e-9) if len(points) else 0.0, "f4")
-    most = min(2 * neighbours, len(points) - 1)
-    distance, index = cKDTree(points).query(points, k=most + 1, workers=threads())
-    reach = distance[:, neighbours]
-    around = np.median(reach[index[:, 1:]], axis=1)
+    tree, most = cKDTree(points), min(2 * neighbours, len(points) - 1)
+    reach, around = np.empty(len(points), dtype=np.float32), np.empty(len(points), dtype=np.float32)
+    nearest = np.empty((len(points), most), dtype=np.int32)
+    parts = [slice(start, start + _AT_ONCE) for start in range(0, len(points), _AT_ONCE)]
+    for part in parts:
+        distance, index = tree.query(points[part], k=most + 1, workers=threads())
+        reach[part], nearest[part] = distance[:, neighbours], index[:, 1:]
+    for part in parts:
+        around[part] = np.median(reach[nearest[part]], axis=1)
     middle = float(np.median(reach)) or 1e-9
     # Points that coincide still get a disc.
     spacing = np.clip(reach, around / 2, _STRAY * around)

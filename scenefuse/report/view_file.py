@@ -16,14 +16,14 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.report.render import point_radii
 from scenefuse.report.view_points import AFTER, BEFORE, BOTH
-from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array
 
 Bytes = NDArray[np.uint8]
 
 LIGHT = np.array([-0.39, -0.55, 0.74])
 """Where the light comes from that shades what is not in photo colours: high, from the left of the first picture."""
-DARKEST = 0.35
+DARKEST = 0.45
 """Shade of a surface that faces away from the light."""
 _SMOOTHED = 12
 _RADIUS = 0.8
@@ -72,21 +72,29 @@ def write_view(folder: Path, view: View) -> None:
 
 
 def read_view(folder: Path) -> View | None:
-    """The view of a folder; None where it has none."""
-    if not (folder / "view.json").is_file():
+    """The view of a folder; None where it has none.
+
+    Raises:
+        StageError: one of its files is missing or damaged.
+    """
+    path = folder / "view.json"
+    if not path.is_file():
         return None
-    about = read_json(folder / "view.json")
-    return View(
-        read_cloud(folder / "view.ply"),
-        {int(number): name for number, name in value(about, "sources").items()},
-        about["low"]["unit"],
-        np.array(value(about, "low")),
-        np.array(value(about, "high")),
-        value(about, "azimuth_deg"),
-        value(about, "elevation_deg"),
-        value(about, "before_points"),
-        value(about, "after_points"),
-    )
+    about, cloud = read_json(path), read_cloud(folder / "view.ply")
+    try:
+        return View(
+            cloud,
+            {int(number): name for number, name in value(about, "sources").items()},
+            about["low"]["unit"],
+            np.array(value(about, "low")),
+            np.array(value(about, "high")),
+            value(about, "azimuth_deg"),
+            value(about, "elevation_deg"),
+            value(about, "before_points"),
+            value(about, "after_points"),
+        )
+    except KeyError as error:
+        raise StageError(f"{path} lacks {error}; delete it and rerun the stage that writes it") from None
 
 
 def encode(view: View) -> tuple[dict[str, Any], bytes]:

@@ -101,7 +101,10 @@ const paint = (mode, about, { count, planes }) => {
   }
   const table = new Uint32Array(256).fill(hex(mode.other.color)), plane = planes[mode.name];
   mode.entries.forEach((entry) => { table[entry.code] = hex(entry.color); });
-  for (let i = 0; i < count; i++) colors[i] = dimmed(table[plane[i]], planes.shade[i] / about.levels);
+  // Along a ramp brightness means something: shade it less.
+  const least = mode.ramp ? 0.5 : 0;
+  for (let i = 0; i < count; i++)
+    colors[i] = dimmed(table[plane[i]], least + (1 - least) * planes.shade[i] / about.levels);
   return colors;
 };
 

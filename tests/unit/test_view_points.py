@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud, spacing
 from scenefuse.report.view_file import View, encode, read_view, write_view
 from scenefuse.report.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN, merge, thin, within
+from scenefuse.stage import StageError
 
 
 def square(count, seed=0, height=0.0, color=(90, 160, 70), **fields):
@@ -161,3 +162,10 @@ def test_a_written_view_is_read_as_it_was(tmp_path):
     np.testing.assert_array_equal(found.cloud.points, view.cloud.points)
     np.testing.assert_array_equal(found.cloud.fields["shown"], view.cloud.fields["shown"])
     assert (found.sources, found.unit, found.azimuth_deg, found.before_points) == (view.sources, "m", 40.0, 30)
+
+
+def test_a_damaged_view_is_named(tmp_path):
+    write_view(tmp_path, view_of(merge(square(30), square(30, 2))))
+    (tmp_path / "view.json").write_text("{}")
+    with pytest.raises(StageError, match=r"view.json lacks 'sources'; delete it"):
+        read_view(tmp_path)
