@@ -19,6 +19,8 @@ from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
+Discs = list[tuple[Cloud, NDArray[np.float32]]]
+"""Clouds and the radii of their points' discs."""
 VIEW_POINTS = 150_000
 """Of an object's 3D view: with three objects and a scene, the page stays well below 15 MB."""
 
@@ -39,12 +41,13 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         StageError: a cloud or JSON is missing or damaged.
     """
     join = read_surroundings(inputs)
-    azimuth_deg = _most_changed(join)
+    clouds = [(cloud, point_radii(cloud.points)) for cloud in (join.before, join.after)]
+    azimuth_deg = _most_changed(clouds, join.framed)
     pictures = {
-        "before_after": _before_after(inputs.name, join),
-        "provenance": _provenance(inputs.name, join),
+        "before_after": _before_after(inputs.name, join, clouds),
+        "provenance": _provenance(inputs.name, join, clouds[1][1]),
         "registration": _registration(inputs.name, join),
-        **dict(zip(("before", "after"), _large(join, azimuth_deg))),
+        **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
     }
     cloud = join.object_cloud or upright(read_cloud(inputs.object_cloud), inputs.workspace)
     pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
@@ -128,14 +131,13 @@ def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, len(join.before), len(join.after))
 
 
-def _before_after(name: str, join: Surroundings) -> Image:
+def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
     """Rows before and after; four sides from slightly above, and from below with the surroundings cut away."""
     tile = (350, 290)
     low, high = join.framed.min(0), join.framed.max(0)
     margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
     rows: list[list[Image | None]] = []
-    for cloud in (join.before, join.after):
-        radii = point_radii(cloud.points)
+    for cloud, radii in clouds:
         sides = [render(cloud, orbit_camera(join.framed, a, 22.0, tile), radii) for a in SIDES_DEG]
         near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
         from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
@@ -145,9 +147,9 @@ def _before_after(name: str, join: Surroundings) -> Image:
     return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
 
 
-def _provenance(name: str, join: Surroundings) -> Image:
+def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
     """Scene points grey, added points coloured."""
-    tile, added, radii = (430, 350), _added(join.after), point_radii(join.after.points)
+    tile, added = (430, 350), _added(join.after)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = (np.where(added[:, None], ADDED_COLOR, SCENE_COLOR) * shade).astype(np.uint8)
     images: list[Image | None] = [
@@ -179,17 +181,19 @@ def _registration(name: str, join: Surroundings) -> Image:
     return draw_sheet(Sheet(f"{name}: registration", note, [images], [], list(views), {}, tile))
 
 
-def _large(join: Surroundings, azimuth_deg: float, size_px: tuple[int, int] = (840, 600)) -> tuple[Image, Image]:
+def _large(
+    clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int, int] = (840, 600)
+) -> tuple[Image, Image]:
     """The same view before and after."""
-    camera = orbit_camera(join.framed, azimuth_deg, 15.0, size_px, margin=0.1)
-    first, second = (render(cloud, camera, point_radii(cloud.points)) for cloud in (join.before, join.after))
+    camera = orbit_camera(framed, azimuth_deg, 15.0, size_px, margin=0.1)
+    first, second = (render(cloud, camera, radii) for cloud, radii in clouds)
     return first, second
 
 
-def _most_changed(join: Surroundings) -> float:
+def _most_changed(clouds: Discs, framed: Array) -> float:
     """The azimuth, in degrees, from which before and after differ most."""
     azimuths = np.arange(0.0, 360.0, 45.0)
-    pairs = (_large(join, float(azimuth), (120, 90)) for azimuth in azimuths)
+    pairs = (_large(clouds, framed, float(azimuth), (120, 90)) for azimuth in azimuths)
     changes = [float(np.abs(np.subtract(first, second, dtype=np.float32)).mean()) for first, second in pairs]
     return float(azimuths[int(np.argmax(changes))])
 
