@@ -1,6 +1,7 @@
 """Unsupervised quality of what was added: surface variation, uniformity of density, primitives; each with its null."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from scenefuse.transforms import Array
 
 # Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
 WIDE_SAMPLE = 1500
+# Points whose neighbourhoods are held in memory together: a fine object's hold thousands of points each.
+AT_ONCE = 200
 
 
 @dataclass(frozen=True)
@@ -38,72 +41,146 @@ class MetricSettings:
     """Largest angle in degrees between a point's normal and the primitive's."""
 
 
-def completion_metrics(
-    around: Cloud, scene: Cloud, added: Cloud, diagonal: float, unit: str, settings: MetricSettings, seed: int
-) -> dict[str, dict[str, Any]]:
-    """The completion.* numbers of the added points P_new, and the same of a random cloud in their place.
+@dataclass(frozen=True)
+class Completion:
+    """An object in its scene before and after fusion; clouds in the scene's frame, without the ground around it.
 
-    The null cloud has as many points, uniform in P_new's bounding box: a metric gives that much for nothing.
+    Attributes:
+        before: (N, 3) the incomplete cloud: the scene's points on the object, the crop.
+        kept: (K, 3) those of them that fusion left.
+        added: (M, 3) P_new, what fusion added.
+        diagonal: of the full variant's crop.
+    """
+
+    before: Array
+    kept: Array
+    added: Array
+    diagonal: float
+
+    @property
+    def after(self) -> Array:
+        """(K + M, 3) the completed cloud."""
+        return np.concatenate([self.kept, self.added])
+
+
+def completion_of(before: Array, after: Cloud, source: int, diagonal: float) -> Completion:
+    """An object's completion, from the scene's points on it and a fused cloud.
 
     Args:
-        around: the scene's points that were kept around the object.
-        scene: the scene's points on the object before completion: the incomplete cloud of NUE.
-        added: P_new.
+        before: (N, 3) the crop.
+        after: the object's surroundings or the whole scene after fusion, with `source`.
+        source: the object's number in it.
         diagonal: of the full variant's crop.
-        unit: of the scene's lengths.
+    """
+    low, high = before.min(0), before.max(0)
+    origin = after.fields["source"]
+    left = after.points[(origin == 0) & ((after.points >= low) & (after.points <= high)).all(1)]
+    # Fusion never moves what it keeps of the scene.
+    still = cKDTree(left).query(before, workers=threads())[0] == 0 if len(left) else np.zeros(len(before), dtype=bool)
+    return Completion(before, before[still], after.points[origin == source], diagonal)
+
+
+def completion_metrics(parts: Sequence[Completion], settings: MetricSettings, seed: int) -> dict[str, dict[str, Any]]:
+    """The completion.* numbers of one object, or of a scene's objects together (method G2 to G5).
+
+    A name alone is the paper's measure of the added points P_new in the completed cloud. `_null` is the same with a
+    random cloud in the place of P_new, as many points, uniform in its bounding box: what the measure gives for nothing.
+    `_before` and `_after` are the same measure of all points of the incomplete and of the completed cloud. Objects that
+    added next to nothing are left out; several count by their points.
+
+    Args:
+        parts: the objects that were fused.
         settings: see MetricSettings.
         seed: of samples and of the null cloud.
     """
-    names = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
-    if len(added) < 4 * settings.density_neighbours:
-        empty = {n: quantity(None, "1") for m in names for n in (m, f"{m}_null")}
-        return {**empty, "added_points": quantity(len(added), "points")}
-    rng = np.random.default_rng(seed)
-    low, high = added.points.min(0), added.points.max(0)
-    random = rng.uniform(low, high, (len(added), 3))
-    real = _measure(around.points, scene.points, added.points, diagonal, settings, seed)
-    null = _measure(around.points, scene.points, random, diagonal, settings, seed)
+    added = quantity(sum(len(part.added) for part in parts), "points")
+    parts = [part for part in parts if len(part.added) >= 4 * settings.density_neighbours]
+    if not parts:
+        names = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
+        return {n: quantity(None, "1") for m in names for n in (m, f"{m}_null")} | {"added_points": added}
+    random = [replace(part, added=_random_cloud(part.added, seed)) for part in parts]
+    real, null = _of_added(parts, settings, seed), _of_added(random, settings, seed)
     found: dict[str, dict[str, Any]] = {}
     for name in real:
-        found[name] = quantity(real[name], "1")
-        found[f"{name}_null"] = quantity(null[name], "1")
-    radius = settings.variation_spacings * spacing(scene.points)
-    found["surface_variation_scene"] = quantity(
-        surface_variation(scene.points, sampled(scene.points, settings.sample, seed), radius), "1"
-    )
-    found["surface_variation_radius"] = quantity(radius, unit)
-    found["added_points"] = quantity(len(added), "points")
+        found |= {name: quantity(real[name], "1"), f"{name}_null": quantity(null[name], "1")}
+    for when, clouds in (("before", [part.before for part in parts]), ("after", [part.after for part in parts])):
+        for name, number in _of_whole(clouds, parts, settings, seed).items():
+            found[f"{name}_{when}"] = quantity(number, "1")
+    return found | {"added_points": added}
+
+
+def variation_radius(part: Completion, settings: MetricSettings) -> float:
+    """Radius of the surface variation, in the scene's unit (method G2)."""
+    return settings.variation_spacings * spacing(part.before)
+
+
+def _random_cloud(like: Array, seed: int) -> Array:
+    return np.random.default_rng(seed).uniform(like.min(0), like.max(0), like.shape)
+
+
+def _of_added(parts: Sequence[Completion], settings: MetricSettings, seed: int) -> dict[str, float | None]:
+    """Every number of the added points, the objects weighted by their number."""
+    weights = [len(part.added) for part in parts]
+    few = [sampled(part.added, settings.sample, seed) for part in parts]
+    found = {
+        "surface_variation": _mean(
+            [surface_variation(p.after, at, variation_radius(p, settings)) for p, at in zip(parts, few)], weights
+        )
+    }
+    fewer = [sampled(part.added, min(settings.sample, WIDE_SAMPLE), seed) for part in parts]
+    for percent in (1, 2, 4):
+        values = [surface_variation(p.after, at, percent / 100 * p.diagonal) for p, at in zip(parts, fewer)]
+        found[f"surface_variation_{percent}pct"] = _mean(values, weights)
+    for k in (settings.density_neighbours, 8, 32):
+        suffix = "" if k == settings.density_neighbours else f"_k{k}"
+        new = _spread([part.after for part in parts], k, settings.sample, seed)
+        old = _spread([part.before for part in parts], k, settings.sample, seed)
+        found[f"nue{suffix}"] = new[1] / old[1]
+        found[f"nue_density_invariant{suffix}"] = (new[1] / new[0]) / (old[1] / old[0])
+    scores = [_primitives(part.after, at, part.diagonal, settings, seed) for part, at in zip(parts, few)]
+    found["primitive_fitting_score"] = _mean(scores, weights)
     return found
 
 
-def _measure(
-    around: Array, scene: Array, added: Array, diagonal: float, settings: MetricSettings, seed: int
+def _of_whole(
+    clouds: Sequence[Array], parts: Sequence[Completion], settings: MetricSettings, seed: int
 ) -> dict[str, float | None]:
-    """Every number for one set of added points."""
-    complete = np.concatenate([around, added])
-    few = sampled(added, settings.sample, seed)
-    fewer = sampled(added, min(settings.sample, WIDE_SAMPLE), seed)
-    few_scene = sampled(scene, settings.sample, seed)
-    radius = settings.variation_spacings * spacing(scene)
-    found: dict[str, float | None] = {"surface_variation": surface_variation(complete, few, radius)}
-    for percent in (1, 2, 4):
-        found[f"surface_variation_{percent}pct"] = surface_variation(complete, fewer, percent / 100 * diagonal)
-    for k in (settings.density_neighbours, 8, 32):
-        suffix = "" if k == settings.density_neighbours else f"_k{k}"
-        new, old = local_density(complete, few, k), local_density(scene, few_scene, k)
-        found[f"nue{suffix}"] = float(new.std() / old.std())
-        found[f"nue_density_invariant{suffix}"] = float((new.std() / new.mean()) / (old.std() / old.mean()))
-    nearest = cKDTree(complete).query(few, k=min(NORMAL_NEIGHBOURS, len(complete)), workers=threads())[1]
-    found["primitive_fitting_score"] = primitive_fitting_score(
-        few,
-        plane_normals(complete, nearest),
+    """Surface variation and primitives of whole clouds, one for each object, at points of them all."""
+    weights, few = [len(cloud) for cloud in clouds], [sampled(cloud, settings.sample, seed) for cloud in clouds]
+    smooth = [
+        surface_variation(cloud, at, variation_radius(part, settings)) for cloud, at, part in zip(clouds, few, parts)
+    ]
+    plain = [_primitives(cloud, at, part.diagonal, settings, seed) for cloud, at, part in zip(clouds, few, parts)]
+    return {"surface_variation": _mean(smooth, weights), "primitive_fitting_score": _mean(plain, weights)}
+
+
+def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | None:
+    """The weighted mean of the values that exist."""
+    there = [(value, weight) for value, weight in zip(values, weights) if value is not None]
+    return float(np.average([v for v, _ in there], weights=[w for _, w in there])) if there else None
+
+
+def _spread(clouds: Sequence[Array], k: int, most: int, seed: int) -> tuple[float, float]:
+    """Mean and standard deviation of the local densities of several clouds, each counted by its points."""
+    found = [local_density(cloud, sampled(cloud, most, seed), k) for cloud in clouds]
+    weights = np.concatenate([np.full(len(rho), len(cloud) / len(rho)) for rho, cloud in zip(found, clouds)])
+    rho = np.concatenate(found)
+    mean = float(np.average(rho, weights=weights))
+    return mean, float(np.sqrt(np.average((rho - mean) ** 2, weights=weights)))
+
+
+def _primitives(cloud: Array, at: Array, diagonal: float, settings: MetricSettings, seed: int) -> float:
+    """The primitive fitting score of points `at` of a cloud, with the cloud's normals."""
+    nearest = cKDTree(cloud).query(at, k=min(NORMAL_NEIGHBOURS, len(cloud)), workers=threads())[1]
+    return primitive_fitting_score(
+        at,
+        plane_normals(cloud, nearest),
         settings.primitive_fraction * diagonal,
         settings.primitive_support,
         settings.primitive_most,
         settings.primitive_angle_deg,
         seed,
     )
-    return found
 
 
 def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
@@ -116,13 +193,19 @@ def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
         at: (M, 3) points whose neighbourhoods are measured.
         radius: of a neighbourhood, in the clouds' unit.
     """
-    found = cKDTree(cloud).query_ball_point(at, radius, workers=threads())
-    counts = np.array([len(f) for f in found])
-    if (counts < 4).all():
-        return None
-    index = np.concatenate([np.asarray(f, dtype=np.int64) for f in found])
+    tree = cKDTree(cloud)
+    parts = [_variations(tree, at[start : start + AT_ONCE], radius) for start in range(0, len(at), AT_ONCE)]
+    found = np.concatenate(parts) if parts else np.empty(0)
+    return float(found.mean()) if len(found) else None
+
+
+def _variations(tree: cKDTree, at: Array, radius: float) -> Array:
+    """(V,) surface variations at those of `at` whose neighbourhood holds four points or more."""
+    near = tree.query_ball_point(at, radius, workers=threads())
+    counts = np.array([len(f) for f in near])
+    index = np.concatenate([np.asarray(f, dtype=np.int64) for f in near])
     owner = np.repeat(np.arange(len(at)), counts)
-    local = cloud[index] - at[owner]
+    local = tree.data[index] - at[owner]
     first = np.stack([np.bincount(owner, local[:, i], len(at)) for i in range(3)], axis=1)
     second = np.stack(
         [np.bincount(owner, local[:, i] * local[:, j], len(at)) for i in range(3) for j in range(3)], axis=1
@@ -132,7 +215,7 @@ def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
     mean = first[enough] / n
     covariance = second[enough].reshape(-1, 3, 3) / n[..., None] - mean[:, :, None] * mean[:, None, :]
     values = np.clip(np.linalg.eigvalsh(covariance), 0, None)
-    return float((values[:, 0] / np.maximum(values.sum(1), 1e-300)).mean())
+    return values[:, 0] / np.maximum(values.sum(1), 1e-300)
 
 
 def local_density(cloud: Array, at: Array, k: int) -> Array:

@@ -5,8 +5,9 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.fusion.fuse_object import FROM_OBJECT
 from scenefuse.io.clouds import read_cloud
-from scenefuse.metrics.completion import MetricSettings, completion_metrics
+from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
 from scenefuse.registration.agreement import registration_metrics
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
@@ -45,11 +46,9 @@ def compute_metrics(
     found["status"] = quantity(value(registration, "status"), "")
     content: dict[str, Any] = {"registration": found}
     if fused is not None:
-        completed = read_cloud(fused)
-        added = completed.fields["source"] == 1
-        content["completion"] = completion_metrics(
-            completed[~added], scene, completed[added], diagonal, unit, settings, seed
-        )
+        part = completion_of(scene.points, read_cloud(fused), FROM_OBJECT, diagonal)
+        radius = {"surface_variation_radius": quantity(variation_radius(part, settings), unit)}
+        content["completion"] = completion_metrics([part], settings, seed) | radius
     for name, item in found.items():
         print(f"{name:28s} {item['value']} {item['unit']}", flush=True)
     write_json(report, content)

@@ -7,20 +7,26 @@ from typing import Any
 import cv2
 import numpy as np
 
-from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.demo.cameras import Cameras, read_cameras
 from scenefuse.io.clouds import read_cloud, sampled
 from scenefuse.io.pictures import read_gray
-from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.object_truth import (
+    ObjectTruth,
+    cloud_results,
+    depth_results,
+    read_object_truth,
+    scene_scores,
+    surface_to_find,
+)
+from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import (
-    HIDDEN,
     Posed,
-    belongs_to_object,
     camera_results,
     distances,
-    f_score,
     nearest,
     print_results,
     registration_error,
+    scores_at,
 )
 from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.stage import quantity, read_json, setting, value, write_json
@@ -68,11 +74,13 @@ class EvaluationInputs:
 def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settings: ObjectEvaluationSettings) -> None:
     """Compare an object with its truth: masks, cameras, depth after each stage, cloud, registration, completed scene.
 
-    Definitions. Every length is over the diagonal of the object's true bounding box. The surface to be found is what
-    of the object's true surface any photo of its orbit sees (for the scene's scores: any photo of the orbit or of the
-    flight). `scene_f_score_before` and `_after` compare clouds in the scene's frame; of a cloud, the points count that
-    lie in the object's true box, widened by 5 %, nearer to the object than to the terrain and the clutter. The error of
-    each variant is that of its scene_from_object against the one that follows from the true cameras on both sides.
+    Definitions (method G8). Every length is over the diagonal of the object's true bounding box; F-score, precision and
+    recall are at 0.25, 0.5, 1 and 2 % of it (`_025pct`, `_05pct`, `_1pct`, `_2pct`). The surface to be found is what of
+    the object's true surface any photo of its orbit sees; for `scene_*`, any photo of the orbit or of the flight.
+    `cloud_*` is the object's cloud, placed by its own cameras; `placed_*` is that cloud where a registration puts it;
+    `scene_*_before` and `scene_*_after` are the scene around the object before and after fusion: its points in the
+    object's true box, widened by 5 %, nearer to the object than to the terrain and the clutter. The error of each
+    variant is that of its scene_from_object against the one that follows from the true cameras on both sides.
 
     Args:
         inputs: see EvaluationInputs.
@@ -105,11 +113,13 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
         errors = errors_of(inputs.alignment_json)
         result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
     flight = read_cameras(inputs.truth_scene / "cameras.json")
-    seen = known.seen | visible(known.everything, flight, known.surface, HIDDEN)[1].any(0)
-    for label, path in (("before", inputs.before), ("after", inputs.after)):
+    surface = surface_to_find(known, flight)
+    for when, path in (("before", inputs.before), ("after", inputs.after)):
         if path is not None:
-            result |= _scene_results(label, read_cloud(path).points, truth_from_scene, known, known.surface[seen])
-    result |= {"tau": quantity(0.01 * known.diagonal, "m"), "variants": variants}
+            of_scene = scene_scores(truth_from_scene.apply(read_cloud(path).points), known, surface)
+            for ending, scores in of_scene.items():
+                result |= {f"scene_{name}_{when}_{ending}": quantity(score, "1") for name, score in scores.items()}
+    result["variants"] = variants
     write_json(report, result)
     print_results(result)
 
@@ -143,41 +153,18 @@ def _registration_results(
     matrix = fine.get("scene_from_object", {}).get("value")
     result = {"status": quantity(fine.get("status", {}).get("value"), "")}
     if matrix is None:
-        for key in ("scale_error_pct", "rotation_error_deg", "translation_error_over_diagonal", "object_f_score"):
-            result[key] = quantity(None, "")
-        return result
+        errors = ("scale_error_pct", "rotation_error_deg", "translation_error_over_diagonal")
+        return result | {key: quantity(None, "") for key in (*errors, *(f"placed_f_score_{e}" for e in THRESHOLDS))}
     estimated, truth_from_object = Sim3.from_matrix(np.array(matrix)), known.fit.truth_from_model
     true = truth_from_scene.inverse() @ truth_from_object
     middle = truth_from_object.inverse().apply(known.middle)
     error = registration_error(estimated, true, middle, known.diagonal / truth_from_scene.scale)
     placed = (truth_from_scene @ estimated).apply(points)
     to_mesh = distances(known.mesh.caster(), sampled(placed, samples, seed))
-    score = f_score(to_mesh, nearest(known.surface[known.seen], placed), 0.01 * known.diagonal)[2]
+    scores = scores_at(to_mesh, nearest(known.surface[known.seen], placed), known.diagonal)
     return result | {
         "scale_error_pct": quantity(error.scale_pct, "%"),
         "rotation_error_deg": quantity(error.rotation_deg, "deg"),
         "translation_error_over_diagonal": quantity(error.translation_over_diagonal, "1"),
-        "object_f_score": quantity(score, "1"),
+        **{f"placed_f_score_{ending}": quantity(score["f_score"], "1") for ending, score in scores.items()},
     }
-
-
-def _scene_results(
-    label: str, points: Array, truth_from_scene: Sim3, known: ObjectTruth, surface: Array
-) -> dict[str, Any]:
-    """F-score, precision and recall of a scene's points around the object, before or after fusion, at 1 % and 2 %."""
-    low, high, margin = surface.min(0), surface.max(0), 0.05 * known.diagonal
-    points = truth_from_scene.apply(points)
-    points = points[((points >= low - margin) & (points <= high + margin)).all(1)]
-    own, other = (
-        distances(mesh.caster(), points) if len(points) else np.empty(0, dtype=np.float32)
-        for mesh in (known.mesh, known.rest)
-    )
-    of_object = belongs_to_object(points, own, other, low, high, margin)
-    to_cloud = nearest(surface, points[of_object])
-    result: dict[str, Any] = {}
-    for share, suffix in ((0.01, ""), (0.02, "_2pct")):
-        precision, recall, score = f_score(own[of_object], to_cloud, share * known.diagonal)
-        result[f"scene_f_score_{label}{suffix}"] = quantity(score, "1")
-        result[f"scene_precision_{label}{suffix}"] = quantity(precision, "1")
-        result[f"scene_recall_{label}{suffix}"] = quantity(recall, "1")
-    return result

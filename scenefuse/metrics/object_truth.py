@@ -15,18 +15,23 @@ from scenefuse.metrics.truth import (
     CameraFit,
     Mesh,
     Posed,
+    belongs_to_object,
     cast_together,
     distances,
-    f_score,
     fit_cameras,
     nearest,
     read_mesh,
     read_posed,
     sample_surface,
+    scores_at,
     true_depth,
 )
 from scenefuse.stage import quantity, read_json, value
 from scenefuse.transforms import Array
+
+# How far around the object's true box a scene's points count as its own, as a share of its diagonal: farther off than
+# any stray point that a person would take for a part of it.
+MARGIN = 0.05
 
 
 @dataclass(frozen=True)
@@ -113,16 +118,45 @@ def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int) -> di
 
 
 def cloud_results(points: Array, known: ObjectTruth, samples: int, seed: int) -> dict[str, Any]:
-    """Accuracy, completeness and F-scores of the object's cloud, in the truth's frame."""
+    """Accuracy, F-scores, precision and recall of the object's cloud (N, 3), in the truth's frame."""
     to_mesh = distances(known.mesh.caster(), sampled(points, samples, seed)) / known.diagonal
     to_cloud = nearest(known.surface[known.seen], points) / known.diagonal
     result = {
         "cloud_accuracy_median": quantity(100 * float(np.median(to_mesh)), "% of the diagonal"),
         "cloud_accuracy_90": quantity(100 * float(np.quantile(to_mesh, 0.9)), "% of the diagonal"),
     }
-    for percent, label in ((0.5, "05"), (1.0, "1")):
-        precision, recall, score = f_score(to_mesh, to_cloud, percent / 100)
-        result[f"cloud_precision_{label}pct"] = quantity(precision, "1")
-        result[f"cloud_completeness_{label}pct"] = quantity(recall, "1")
-        result[f"cloud_f_score_{label}pct"] = quantity(score, "1")
+    for ending, scores in scores_at(to_mesh, to_cloud, 1.0).items():
+        result |= {f"cloud_{name}_{ending}": quantity(score, "1") for name, score in scores.items()}
     return result
+
+
+def around_object(points: Array, known: ObjectTruth) -> NDArray[np.bool_]:
+    """(N,) points of a scene (N, 3), in the truth's frame, that count as the object's; see `belongs_to_object`.
+
+    The box is that of the object's true surface, widened by MARGIN of its diagonal.
+    """
+    low, high, margin = known.surface.min(0), known.surface.max(0), MARGIN * known.diagonal
+    near = ((points >= low - margin) & (points <= high + margin)).all(1)
+    inside = np.flatnonzero(near)
+    if len(inside):
+        own, other = (distances(mesh.caster(), points[inside]) for mesh in (known.mesh, known.rest))
+        near[inside] = belongs_to_object(points[inside], own, other, low, high, margin)
+    return near
+
+
+def scene_scores(points: Array, known: ObjectTruth, surface: Array) -> dict[str, dict[str, float]]:
+    """F-score, precision and recall of a scene around the object, at every threshold; see `scores_at`.
+
+    Args:
+        points: (N, 3) the scene's points in the truth's frame.
+        known: the object as it truly is.
+        surface: (M, 3) what is to be found of the object's surface.
+    """
+    points = points[around_object(points, known)]
+    to_mesh = distances(known.mesh.caster(), points) if len(points) else np.empty(0, dtype=np.float32)
+    return scores_at(to_mesh, nearest(surface, points), known.diagonal)
+
+
+def surface_to_find(known: ObjectTruth, flight: Cameras) -> Array:
+    """(M, 3) what of the object's true surface any photo of its orbit or of the flight sees, in the truth's frame."""
+    return known.surface[known.seen | visible(known.everything, flight, known.surface, HIDDEN)[1].any(0)]

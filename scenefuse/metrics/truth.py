@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import Cameras
+from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.stage import StageError, quantity, threads
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.workspace import View, read_views
@@ -167,6 +168,23 @@ def f_score(
     recall = float((truth_to_cloud <= tau).mean()) if len(truth_to_cloud) else 0.0
     total = precision + recall
     return precision, recall, 2 * precision * recall / total if total > 0 else 0.0
+
+
+def scores_at(
+    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], diagonal: float
+) -> dict[str, dict[str, float]]:
+    """F-score, precision and recall at each of THRESHOLDS (method G8): {"1pct": {"f_score": ..., ...}, ...}.
+
+    Args:
+        cloud_to_truth: (N,) distances of the cloud's points to the true surface.
+        truth_to_cloud: (M,) distances of points on the true surface to the cloud.
+        diagonal: of the object's true bounding box, in the unit of the distances.
+    """
+    found = {}
+    for ending, share in THRESHOLDS.items():
+        precision, recall, score = f_score(cloud_to_truth, truth_to_cloud, share * diagonal)
+        found[ending] = dict(zip(SCORES, (score, precision, recall)))
+    return found
 
 
 def nearest(points: Array, cloud: Array) -> Array:

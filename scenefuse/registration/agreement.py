@@ -4,16 +4,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, plane_normals, spacing
+from scenefuse.io.clouds import Cloud, plane_normals, sampled, spacing
 from scenefuse.stage import quantity, setting, threads
 from scenefuse.transforms import Array, Sim3
 
 # Neighbours that a plane is fitted to for a normal.
 NORMAL_NEIGHBOURS = 16
-# Points of both clouds together at which their common normals are measured.
+# Points at which the normals of both clouds together are compared with their neighbours'.
 MOST_TOGETHER = 20000
 
 
@@ -30,10 +29,12 @@ def registration_metrics(
 ) -> dict[str, dict[str, Any]]:
     """The registration.* numbers of one pose.
 
-    fitness_source = share of object points with a scene point within tau (Open3D's); fitness_target = share of scene
-    points with an object point within tau (the paper divides by the target); inlier_rmse over the object's inliers;
-    normal_consistency_cross = mean |n . n_nearest| over them (chance 0.5); normal_consistency_self = the same between
-    each point of both clouds together and its neighbours; f_score = harmonic mean of both fitnesses.
+    The object's inliers are its points with a scene point within tau. The names without a suffix are the paper's:
+    fitness = share of scene points with an object point within tau (the paper divides by the target); inlier_rmse = RMS
+    distance of the object's inliers to their nearest scene points; normal_consistency = mean |n . n_nearest| over these
+    pairs (chance 0.5). Beside them: fitness_source = share of the object's points that are inliers (Open3D's fitness);
+    fitness_f_score = harmonic mean of both fitnesses; normal_consistency_self = mean |n . n'| between points and their
+    neighbours in both whole clouds together.
 
     Args:
         obj: the object in its own frame.
@@ -49,28 +50,35 @@ def registration_metrics(
     inlier = ahead <= tau
     source, target = float(inlier.mean()), float((back <= tau).mean())
     rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
-    normals_object, normals_scene = (_normals(points)[0] for points in (moved, scene.points))
+    normals_object, normals_scene = (_normals(points, points) for points in (moved, scene.points))
     facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
-    together = np.concatenate([moved[inlier], scene.points])
-    if len(together) > MOST_TOGETHER:
-        together = together[np.random.default_rng(0).permutation(len(together))[:MOST_TOGETHER]]
-    union, neighbours = _normals(together)
-    smooth = np.abs(np.einsum("nk,njk->nj", union, union[neighbours[:, 1:]])).mean()
     return {
+        "fitness": quantity(target, "1"),
         "fitness_source": quantity(source, "1"),
-        "fitness_target": quantity(target, "1"),
+        "fitness_f_score": quantity(2 * source * target / max(source + target, 1e-12), "1"),
         "inlier_rmse": quantity(rmse, unit),
         "inlier_rmse_over_diagonal": quantity(None if rmse is None else rmse / diagonal, "1"),
-        "normal_consistency_cross": quantity(float(facing.mean()) if inlier.any() else None, "1"),
-        "normal_consistency_self": quantity(float(smooth), "1"),
-        "f_score": quantity(2 * source * target / max(source + target, 1e-12), "1"),
+        "normal_consistency": quantity(float(facing.mean()) if inlier.any() else None, "1"),
+        "normal_consistency_self": quantity(self_consistency(np.concatenate([moved, scene.points])), "1"),
         "tau": quantity(tau, unit),
         "object_spacing": quantity(spacing(moved), unit),
         "scene_spacing": quantity(spacing(scene.points), unit),
     }
 
 
-def _normals(points: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Normals (N, 3) of the planes through each point's nearest neighbours, and these (N, K)."""
-    neighbours = cKDTree(points).query(points, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
-    return plane_normals(points, neighbours), neighbours
+def self_consistency(points: Array) -> float:
+    """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
+
+    Measured at MOST_TOGETHER points at most; neighbours and normals are those of the whole cloud.
+    """
+    tree, at = cKDTree(points), sampled(points, MOST_TOGETHER, seed=0)
+    neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    used, place = np.unique(neighbours, return_inverse=True)
+    normals = _normals(points, points[used])[place.reshape(neighbours.shape)]
+    return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())
+
+
+def _normals(points: Array, at: Array) -> Array:
+    """Normals (M, 3) of the planes through the points (N, 3) nearest to each of `at` (M, 3)."""
+    neighbours = cKDTree(points).query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    return plane_normals(points, neighbours)

@@ -108,7 +108,7 @@ def _report(
         "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
         **uncertainty_quantities(outcome.uncertainty, length),
         "scale_ledger": quantity(ledger, ""),
-        "tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
+        "score_tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
         "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),

@@ -105,7 +105,7 @@ def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> 
         "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
         **uncertainty_quantities(None, length),
         "scale_ledger": quantity([ledger_row("rms", problem.scales.centre, None, "held by the paper's recipe")], ""),
-        "tau": quantity(SCORE_FRACTION * problem.scene.diagonal, length),
+        "score_tau": quantity(SCORE_FRACTION * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
         "rival": quantity(None, ""),
         "hypotheses": quantity([best.as_json()], ""),

@@ -311,7 +311,7 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None)
     if found.agreement:
         near, back, rmse, share, tau = (
             found.agreement[name]["value"]
-            for name in ("fitness_source", "fitness_target", "inlier_rmse", "inlier_rmse_over_diagonal", "tau")
+            for name in ("fitness_source", "fitness", "inlier_rmse", "inlier_rmse_over_diagonal", "tau")
         )
         off = "" if rmse is None else f", which lie {rmse:.3g} apart (RMS; {100 * share:.2g} % of the scene part)"
         lines.append(

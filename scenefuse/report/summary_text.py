@@ -6,12 +6,22 @@ from typing import Any
 
 import pandas as pd
 
+from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
-from scenefuse.report.tables import REGISTRATION, completion_table, number_in, plain, records, truth_numbers
+from scenefuse.report.tables import (
+    BESIDE,
+    COMPLETION,
+    REGISTRATION,
+    completion_table,
+    number_in,
+    plain,
+    records,
+    truth_numbers,
+)
 from scenefuse.report.values import Fields, find, number, unit_of
 
 WIDTH = 100
-_COLUMNS = ("value", "null", "scene")
+_COLUMNS = ("value", *BESIDE)
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
 _CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "mode", "workspace", "kept", "kernels")
@@ -55,7 +65,14 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame))
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
-    return lines + _completed_lines(fields) + _truth_lines(fields) + _remarks(fields)
+    measures = [{"measure": name, **{c: row.get(_beside(name, c)) for c in _COLUMNS}} for name in COMPLETION]
+    lines += _completed_lines(fields) + _completion_lines(measures)
+    return lines + _truth_lines(fields) + _remarks(fields)
+
+
+def _beside(measure: str, column: str) -> str:
+    """The column of scenes.tsv for a completion metric itself, its null, before or after."""
+    return measure if column == "value" else f"{measure}_{column}"
 
 
 def _cameras(row: dict[str, Any], pictures: str) -> str:
@@ -93,13 +110,16 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
         }
         cells = [(label, row.get(f"stage{stage}_{key}"), unit) for key, (label, unit) in names.items()]
         lines += _line(f"stage {stage}", _pairs(cells))
-    cloud = [("points", row["points"], ""), ("median distance", row["accuracy_pct_of_diagonal"], "% of the diagonal")]
-    cloud += [(k.replace("_", "-"), row[f"{k}_1pct"], "at 1 %") for k in ("precision", "completeness", "f_score")]
+    cloud = [
+        ("points", row["points"], ""),
+        ("median distance", row["cloud_accuracy_median_pct_of_diagonal"], "% of the diagonal"),
+    ]
     lines += (
         _line("cloud", _pairs(cloud)) + _line("alignment", _alignment(item.stages)) + _variant_lines(item, variants)
     )
     lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
-    lines += _around_line(item.stages) + _completion_lines(item, variants[0])
+    lines += _truth_table(item.stages)
+    lines += _completion_lines([r for r in records(completion_table([item], variants[0])) if _is_measure(r)])
     return lines + _remarks(item.stages | fields | item.fusion)
 
 
@@ -124,17 +144,17 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     shown = {
         "scale": ("", "scale"),
         "f_score": ("", "F-score"),
-        "fitness_source": ("fitness", "object"),
-        "fitness_target": ("fitness", "scene"),
-        "inlier_rmse_over_diagonal": ("RMSE", "of diag"),
-        "normal_consistency_cross": ("", "normals"),
         "margin": ("", "margin"),
+        "fitness": ("", "fitness"),
+        "fitness_source": ("fitness", "source"),
+        "inlier_rmse_over_diagonal": ("RMSE", "of diag"),
+        "normal_consistency": ("", "normals"),
         "scale_error_pct": ("scale", "error %"),
         "rotation_error_deg": ("angle", "error °"),
         "translation_error_over_diagonal": ("shift", "of diag"),
     }
     rows = {
-        variant: {k: number_in(item.variants.get(variant, {}), *REGISTRATION[k]) for k in shown} for variant in variants
+        variant: {k: number_in(item.variants.get(variant, {}), REGISTRATION[k]) for k in shown} for variant in variants
     }
     used = [k for k in shown if any(row[k] is not None for row in rows.values())]
     if not used:
@@ -147,11 +167,10 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
         lines.append(
             f"  {variant[:10]:<10}{words.get(status, status):>8}" + "".join(f"{_three(row[k]):>8}" for k in used)
         )
-    rmse = number_in(item.variants[variants[0]], *REGISTRATION["inlier_rmse"])
-    if rmse is not None:
-        cells_of = [(k.replace("_", " "), k) for k in ("inlier_rmse", "threshold")]
-        found = item.variants[variants[0]]
-        units = [(n, number_in(found, *REGISTRATION[k]), _short(unit_of(found, *REGISTRATION[k]))) for n, k in cells_of]
+    found = item.variants[variants[0]]
+    if number_in(found, REGISTRATION["inlier_rmse"]) is not None:
+        cells_of = [(k.replace("_", " "), REGISTRATION[k]) for k in ("inlier_rmse", "tau")]
+        units = [(name, number_in(found, key), _short(unit_of(found, key))) for name, key in cells_of]
         lines += _line("", f"{variants[0]}: {_pairs(units)}")
     decided = find(item.variants[variants[0]], "fine.decided_by")
     if decided is not None:
@@ -173,22 +192,37 @@ def _three(item: float | int | None) -> str:
     return "-" if item is None else f"{item:.1e}" if 0 < abs(item) < 1e-4 else f"{item:.3g}"
 
 
-def _around_line(fields: Fields) -> list[str]:
-    """The scene's scores around the object before and after fusion, where truth is known."""
-    parts = []
-    for label, name in (("F-score", "f_score"), ("precision", "precision"), ("recall", "recall")):
-        before, after = (number_in(fields, f"truth.scene_{name}_{when}") for when in ("before", "after"))
-        if before is not None:
-            parts.append(f"{label} {_three(before)} -> {_three(after)}")
-    return _line("scene, truth", f"around the object, at 1 % of its diagonal: {', '.join(parts)}" if parts else "")
+def _truth_table(fields: Fields) -> list[str]:
+    """Scores of the object's cloud, and of the scene around it before and after fusion, where truth is known."""
+    lines = []
+    for label, keys in (("cloud", ["cloud_{}"]), ("scene", ["scene_{}_before", "scene_{}_after"])):
+        for score in SCORES:
+            cells = []
+            for threshold in THRESHOLDS:
+                found = [number_in(fields, f"truth.{key.format(score)}_{threshold}") for key in keys]
+                cells.append(" -> ".join(_three(number) for number in found if number is not None) or "-")
+            if set(cells) != {"-"}:
+                name = "F-score" if score == "f_score" else score
+                lines.append(
+                    f"  {label if score == SCORES[0] else '':<12}{name:<14}" + "".join(f"{c:>17}" for c in cells)
+                )
+    if not lines:
+        return []
+    shares = "".join(f"{f'{100 * share:g} %':>17}" for share in THRESHOLDS.values())
+    return [f"{'truth, at a share of diag':<28}{shares}", *lines]
 
 
-def _completion_lines(item: Collected, variant: str) -> list[str]:
-    table = records(completion_table([item], variant))
-    rows = [r for r in table if isinstance(r["value"], (int, float)) and not r["measure"].startswith("scene_")]
+def _is_measure(row: dict[str, Any]) -> bool:
+    """Whether a row of the completion table is a metric without truth."""
+    return not row["measure"].startswith("scene_")
+
+
+def _completion_lines(rows: list[dict[str, Any]]) -> list[str]:
+    """The completion metrics: of what was added, of a random cloud in its place, before and after."""
+    rows = [row for row in rows if _cell(row["value"]) != "-"]
     if not rows:
         return []
-    lines = [f"{'completion':<14}{'':<34}{'value':>10}{'null':>10}{'scene':>10}"]
+    lines = [f"{'completion':<14}{'':<34}" + "".join(f"{c:>10}" for c in _COLUMNS)]
     for row in rows:
         lines.append(f"{'':<14}{row['measure'][:33]:<34}" + "".join(f"{_cell(row[k]):>10}" for k in _COLUMNS))
     return [line.rstrip() for line in lines]

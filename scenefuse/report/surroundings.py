@@ -109,10 +109,10 @@ def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
         parts.append(str(reason))
     for label, keys in (
         ("scale", ("scale",)),
-        ("F-score", ("registration.f_score", "f_score")),
-        ("fitness", ("registration.fitness_source", "fitness_source")),
+        ("F-score", ("f_score",)),
+        ("fitness", ("registration.fitness",)),
         ("inlier RMSE / diagonal", ("registration.inlier_rmse_over_diagonal",)),
-        ("normal consistency", ("registration.normal_consistency_cross",)),
+        ("normal consistency", ("registration.normal_consistency",)),
         ("margin", ("margin",)),
     ):
         found = find(fields, *keys)

@@ -3,33 +3,37 @@
 A run may be partial: a value that does not exist is empty, an object without results carries its last error.
 """
 
+import itertools
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.values import Fields, find, number, unit_of
 
-# Columns of registration.tsv and rows of ablation.tsv: name, and where a value may stand, best first.
-REGISTRATION: dict[str, tuple[str, ...]] = {
-    "scale": ("fine.scale",),
-    "f_score": ("metrics.registration.f_score", "fine.f_score"),
-    "fitness_source": ("metrics.registration.fitness_source", "fine.fitness_source"),
-    "fitness_target": ("metrics.registration.fitness_target", "fine.fitness_target"),
-    "inlier_rmse": ("metrics.registration.inlier_rmse", "fine.inlier_rmse"),
-    "inlier_rmse_over_diagonal": ("metrics.registration.inlier_rmse_over_diagonal", "fine.inlier_rmse_over_diagonal"),
-    "normal_consistency_cross": ("metrics.registration.normal_consistency_cross",),
-    "normal_consistency_self": ("metrics.registration.normal_consistency_self",),
-    "margin": ("fine.margin",),
-    "threshold": ("metrics.registration.tau",),
-    "scale_error_pct": ("truth.scale_error_pct",),
-    "rotation_error_deg": ("truth.rotation_error_deg",),
-    "translation_error_over_diagonal": ("truth.translation_error_over_diagonal",),
-    "object_f_score": ("truth.object_f_score",),
+# Columns of registration.tsv and rows of ablation.tsv: name, and where its value stands.
+REGISTRATION: dict[str, str] = {
+    "scale": "fine.scale",
+    "f_score": "fine.f_score",
+    "margin": "fine.margin",
+    **{
+        name: f"metrics.registration.{name}"
+        for name in (
+            *("fitness", "fitness_source", "fitness_f_score", "inlier_rmse", "inlier_rmse_over_diagonal"),
+            *("normal_consistency", "normal_consistency_self", "tau"),
+        )
+    },
+    "scale_error_pct": "truth.scale_error_pct",
+    "rotation_error_deg": "truth.rotation_error_deg",
+    "translation_error_over_diagonal": "truth.translation_error_over_diagonal",
+    "placed_f_score_1pct": "truth.placed_f_score_1pct",
 }
-_AROUND = [f"scene_{score}_{when}" for score in ("f_score", "precision", "recall") for when in ("before", "after")]
+# The completion metrics of the completed scene that scenes.tsv holds, each with what stands beside it.
+COMPLETION = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
+BESIDE = ("null", "before", "after")
 
 
 def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
@@ -44,7 +48,7 @@ def registration_table(objects: list[Collected], variants: list[str]) -> pd.Data
                 "status": status_of(item, variant),
                 "reason": reason_of(item, variant),
             }
-            rows.append({**row, **{name: number_in(fields, *keys) for name, keys in REGISTRATION.items()}})
+            rows.append({**row, **{name: number_in(fields, key) for name, key in REGISTRATION.items()}})
     return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *REGISTRATION])
 
 
@@ -53,11 +57,11 @@ def ablation_table(objects: list[Collected], variants: list[str]) -> pd.DataFram
     rows: list[dict[str, Any]] = []
     for item in objects:
         rows.append({"object": item.name, "measure": "status", "unit": ""} | {a: status_of(item, a) for a in variants})
-        for name, keys in REGISTRATION.items():
-            values = {variant: number_in(item.variants.get(variant, {}), *keys) for variant in variants}
+        for name, key in REGISTRATION.items():
+            values = {variant: number_in(item.variants.get(variant, {}), key) for variant in variants}
             if any(v is not None for v in values.values()):
                 unit = next(
-                    u for variant in variants if (u := unit_of(item.variants.get(variant, {}), *keys)) is not None
+                    u for variant in variants if (u := unit_of(item.variants.get(variant, {}), key)) is not None
                 )
                 rows.append(
                     {"object": item.name, "measure": name, "unit": unit} | {a: _six(v) for a, v in values.items()}
@@ -66,8 +70,11 @@ def ablation_table(objects: list[Collected], variants: list[str]) -> pd.DataFram
 
 
 def completion_table(objects: list[Collected], variant: str) -> pd.DataFrame:
-    """One row an object and measure: its value, the value of a matched random cloud (null), and the scene's own."""
-    rows = []
+    """One row an object and measure: of what was added, of a random cloud in its place (null), before and after.
+
+    Scores against truth (`scene_*`) are those of the scene around the object, before and after fusion.
+    """
+    rows: list[dict[str, Any]] = []
     for item in objects:
         fields = item.variants.get(variant, {})
         group = {k.split("completion.", 1)[1]: v for k, v in fields.items() if k.startswith("metrics.completion.")}
@@ -76,12 +83,12 @@ def completion_table(objects: list[Collected], variant: str) -> pd.DataFrame:
             name, column = _measure(key)
             cells = of_measure.setdefault(name, {"unit": entry["unit"]})
             cells[column] = plain(entry["value"])
+        for threshold, score in itertools.product(THRESHOLDS, SCORES):
+            cells = {w: number_in(item.stages, f"truth.scene_{score}_{w}_{threshold}") for w in ("before", "after")}
+            if cells["before"] is not None:
+                of_measure[f"scene_{score}_{threshold}"] = {"unit": "1", **cells}
         rows += [{"object": item.name, "measure": name, **cells} for name, cells in of_measure.items()]
-        for name in _AROUND:
-            amount = number_in(item.stages, f"truth.{name}")
-            if amount is not None:
-                rows.append({"object": item.name, "measure": name, "unit": "1", "value": amount})
-    return pd.DataFrame(rows, columns=["object", "measure", "unit", "value", "null", "scene"])
+    return pd.DataFrame(rows, columns=["object", "measure", "unit", "value", *BESIDE])
 
 
 def runtime_table(benchmarks: Path) -> pd.DataFrame:
@@ -108,7 +115,7 @@ def runtime_table(benchmarks: Path) -> pd.DataFrame:
 
 
 def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
-    """One row a scene: photos, cameras, georeference, cloud, errors against truth."""
+    """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth."""
     rows = []
     for name, fields in scenes.items():
         added = find(fields, "completed.added_points")
@@ -125,6 +132,9 @@ def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
             "completed_points": number_in(fields, "completed.points"),
             "completed_by": None if added is None else ", ".join(added) or "none",
         }
+        for measure in (n for m in COMPLETION for n in (m, *(f"{m}_{beside}" for beside in BESIDE))):
+            if f"metrics.completion.{measure}" in fields:
+                row[measure] = number_in(fields, f"metrics.completion.{measure}")
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
         row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(jobs, name))
         rows.append(row)
@@ -152,9 +162,9 @@ def objects_table(objects: list[Collected]) -> pd.DataFrame:
             row[f"stage{stage}_depth_error_over_diagonal"] = number_in(fields, f"truth.stage{stage}_depth_error")
             row[f"stage{stage}_depth_within_1pct"] = number_in(fields, f"truth.stage{stage}_depth_within_1pct")
         row["points"] = number_in(fields, "object.points")
-        row["accuracy_pct_of_diagonal"] = number_in(fields, "truth.cloud_accuracy_median")
-        for name in ("precision", "completeness", "f_score"):
-            row[f"{name}_1pct"] = number_in(fields, f"truth.cloud_{name}_1pct")
+        row["cloud_accuracy_median_pct_of_diagonal"] = number_in(fields, "truth.cloud_accuracy_median")
+        for threshold, score in itertools.product(THRESHOLDS, SCORES):
+            row[f"cloud_{score}_{threshold}"] = number_in(fields, f"truth.cloud_{score}_{threshold}")
         row["missing"] = item.missing or None
         row["error"] = why_missing(item.failed) if item.missing else None
         rows.append(row)
@@ -190,8 +200,8 @@ def plain(item: Any) -> Any:
 
 
 def _measure(key: str) -> tuple[str, str]:
-    """A completion key as (measure, column): `nue_null` is the null of `nue`, `nue_scene` the scene's own."""
-    for column in ("null", "scene"):
+    """A completion key as (measure, column): `nue_null` is the null of `nue`."""
+    for column in BESIDE:
         if key.endswith(f"_{column}"):
             return key.removesuffix(f"_{column}"), column
     return key, "value"

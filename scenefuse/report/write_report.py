@@ -33,20 +33,24 @@ _NOTES = {
     "in the unit named in the row: metres only where GPS made it so.",
     "objects": "PSNR (dB) and SSIM compare renders with photos: higher is better; `measured_on` says whether training "
     "saw those photos. Depth error, "
-    "accuracy, completeness and F-score exist only where the true surface is known.",
-    "registration": "Fitness: share of object (source) or scene (target) points with a partner within the threshold. "
-    "F-score: both at once, 1 is perfect; a wrong pose can have a high fitness, hardly a high F-score. Inlier RMSE is "
-    "in the scene's unit, and as a share of the crop's diagonal. Normal consistency, cross: how parallel the two "
-    "surfaces are where they meet (0.5 is chance). Margin: lead over the second-best pose; near zero, two poses "
-    "explain the data equally well. Below its limits an object is unregistered and left out of the scene. `ungated`: "
-    "nothing checked the pose. `failed`: a step ended with an error; `missing`: it has not run.",
-    "completion": "Every measure stands beside its null, the same measure on a matched random cloud: only a clear "
-    "distance from the null says something. Surface variation: 0 smooth to 1/3. NUE: evenness of the density after "
-    "against before, at or below 1 as even as the scene, to 1.3 seamless; the density-invariant form ignores that one "
-    "cloud is denser. Primitive fitting: share of added points on planes, spheres or cylinders.",
-    "ablation": "All variants at the same thresholds. `full` is fused, `paper` follows the published recipe, which "
-    "checks no pose, `clouds_only` uses the clouds alone, `no_scale` leaves out scale rectification, `no_crop` the "
-    "crop.",
+    "accuracy, precision, recall and F-score exist only where the true surface is known.",
+    "registration": "f_score: how well both surfaces explain each other, 1 is perfect; the decision is made on it. "
+    "Margin: lead over the second-best pose; near zero, two poses explain the data equally well. Below its limits an "
+    "object is unregistered and left out of the scene. The paper's are fitness (the share of the crop's points with an "
+    "object point within tau), inlier_rmse (the distance of the object's points that lie within tau of the "
+    "crop, in the scene's unit and as a share of the crop's diagonal) and normal_consistency (how parallel the two "
+    "surfaces are there; 0.5 is chance). fitness_source: the share of the object's points within tau of the crop, high "
+    "for an object that is too small. fitness_f_score: both at once. `ungated`: nothing checked the pose. `failed`: a "
+    "step ended with an error; `missing`: it has not run.",
+    "completion": "value: of the added points. null: of a random cloud in their place; only a clear distance from it "
+    "says something. before, after: of all points of the object in the scene, without and with them. Surface "
+    "variation: 0 smooth to 1/3. NUE: evenness of the density after against before; at or below 1 as even as the "
+    "scene, to 1.3 seamless; the density-invariant form ignores that one cloud is denser. Primitive fitting: share of "
+    "points on planes, spheres or cylinders. scene_*: against truth, the scene around the object at a share of its "
+    "diagonal (025pct: 0.25 %).",
+    "ablation": "All variants at the same thresholds, except f_score and margin, which are each decision's own. `full` "
+    "is fused, `paper` follows the published recipe, which checks no pose, `clouds_only` uses the clouds alone, "
+    "`no_scale` leaves out scale rectification, `no_crop` the crop.",
     "runtime": "Sum over a rule's jobs; jobs run side by side, so the wall time is less than the total. Memory is the "
     "largest resident size of one job.",
 }

@@ -77,7 +77,7 @@ def write_summary(
 
 
 def _completed(folder: Path, objects: list[Collected], variant: str) -> Fields:
-    """What the completed scene holds; nothing when it is from before an object failed, or was mended."""
-    fields = read_fields(folder, ["completed.json"])
+    """What the completed scene holds and its metrics; nothing when it is from before an object failed or was mended."""
+    fields = read_fields(folder, ["completed.json", "metrics.json"])
     undecided = {item.name for item in objects if status_of(item, variant) in ("failed", "missing")}
     return fields if set(find(fields, "completed.failed") or {}) == undecided else {}

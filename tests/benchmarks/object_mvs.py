@@ -149,8 +149,8 @@ def measured(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[
         "points": len(cloud),
         "accuracy_pct": value(found, "cloud_accuracy_median"),
         "accuracy_90_pct": value(found, "cloud_accuracy_90"),
-        "complete_05": value(found, "cloud_completeness_05pct"),
-        "complete_1": value(found, "cloud_completeness_1pct"),
+        "recall_05": value(found, "cloud_recall_05pct"),
+        "recall_1": value(found, "cloud_recall_1pct"),
         "f_05": value(found, "cloud_f_score_05pct"),
         "f_1": value(found, "cloud_f_score_1pct"),
     }

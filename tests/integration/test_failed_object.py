@@ -17,7 +17,7 @@ import yaml
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import quantity, write_json
 
-GATHERED = ("completed.", "view.", "summary/")
+GATHERED = ("completed.", "view.", "yard/metrics.json", "summary/")
 STATUS = {
     "status": quantity("registered", ""),
     "reason": quantity("", ""),
@@ -35,6 +35,7 @@ def write_stages(folder: Path, files: list[str], date: float) -> None:
     """Outputs of the stages before the last ones: real where these read them, else empty."""
     content = {"fine.json": STATUS, "dense.json": {"points": quantity(1000, "points")}}
     content["georeference.json"] = {"length_unit": quantity("m", "")}
+    content["crop.json"] = {"diagonal": quantity(5.0, "m")}
     for path in (folder / file for file in files):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".ply":
@@ -85,6 +86,8 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert list(report["added_points"]["value"]) == ["shed"] and "2.jpg" in report["failed"]["value"]["barn"]
     assert set(read_cloud(scene / "completed.ply").fields["source"]) == {0, 1}
     assert (scene / "completed.laz").stat().st_size > 0
+    measured = json.loads((scene / "metrics.json").read_text())["completion"]
+    assert measured["objects"]["value"] == 1 and measured["surface_variation"]["value"] < 1e-6
     table = pd.read_csv(summary / "registration.tsv", sep="\t").set_index("object")
     assert table["status"].to_dict() == {"shed": "registered", "barn": "failed"} and "2.jpg" in table["reason"]["barn"]
     text = " ".join((summary / "summary.txt").read_text().split())
@@ -103,6 +106,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert mended.returncode == 0, mended.stdout[-3000:]
     report = json.loads((scene / "completed.json").read_text())
     assert list(report["added_points"]["value"]) == ["shed", "barn"] and report["failed"]["value"] == {}
+    assert json.loads((scene / "metrics.json").read_text())["completion"]["objects"]["value"] == 2
     assert "2 of 2 objects registered" in (summary / "summary.txt").read_text()
     assert "Nothing to be done" in project("-n").stdout
 

@@ -64,7 +64,8 @@ def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(fini
     assert (~added).sum() == len(scene)
     assert (house / "fused_scene.laz").stat().st_size > 0
     assert added.sum() > 0 and (fused.fields["views"][added] >= 2).all()
-    assert truth["scene_f_score_after"]["value"] > truth["scene_f_score_before"]["value"]
+    for threshold in ("1pct", "2pct"):
+        assert truth[f"scene_f_score_after_{threshold}"]["value"] > truth[f"scene_f_score_before_{threshold}"]["value"]
 
 
 def test_the_completed_scene_holds_what_the_object_adds(finished):
@@ -76,6 +77,12 @@ def test_the_completed_scene_holds_what_the_object_adds(finished):
     assert np.array_equal(completed.fields["source"], alone.fields["source"])
     assert json.loads((scene / "completed.json").read_text())["sources"]["value"] == {"0": "scene", "1": "house"}
     assert (scene / "completed.laz").stat().st_size > 0
+    of_scene, of_house = (
+        json.loads((folder / "metrics.json").read_text())["completion"]
+        for folder in (scene, finished / "results/objects/house")
+    )
+    for name in ("surface_variation", "surface_variation_null", "nue", "primitive_fitting_score_after"):
+        assert of_scene[name]["value"] == pytest.approx(of_house[name]["value"], rel=0.05)
 
 
 def test_transforms_in_the_ledger_agree_with_the_registration(finished):
@@ -95,8 +102,14 @@ SUMMARY = {"draw_object", "write_summary", "write_report", "all"}
 @pytest.mark.parametrize(
     "edit, rules",
     [
-        ({"metrics": {"tau_fraction": 0.02}}, {"compute_metrics", "compute_variant_metrics"}),
-        ({"fusion": {"fill_spacings": 2.0}}, {"fuse_object", "complete_scene", "compute_metrics", "evaluate_object"}),
+        ({"metrics": {"tau_fraction": 0.02}}, {"compute_metrics", "compute_variant_metrics", "compute_scene_metrics"}),
+        (
+            {"fusion": {"fill_spacings": 2.0}},
+            {
+                *("fuse_object", "complete_scene", "view_scene"),
+                *("compute_metrics", "compute_scene_metrics", "evaluate_object"),
+            },
+        ),
     ],
     ids=["metrics", "fusion"],
 )

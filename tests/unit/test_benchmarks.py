@@ -4,15 +4,21 @@ import dataclasses
 import importlib
 import re
 from pathlib import Path
-from typing import get_type_hints
+from types import SimpleNamespace
+from typing import get_args, get_type_hints
 
+import numpy as np
+import pandas as pd
 import pytest
-from benchmarks import frames_scaling, lego, object_ablation, object_mvs
+from benchmarks import completed_scene, frames_scaling, lego, object_ablation, object_mvs
 
+from scenefuse.fusion.fuse_object import FusionSettings
+from scenefuse.io.clouds import Cloud
 from scenefuse.io.settings import read_settings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
+from scenefuse.transforms import Sim3, rotation_between
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 
@@ -45,6 +51,61 @@ def test_the_lego_example_and_its_benchmark_train_alike():
     words = re.sub(r"[#\\\n]+", " ", example.split("--out lego")[1].split("object:")[0]).split()
     said = {words[i].removeprefix("--").replace("-", "_"): float(words[i + 1]) for i in range(0, len(words), 2)}
     assert said | {"mask_band_px": 0} == lego.FLAGS
+
+
+def case(points) -> completed_scene.Case:
+    """An object of a diagonal of 10 m, 5 in its own unit, turned and moved into the scene."""
+    turn = rotation_between(np.array([0, 0, 1.0]), np.array([0.3, -0.5, 0.8]))
+    known = SimpleNamespace(diagonal=10.0)
+    pose, cloud = Sim3(2.0, turn, np.array([3.0, 1, 2])), Cloud(points)
+    return completed_scene.Case(
+        "x",
+        cloud,
+        cloud,
+        cloud,
+        pose,
+        Sim3.identity(),
+        known,
+        points,
+        Path("results"),  # type: ignore[arg-type]
+    )
+
+
+def test_the_harm_done_to_an_object_is_as_large_as_it_says():
+    points = np.random.default_rng(0).uniform(0, 3, (30000, 3))
+    right = case(points)
+    moved = completed_scene.displaced(right, 1, -1).apply(points) - right.pose.apply(points)
+    assert np.allclose(moved, -0.2 * right.pose.rotation[:, 1])
+    larger = completed_scene.scaled(right, 1.03)
+    assert larger.scale == pytest.approx(2.06)
+    assert np.allclose(larger.apply(np.full(3, 1.5)), right.pose.apply(np.full(3, 1.5)), atol=0.01)
+    away = completed_scene.bad_object(right).points - points
+    third = points[:, 0] > np.quantile(points[:, 0], 2 / 3)
+    assert np.allclose(away[third].mean(0), [0, 0.5, 0], atol=0.003) and np.allclose(
+        away[~third].mean(0), 0, atol=0.003
+    )
+    assert np.allclose(away[~third].std(0), 0.05, atol=0.002)
+
+
+def test_every_mode_of_fusion_is_in_the_table_of_the_completed_scene():
+    modes = get_args(get_type_hints(FusionSettings)["mode"])
+    found = completed_scene.fusions()
+    assert {settings.mode for settings in found.values()} == set(modes) >= set(completed_scene.THINNED)
+    assert FusionSettings() in found.values()
+
+
+def test_the_table_of_the_completed_scene_compares_with_the_better_source_of_each_run():
+    def rows(run, before, fused, alone):
+        clouds = ((completed_scene.BEFORE, before), ("fill", fused), (completed_scene.ALONE, alone))
+        return [
+            {"run": run, "object": "x", "shift_over_diagonal": 0, "cloud": c}
+            | dict.fromkeys(completed_scene.F_SCORES, f)
+            for c, f in clouds
+        ]
+
+    lines = completed_scene.summary(pd.DataFrame(rows("a", 0.9, 0.8, 0.5) + rows("b", 0.5, 0.8, 0.8))).splitlines()
+    fill = next(line for line in lines if line.startswith("fill"))
+    assert fill.endswith("-0.050") and fill.count("0.800 ± 0.000") == 4
 
 
 def fields(settings: type) -> set[str]:

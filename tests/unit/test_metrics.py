@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 
 from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.metrics.completion import MetricSettings, completion_metrics, local_density, surface_variation
+from scenefuse.metrics.completion import (
+    Completion,
+    MetricSettings,
+    completion_metrics,
+    completion_of,
+    local_density,
+    surface_variation,
+)
 from scenefuse.metrics.compute_metrics import compute_metrics
+from scenefuse.metrics.compute_scene_metrics import compute_scene_metrics
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.registration.agreement import registration_metrics
+from scenefuse.registration.agreement import MOST_TOGETHER, registration_metrics, self_consistency
 from scenefuse.stage import quantity, read_json, write_json
 from scenefuse.transforms import Sim3
 
@@ -40,12 +48,12 @@ def test_fitness_counts_both_ways_and_rmse_is_the_shift():
     scene = Cloud(grid(20))
     obj = Cloud(np.concatenate([grid(20)[:100] + [0, 0, 0.3], grid(20)[:100] + [0, 0, 50.0]]))
     found = registration_metrics(obj, scene, Sim3.identity(), 0.5, 10.0, "m")
-    assert found["fitness_source"]["value"] == pytest.approx(0.5)
-    assert found["fitness_target"]["value"] == pytest.approx(0.25)
-    assert found["f_score"]["value"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)
+    assert found["fitness"]["value"] == pytest.approx(0.25)  # of the scene's points, as the paper
+    assert found["fitness_source"]["value"] == pytest.approx(0.5)  # of the object's, as Open3D
+    assert found["fitness_f_score"]["value"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)
     assert found["inlier_rmse"]["value"] == pytest.approx(0.3)
     assert found["inlier_rmse_over_diagonal"]["value"] == pytest.approx(0.03)
-    assert found["normal_consistency_cross"]["value"] == pytest.approx(1.0)
+    assert found["normal_consistency"]["value"] == pytest.approx(1.0)
 
 
 def test_normals_of_unrelated_surfaces_agree_by_chance_only():
@@ -53,7 +61,29 @@ def test_normals_of_unrelated_surfaces_agree_by_chance_only():
     found = registration_metrics(
         Cloud(rng.uniform(size=(3000, 3))), Cloud(rng.uniform(size=(3000, 3))), Sim3.identity(), 0.2, 1.0, "m"
     )
-    assert found["normal_consistency_cross"]["value"] == pytest.approx(0.5, abs=0.1)
+    assert found["normal_consistency"]["value"] == pytest.approx(0.5, abs=0.1)
+
+
+def test_an_object_that_is_too_small_has_a_low_fitness_though_all_of_it_lies_on_the_scene():
+    scene = Cloud(grid(40))
+    found = registration_metrics(scene, scene, Sim3(0.2, np.eye(3), np.zeros(3)), 0.9, 50.0, "m")
+    assert found["fitness_source"]["value"] == 1.0
+    assert found["fitness"]["value"] == pytest.approx(9**2 / 40**2)
+
+
+def test_self_consistency_is_of_both_whole_clouds_at_their_own_density():
+    """A ripple whose normals turn by 90 degrees every half unit: a thinned cloud has more of its neighbours there."""
+    x, y = np.meshgrid(np.arange(0, 60, 0.05), np.arange(0, 6, 0.05))
+    ripple = np.stack([x.ravel(), y.ravel(), np.abs(x.ravel() % 1 - 0.5)], axis=1)
+    assert len(ripple) > 7 * MOST_TOGETHER
+    assert self_consistency(ripple) > 0.93 > 0.9 > self_consistency(ripple[::7])
+    flat, far = grid(30), ball(900) * 30 + [500, 0, 0]
+    alone, both = (
+        registration_metrics(Cloud(obj), Cloud(flat), Sim3.identity(), 0.5, 50.0, "m")["normal_consistency_self"]
+        for obj in (flat + [0, 0, 0.1], far)
+    )
+    # What is of the object and far from the scene counts too.
+    assert alone["value"] > 0.99 and both["value"] < 0.9
 
 
 def test_no_inlier_gives_no_rmse():
@@ -128,7 +158,7 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
     )
     content = read_json(tmp_path / "metrics.json")
     completion = {name: item["value"] for name, item in content["completion"].items()}
-    assert content["registration"]["fitness_target"]["value"] == 1.0
+    assert content["registration"]["fitness"]["value"] == 1.0
     assert content["registration"]["tau"]["unit"] == content["completion"]["surface_variation_radius"]["unit"] == "m"
     assert completion["surface_variation"] < 1e-6
     assert completion["nue"] == pytest.approx(1.0, abs=0.15)
@@ -137,14 +167,84 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
         assert f"{name}_null" in completion
 
 
-def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_form(tmp_path):
+def test_a_five_times_denser_completion_shows_in_nue_but_not_in_its_invariant_form():
     rng = np.random.default_rng(0)
-    scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
-    dense = rng.uniform(0, 4, (10000, 3)) * [1, 1, 0] + [4.2, 0, 0]
+    scene, dense = (rng.uniform(0, 4, (n, 3)) * [1, 1, 0] for n in (2000, 10000))
     settings = replace(SETTINGS, primitive_most=2)
-    found = completion_metrics(Cloud(scene), Cloud(scene), Cloud(dense), 6.0, "m", settings, 0)
+    found = completion_metrics([Completion(scene, scene[:0], dense, 6.0)], settings, 0)
     assert found["nue"]["value"] == pytest.approx(5, rel=0.25)
     assert found["nue_density_invariant"]["value"] == pytest.approx(1, rel=0.2)
+
+
+def test_nue_is_of_the_completed_cloud_not_only_of_what_was_added():
+    """Half of it five times as dense: even within each half, uneven as a whole."""
+    rng = np.random.default_rng(0)
+    scene, dense = (rng.uniform(0, 4, (n, 3)) * [1, 1, 0] for n in (4000, 10000))
+    half = scene[scene[:, 0] < 2]
+    settings = replace(SETTINGS, primitive_most=2)
+    found = completion_metrics([Completion(scene, half, dense * [0.5, 1, 1] + [2, 0, 0], 6.0)], settings, 0)
+    # By hand: densities 1 and 5 at 1 and 5 shares of the points; 16 neighbours add a quarter of each as noise.
+    mean, noise = (1 * 1 + 5 * 5) / 6, 0.25
+    spread = np.sqrt(((1 - mean) ** 2 + 5 * (5 - mean) ** 2) / 6 + noise**2 * (1 + 5 * 25) / 6)
+    assert found["nue_density_invariant"]["value"] == pytest.approx(spread / mean / noise, rel=0.15)
+
+
+def test_what_fusion_took_away_counts_no_longer():
+    rng = np.random.default_rng(0)
+    good = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0]
+    bad = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0.2] + [4, 0, 0]
+    new = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0] + [4, 0, 0]
+    ground = rng.uniform(-2, 8, (500, 3)) * [1, 1, 0] - [0, 0, 0.5]
+    other = ball(300) + [4, 2, 1]
+    fused = Cloud(
+        np.concatenate([ground, good, other, new]),
+        fields={"source": np.repeat([0, 1, 3], [2000, 300, 1500]).astype(np.uint16)},
+    )
+    part = completion_of(np.concatenate([bad, good]), fused, 3, 9.0)
+    assert np.array_equal(np.sort(part.kept, axis=0), np.sort(good, axis=0)) and np.array_equal(part.added, new)
+    found = completion_metrics([part], replace(SETTINGS, primitive_most=3), 0)
+    before, after = (found[f"surface_variation_{when}"]["value"] for when in ("before", "after"))
+    assert after < 1e-9 < 0.01 < before
+    before, after = (found[f"primitive_fitting_score_{when}"]["value"] for when in ("before", "after"))
+    assert after > 0.95 > 0.8 > before
+
+
+def test_objects_of_a_scene_count_by_their_points():
+    rng = np.random.default_rng(0)
+    scene = rng.uniform(0, 4, (2000, 3)) * [1, 1, 0]
+    smooth = rng.uniform(0, 4, (3000, 3)) * [1, 1, 0] + [4.2, 0, 0]
+    rough = rng.uniform(0, 4, (1000, 3)) * [1, 1, 0.2] + [4.2, 0, 0]
+    parts = [Completion(scene, scene, added, 6.0) for added in (smooth, rough, smooth[:3])]
+    settings = replace(SETTINGS, primitive_most=2)
+    alone, both = completion_metrics(parts[1:2], settings, 0), completion_metrics(parts, settings, 0)
+    assert both["surface_variation"]["value"] == pytest.approx(alone["surface_variation"]["value"] / 4, rel=0.02)
+    assert both["added_points"]["value"] == 4003
+    nothing = completion_metrics([parts[2]], settings, 0)
+    assert nothing["nue"]["value"] is None and nothing["added_points"]["value"] == 3
+
+
+def test_the_completed_scene_is_measured_over_the_objects_that_are_in_it(tmp_path):
+    rng = np.random.default_rng(0)
+    roof = np.array([[1, 0, 0.5], [0, 1, 0], [0, 0, 0]])  # x slopes
+    crop, added = (rng.uniform(0, 4, (1000, 3)) @ roof + [x, 0, x / 2] for x in (0, 4))
+    whole = Cloud(np.concatenate([crop, added]), fields={"source": np.repeat([0, 2], 1000).astype(np.uint16)})
+    write_cloud(tmp_path / "completed.ply", whole)
+    known = {"sources": {"0": "scene", "1": "barn", "2": "shed"}, "added_points": {"shed": 1000}}
+    write_json(tmp_path / "completed.json", {name: quantity(item, "") for name, item in known.items()})
+    write_cloud(tmp_path / "shed/registration/full/crop.ply", Cloud(crop))
+    write_json(tmp_path / "shed/registration/full/crop.json", {"diagonal": quantity(6.0, "m")})
+    compute_scene_metrics(
+        completed=tmp_path / "completed.ply",
+        completed_json=tmp_path / "completed.json",
+        objects=[tmp_path / "barn", tmp_path / "shed"],
+        report=tmp_path / "metrics.json",
+        seed=0,
+        settings=SETTINGS,
+    )
+    found = read_json(tmp_path / "metrics.json")["completion"]
+    assert found["objects"]["value"] == 1 and found["added_points"]["value"] == 1000
+    assert found["primitive_fitting_score"]["value"] > 0.95 > 0.5 > found["primitive_fitting_score_null"]["value"]
+    assert found["nue"]["value"] == pytest.approx(1.0, abs=0.15)
 
 
 def test_every_part_of_what_was_added_counts_in_the_variation_over_wide_radii():
@@ -155,7 +255,7 @@ def test_every_part_of_what_was_added_counts_in_the_variation_over_wide_radii():
     rough = rng.uniform(0, 4, (1500, 3)) * [1, 1, 0.1] + [8.4, 0, 0]
     settings = replace(SETTINGS, primitive_most=2, sample=4000)
     found = [
-        completion_metrics(Cloud(scene), Cloud(scene), Cloud(np.concatenate(parts)), 10.0, "m", settings, 0)
+        completion_metrics([Completion(scene, scene, np.concatenate(parts), 10.0)], settings, 0)
         for parts in ([smooth, rough], [rough, smooth])
     ]
     for name in ("surface_variation_2pct", "surface_variation_4pct"):

@@ -48,7 +48,7 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     content = read_json(out / "transform.json")
     scale, angle, shift = in_files(content, house, UTM)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
-    assert value(content, "status") == "registered" and value(content["agreement"], "fitness_target") > 0.9
+    assert value(content, "status") == "registered" and value(content["agreement"], "fitness") > 0.9
     pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
     placed = read_cloud(out / "object_in_scene.laz")
     expected = pose.apply(read_cloud(tmp_path / "house.e57").points)

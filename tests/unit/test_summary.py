@@ -1,5 +1,6 @@
 """Tables, text and page of partial runs."""
 
+import json
 import re
 
 import numpy as np
@@ -43,13 +44,17 @@ def results(tmp_path):
                 write_json(folder / f"registration/{variant}/{stage}.json", {})
             scale = {"scale": quantity(2.0 + k, "scene units per object unit")}
             write_json(folder / f"registration/{variant}/fine.json", fine | scale)
-            scores = {"fitness_source": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
+            scores = {"fitness": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
             write_json(folder / f"registration/{variant}/metrics.json", {"registration": scores})
-        completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1"), "nue_scene": quantity(None, "1")}
+        completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1")}
+        completion |= {
+            f"surface_variation{e}": quantity(v, "1") for e, v in (("", 0.1), ("_before", 0.3), ("_after", 0.2))
+        }
         write_json(folder / "metrics.json", {"completion": completion})
         write_json(folder / "fusion.json", {"added_points": quantity(30, "points")})
         variants = {variant: {"scale_error_pct": quantity(0.5 + k, "%")} for k, variant in enumerate(("full", "paper"))}
-        scene_scores = {f"scene_f_score_{w}": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
+        scene_scores = {f"scene_f_score_{w}_05pct": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
+        scene_scores |= {f"cloud_f_score_{e}pct": quantity(v, "1") for e, v in (("025", 0.71), ("2", 0.98))}
         write_json(
             folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "variants": variants, **scene_scores}
         )
@@ -87,7 +92,7 @@ def read(summary, name, **options):
 def test_registration_holds_every_object_and_variant(results):
     table = read(summarise(results), "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "registered"
-    assert table.loc[("house", "paper"), "fitness_source"] == pytest.approx(0.6)
+    assert table.loc[("house", "paper"), "fitness"] == pytest.approx(0.6)
     assert table.loc[("house", "paper"), "scale_error_pct"] == 1.5
     assert table.loc[("balloon", "full"), "reason"] == "weak"
     assert table.loc[("sculpture", "full"), "status"] == "failed"
@@ -102,11 +107,46 @@ def test_ablation_sets_the_variants_side_by_side(results):
     assert table.loc[("sculpture", "status"), "full"] == "failed"
 
 
-def test_completion_sets_value_null_and_scene_side_by_side(results):
+def test_completion_sets_value_null_before_and_after_side_by_side(results):
     table = read(summarise(results), "completion").set_index(["object", "measure"])
     assert table.loc[("house", "nue"), ["value", "null"]].tolist() == [1.25, 2.5]
-    assert np.isnan(table.loc[("house", "nue"), "scene"])
-    assert table.loc[("house", "scene_f_score_after"), "value"] == 0.9
+    assert table.loc[("house", "nue"), ["before", "after"]].isna().all()
+    assert table.loc[("house", "surface_variation"), ["value", "before", "after"]].tolist() == [0.1, 0.3, 0.2]
+    assert table.loc[("house", "scene_f_score_05pct"), ["before", "after"]].tolist() == [0.4, 0.9]
+
+
+def test_the_completed_scene_has_its_metrics_beside_their_nulls(results):
+    found = {"nue": 0.9, "nue_null": 1.7, "surface_variation": 0.05, "surface_variation_after": 0.04}
+    write_json(
+        results / "scenes/demo/metrics.json", {"completion": {name: quantity(v, "1") for name, v in found.items()}}
+    )
+    names = ("house", "balloon")
+    row = read(summarise(results, names), "scenes").iloc[0]
+    assert {name: row[name] for name in found} == found
+    scene = (results / "summary/summary.txt").read_text().split("object house")[0]
+    assert re.search(r"nue +0\.9 +1\.7 +- +-\n", scene) and re.search(r"surface_variation +0\.05 +- +- +0\.04\n", scene)
+
+
+def test_scores_against_truth_stand_at_their_thresholds(results):
+    summary = summarise(results)
+    objects = read(summary, "objects").set_index("object")
+    assert objects.loc["house", ["cloud_f_score_025pct", "cloud_f_score_2pct"]].tolist() == [0.71, 0.98]
+    lines = (summary / "summary.txt").read_text().splitlines()
+    start = next(n for n, line in enumerate(lines) if line.startswith("truth, at a share"))
+    assert lines[start].split()[-8:] == ["0.25", "%", "0.5", "%", "1", "%", "2", "%"]
+    assert lines[start + 1].split() == ["cloud", "F-score", "0.71", "-", "-", "0.98"]
+    assert lines[start + 2].split() == ["scene", "F-score", "-", "0.4", "->", "0.9", "-", "-"]
+
+
+def test_one_name_has_one_source(results):
+    """A score of another definition never fills in for one that is missing."""
+    fine = results / "objects/house/registration/full/fine.json"
+    content = json.loads(fine.read_text()) | {"f_score": quantity(0.5, "1"), "fitness": quantity(0.7, "1")}
+    write_json(fine, content)
+    metrics = results / "objects/house/registration/full/metrics.json"
+    write_json(metrics, {"registration": {"f_score": quantity(0.6, "1")}})
+    row = read(summarise(results), "registration").set_index(["object", "variant"]).loc[("house", "full")]
+    assert row["f_score"] == 0.5 and np.isnan(row["fitness"]) and np.isnan(row["fitness_f_score"])
 
 
 def test_objects_and_scenes(results):
@@ -138,7 +178,7 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "object house: registered" in text and "object balloon: unregistered" in text
     assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
     assert "dense.fallback: CPU used" in text
-    assert "F-score 0.4 -> 0.9" in text
+    assert "0.4 -> 0.9" in text
     assert "1 of 3 objects registered" in text
 
 
@@ -179,7 +219,7 @@ def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
     summary = summarise(results)
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("house", "full"), "status"] == "missing"
     assert np.isnan(read(summary, "objects").set_index("object").loc["house", "stage4_psnr_db"])
-    assert "F-score 0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
+    assert "0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
 
 
 def test_a_failed_variant_leaves_the_decision_of_the_full_one(results):

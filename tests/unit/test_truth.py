@@ -11,11 +11,12 @@ import pycolmap
 import pytest
 
 from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
+from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_between
 
@@ -183,14 +184,42 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     assert value(result, "stage1_depth_within_1pct") > 0.999
     assert value(result, "stage2_depth_within_1pct") == 0.0
     assert value(result, "cloud_accuracy_90") < 0.01
-    assert value(result, "cloud_completeness_1pct") > 0.97
-    assert value(result, "object_f_score") > 0.98
+    assert value(result, "cloud_recall_1pct") > 0.97
+    assert value(result, "placed_f_score_1pct") > 0.98
     assert value(result, "rotation_error_deg") < 1e-4
     assert value(result["variants"]["no_scale"], "scale_error_pct") == pytest.approx(2.0, abs=1e-4)
     assert value(result, "alignment_scale_error_pct") == pytest.approx(2.0, abs=1e-4)
-    assert value(result["variants"]["no_crop"], "object_f_score") is None
-    assert value(result, "scene_f_score_before") < 0.75 < 0.97 < value(result, "scene_f_score_after")
-    assert value(result, "scene_precision_before") > 0.99
+    assert value(result["variants"]["no_crop"], "placed_f_score_025pct") is None
+    # 2 % of scale, about a point 1.5 m away, moves the box by 2 to 5 cm: 0.25 % of its diagonal is 6 mm, 2 % is 5 cm.
+    scaled = [value(result["variants"]["no_scale"], f"placed_f_score_{e}") for e in ("025pct", "05pct", "1pct", "2pct")]
+    assert scaled == sorted(scaled) and scaled[0] < 0.1 and scaled[-1] > 0.8
+    assert value(result, "scene_f_score_before_1pct") < 0.75 < 0.97 < value(result, "scene_f_score_after_1pct")
+    assert value(result, "scene_precision_before_1pct") > 0.99
+    # Half of the box is there: recall is one half where the threshold is above the cloud's spacing, and less below it.
+    assert value(result, "scene_recall_before_025pct") < 0.3
+    for ending in ("1pct", "2pct"):
+        assert value(result, f"scene_recall_before_{ending}") == pytest.approx(0.5, abs=0.05)
+
+
+def test_scores_at_each_threshold_by_hand() -> None:
+    found = tr.scores_at(np.array([0.02, 0.04, 0.09, 0.3]), np.array([0.02, 0.3, 0.3, 0.3]), 10.0)
+    assert list(found) == ["025pct", "05pct", "1pct", "2pct"]
+    assert [scores["precision"] for scores in found.values()] == [0.25, 0.5, 0.75, 0.75]
+    assert [scores["recall"] for scores in found.values()] == [0.25] * 4
+    assert found["05pct"]["f_score"] == pytest.approx(2 * 0.5 * 0.25 / 0.75)
+
+
+def test_a_scene_is_scored_by_its_points_on_the_object_alone(planted: Path) -> None:
+    known = read_object_truth(
+        planted / "undistorted", planted / "truth/scene", planted / "truth/thing", samples=5000, seed=0
+    )
+    scene = TRUTH_FROM_SCENE.apply(read_cloud(planted / "after.ply").points)
+    beside = np.array([[1.1, 0, 0.5], [1.3, 0, 0.5], [0.0, 0.9, 0.02]])  # near the box; outside; on the ground
+    assert around_object(beside, known).tolist() == [True, False, False]
+    assert scene_scores(scene, known, known.surface)["1pct"]["precision"] > 0.999
+    spoiled = scene_scores(np.concatenate([scene, np.repeat(beside[:1], 30000, axis=0)]), known, known.surface)
+    assert spoiled["1pct"]["precision"] == pytest.approx(0.5, abs=0.05)
+    assert scene_scores(np.empty((0, 3)), known, known.surface)["2pct"]["f_score"] == 0.0
 
 
 def test_f_score_by_hand() -> None:

@@ -9,7 +9,7 @@ def results_of(wildcards):
         "frames.json",
         *(f"registration/{variant}/metrics.json" for variant in VARIANTS),
     ]
-    scene_ends = ["dense.json", "completed.json"]
+    scene_ends = ["dense.json", "completed.json", "metrics.json"]
     files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
     files += [f"results/objects/{name}/{end}" for name in OBJECTS for end in ends]
     files += [

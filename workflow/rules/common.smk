@@ -36,6 +36,13 @@ if workflow.is_main_process and workflow.global_resources["_nodes"].value is Non
     for name, limit in {"mem_mb": memory_mb(), "gpu": 1}.items():
         if name not in workflow.global_resources:
             workflow.register_resource(name, limit)
+    # Objects share the machine's cores: none of their jobs keeps several busy all the time, so two of one thread each are
+    # done sooner than one after the other with two.
+    OBJECT_THREADS = max(
+        1, min(8, (workflow.resource_settings.cores or 8) // max(1, len(OBJECTS)))
+    )
+else:
+    OBJECT_THREADS = 8
 
 
 wildcard_constraints:

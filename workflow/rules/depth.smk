@@ -29,7 +29,7 @@ rule train_depth:
         "results/benchmarks/train_depth/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 240 * attempt,
@@ -67,7 +67,7 @@ rule refine_depth:
         "results/benchmarks/refine_depth/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 240 * attempt,

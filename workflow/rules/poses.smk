@@ -18,7 +18,7 @@ rule find_poses:
         "results/benchmarks/find_poses/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 8
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,

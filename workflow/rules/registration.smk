@@ -30,7 +30,7 @@ rule align_models:
         "results/benchmarks/align_models/{object}.tsv"
     conda:
         "../../envs/registration.yaml"
-    threads: 8
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
@@ -125,7 +125,7 @@ rule register_coarsely:
         "results/benchmarks/register_coarsely/{object}-{variant}.tsv"
     conda:
         "../../envs/registration.yaml"
-    threads: 2
+    threads: min(2, OBJECT_THREADS)
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -169,7 +169,7 @@ rule register_finely:
         "results/benchmarks/register_finely/{object}-{variant}.tsv"
     conda:
         "../../envs/registration.yaml"
-    threads: 2
+    threads: min(2, OBJECT_THREADS)
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -211,7 +211,7 @@ rule register_as_paper:
         "results/benchmarks/register_as_paper/{object}.tsv"
     conda:
         "../../envs/registration.yaml"
-    threads: 2
+    threads: min(2, OBJECT_THREADS)
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,

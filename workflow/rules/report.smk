@@ -184,8 +184,12 @@ onerror:
         options = without_the_failed(job)
         if keep_going and options:
             run_anyway(job, options)
-    for job in held_up("view_scene") if keep_going else []:
-        run_anyway(job)
+    for job in held_up("compute_scene_metrics"):
+        if keep_going and Path(job.input.cloud).is_file():
+            run_anyway(job)
+    for job in held_up("view_scene"):
+        if keep_going and Path(job.input.completed).is_file():
+            run_anyway(job)
     for job in held_up("write_summary"):
         workflow.persistence.started(job)
     shell(

@@ -104,6 +104,7 @@ use rule extract_scene_features as extract_object_features with:
         "results/logs/extract_object_features/{object}.log",
     benchmark:
         "results/benchmarks/extract_object_features/{object}.tsv"
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -156,6 +157,7 @@ use rule match_scene_features as match_object_features with:
         "results/logs/match_object_features/{object}.log",
     benchmark:
         "results/benchmarks/match_object_features/{object}.tsv"
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
@@ -211,6 +213,7 @@ use rule map_scene_photos as map_object_photos with:
         "results/logs/map_object_photos/{object}.log",
     benchmark:
         "results/benchmarks/map_object_photos/{object}.tsv"
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,

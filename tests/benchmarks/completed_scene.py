@@ -1,0 +1,278 @@
+"""The completed scene of a finished demo against truth, for every way to fuse, and the harm that a bad object does.
+
+make demo, then PYTHONPATH=. python tests/benchmarks/completed_scene.py --results results
+The same with --harm True: displaced and scaled objects, and a bad object in a perfect scene.
+
+A quarter of an object's masks wrong needs its stages to run again: spoil the masks in a copy of the results, run up to
+objects/NAME/object.ply there, and give that cloud with --objects NAME --object CLOUD.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import open3d as o3d
+import pandas as pd
+from scipy.spatial import cKDTree
+
+from scenefuse.demo.cameras import read_cameras
+from scenefuse.fusion.fuse_object import FROM_SCENE, FusionSettings, fuse_clouds, with_provenance
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud
+from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.thresholds import THRESHOLDS
+from scenefuse.metrics.truth import registration_error
+from scenefuse.stage import StageError, read_json, run, threads, value
+from scenefuse.transforms import Array, Sim3
+
+# Points drawn on the true surface, as the workflow's evaluation draws them.
+SAMPLES = 60000
+# Harm, over the diagonal: the object's shift, its noise, how far a third of a bad one is moved; and its wrong scales.
+SHIFT, NOISE, MOVED = 0.02, 0.01, 0.1
+SCALES = (1.03, 1 / 1.03)
+# The modes that are shown at the scene's spacing and at the object's own; any other has its own density.
+THINNED = ("fill", "append", "replace")
+# Rows that are no fusion.
+BEFORE, ALONE = "scene before", "object alone"
+F_SCORES = [f"f_score_{ending}" for ending in THRESHOLDS]
+
+
+@dataclass(frozen=True)
+class Case:
+    """An object of a finished demo, the scene that it is added to, and the truth.
+
+    Attributes:
+        name: the object's.
+        object: its cloud, in its own frame.
+        scene: the whole scene.
+        crop: the scene's points on the object.
+        pose: scene_from_object.
+        truth_from_scene: from the scene's evaluation.
+        known: the object as it truly is.
+        surface: (M, 3) what is to be found of its surface, in the truth's frame.
+        results: the run's folder: photos and cameras are in objects/NAME/undistorted and scenes/demo/undistorted.
+    """
+
+    name: str
+    object: Cloud
+    scene: Cloud
+    crop: Cloud
+    pose: Sim3
+    truth_from_scene: Sim3
+    known: ObjectTruth
+    surface: Array
+    results: Path
+
+    @property
+    def diagonal(self) -> float:
+        """The object's true diagonal in the scene's unit."""
+        return self.known.diagonal / self.truth_from_scene.scale
+
+    @property
+    def true_pose(self) -> Sim3:
+        """scene_from_object by the true cameras on both sides."""
+        return self.truth_from_scene.inverse() @ self.known.fit.truth_from_model
+
+    @property
+    def shift(self) -> float:
+        """How far the pose puts the object's middle from its true place, over the diagonal."""
+        middle = self.known.fit.truth_from_model.inverse().apply(self.known.middle)
+        return registration_error(self.pose, self.true_pose, middle, self.diagonal).translation_over_diagonal
+
+
+def fuse(case: Case, settings: FusionSettings) -> Cloud:
+    """The completed scene. All calls of the library's fusion go through here."""
+    fusion = fuse_clouds(case.object, case.scene, case.crop, case.pose, settings)
+    kept = case.scene[fusion.kept]
+    return concatenate([kept, fusion.added]) if len(fusion.added) else kept
+
+
+def fusions() -> dict[str, FusionSettings]:
+    """Every mode that there is, by the name of its row."""
+    found = {}
+    for mode in get_args(get_type_hints(FusionSettings)["mode"]):
+        if mode not in THINNED:
+            found[mode] = FusionSettings(mode=mode)
+            continue
+        for density, name in ((1, "the scene's density"), (0, "its own density")):
+            found[f"{mode}, {name}"] = FusionSettings(mode=mode, density=density)
+    return found
+
+
+def read_case(results: Path, name: str, scene: Cloud) -> Case:
+    """One object of a finished demo; `scene` is the run's dense cloud."""
+    folder, truth = results / "objects" / name, results / "demo/demo/truth"
+    known = read_object_truth(folder / "undistorted", truth / "scene", truth / name, SAMPLES, seed=0)
+    fine = read_json(folder / "registration/full/fine.json")
+    if value(fine, "scene_from_object") is None:
+        raise StageError(f"{folder}: not registered ({value(fine, 'reason')}); run the demo again, or leave it out")
+    return Case(
+        name,
+        read_cloud(folder / "object.ply"),
+        scene,
+        read_cloud(folder / "registration/full/crop.ply"),
+        Sim3.from_matrix(np.array(value(fine, "scene_from_object"))),
+        Sim3.from_matrix(np.array(value(read_json(results / "scenes/demo/truth.json"), "truth_from_scene"))),
+        known,
+        surface_to_find(known, read_cameras(truth / "scene/cameras.json")),
+        results,
+    )
+
+
+def scores(case: Case, cloud: Cloud) -> dict[str, float]:
+    """F-score, precision and recall of a cloud in the scene's frame around the object, at each threshold."""
+    found = scene_scores(case.truth_from_scene.apply(cloud.points), case.known, case.surface)
+    return {f"{name}_{end}": score for end, of_end in found.items() for name, score in of_end.items()}
+
+
+def completed_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """The rows of the first table."""
+    yield {"cloud": BEFORE, **scores(case, case.scene)}
+    for name, settings in fusions().items():
+        yield {"cloud": name, **scores(case, fuse(case, settings))}
+    yield {"cloud": ALONE, **scores(case, case.object.transformed(case.pose))}
+
+
+def harmed(case: Case) -> Iterator[tuple[str, Case]]:
+    """What may go wrong with an object, each as a case of its own; first the object as it is."""
+    yield "nothing", case
+    for axis in range(3):
+        for sign in (1, -1):
+            yield f"displaced by {100 * SHIFT:g} %", replace(case, pose=displaced(case, axis, sign))
+    for factor in SCALES:
+        yield "scaled by 3 %", replace(case, pose=scaled(case, factor))
+    yield "bad object, perfect scene", perfect_scene(replace(case, object=bad_object(case)))
+
+
+def displaced(case: Case, axis: int, sign: int) -> Sim3:
+    """The pose moved along an axis of the object's frame."""
+    shift = sign * SHIFT * case.diagonal * case.pose.rotation[:, axis]
+    return replace(case.pose, translation=case.pose.translation + shift)
+
+
+def scaled(case: Case, factor: float) -> Sim3:
+    """The pose with the object larger or smaller about its middle."""
+    low, high = (np.percentile(case.object.points, q, axis=0) for q in (1, 99))
+    middle = case.pose.apply((low + high) / 2)
+    return Sim3(factor * case.pose.scale, case.pose.rotation, middle + factor * (case.pose.translation - middle))
+
+
+def bad_object(case: Case) -> Cloud:
+    """The object with noise, the third of it at one end of its first axis moved sideways."""
+    points, size = case.object.points, case.diagonal / case.pose.scale
+    moved = points + np.random.default_rng(0).normal(0, NOISE * size, points.shape)
+    moved[points[:, 0] > np.quantile(points[:, 0], 2 / 3), 1] += MOVED * size
+    return replace(case.object, points=moved)
+
+
+def perfect_scene(case: Case) -> Case:
+    """The scene's points on the object replaced by points of its true surface, the object at its true pose.
+
+    Colours are those of the object's cloud (before it was spoilt), which are nearest.
+    """
+    scene_from_truth = case.truth_from_scene.inverse()
+    caster = case.known.mesh.caster()
+    closest = caster.compute_closest_points(o3d.core.Tensor.from_numpy(case.surface.astype(np.float32)), threads())
+    normals = scene_from_truth.rotate(closest["primitive_normals"].numpy()).astype(np.float32)
+    good = read_cloud(case.results / "objects" / case.name / "object.ply")
+    colors = None
+    if good.colors is not None:
+        placed = case.known.fit.truth_from_model.apply(good.points)
+        colors = good.colors[cKDTree(placed).query(case.surface, workers=threads())[1]]
+    perfect = with_provenance(Cloud(scene_from_truth.apply(case.surface), normals, colors), FROM_SCENE)
+    own = around_object(case.truth_from_scene.apply(case.scene.points), case.known)
+    whole = concatenate([case.scene[~own], perfect])
+    return replace(case, scene=whole, crop=perfect, pose=case.true_pose)
+
+
+def harm_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """The rows of the second table: scores of the completed scene minus those of the scene before."""
+    for wrong, spoilt in harmed(case):
+        before = scores(spoilt, spoilt.scene)
+        for name, settings in fusions().items():
+            after = scores(spoilt, fuse(spoilt, settings))
+            yield {"wrong": wrong, "cloud": name, **{key: after[key] - before[key] for key in after}}
+
+
+def completed_scene(
+    *,
+    results: tuple[Path, ...] = (Path("results"),),
+    objects: tuple[str, ...] = (),
+    harm: bool = False,
+    object: Path | None = None,
+) -> None:
+    """Print the scene's F-scores around each object against truth, before and after every kind of fusion.
+
+    All scores go to bench/completed_scene.tsv (`harm`: bench/completed_scene_harm.tsv) in the first results folder.
+
+    Args:
+        results: folders of finished demos; several give mean and standard deviation.
+        objects: which; all that the demo has without it.
+        harm: print the second table instead: what a wrong pose or a bad object changes.
+        object: a cloud in the object's own frame that takes the place of the only one of `objects`.
+
+    Raises:
+        StageError: a folder holds no finished demo, or a cloud is given for several objects.
+    """
+    rows: list[dict[str, Any]] = []
+    for folder in results:
+        for case in read_cases(folder, objects, object):
+            for row in harm_rows(case) if harm else completed_rows(case):
+                rows.append({"run": str(folder), "object": case.name, "shift_over_diagonal": case.shift, **row})
+                print(f"{folder}, {case.name}: {row.get('wrong', '')} {row['cloud']}", flush=True)
+    table = pd.DataFrame(rows)
+    out = results[0] / f"bench/completed_scene{'_harm' if harm else ''}.tsv"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out, sep="\t", index=False, float_format="%.5f")
+    print(harm_summary(table) if harm else summary(table))
+
+
+def read_cases(results: Path, objects: tuple[str, ...], cloud: Path | None) -> Iterator[Case]:
+    """The objects of a finished demo."""
+    truth = results / "demo/demo/truth"
+    if not (results / "scenes/demo/truth.json").is_file():
+        raise StageError(f"{results} holds no finished demo (scenes/demo/truth.json); run make demo first")
+    names = objects or sorted(path.parent.name for path in truth.glob("*/mesh.ply"))
+    if cloud is not None and len(names) != 1:
+        raise StageError(f"--object {cloud} is one object's cloud; name that object with --objects")
+    scene = with_provenance(read_cloud(results / "scenes/demo/dense.ply"), FROM_SCENE)
+    for name in names:
+        case = read_case(results, name, scene)
+        yield case if cloud is None else replace(case, object=read_cloud(cloud))
+
+
+def summary(table: pd.DataFrame) -> str:
+    """F-scores of every row; and, at worst over the thresholds, how far it is above the better of its two sources."""
+    runs, heads = table["run"].nunique(), "".join(f"{f'{100 * share:g} %':>16}" for share in THRESHOLDS.values())
+    lines = [f"F-score at a share of the diagonal, {runs} run{'s' if runs > 1 else ''} (mean ± standard deviation)"]
+    for name, part in table.groupby("object", sort=False):
+        shift = f"{name}, {100 * part['shift_over_diagonal'].mean():.2f} % from its true place"
+        lines += ["", f"{shift:40s}{heads}   over the better source"]
+        scores = part.set_index(["run", "cloud"])[F_SCORES]
+        better = np.maximum(scores.xs(BEFORE, level="cloud"), scores.xs(ALONE, level="cloud"))
+        for cloud in part["cloud"].unique():
+            own = scores.xs(cloud, level="cloud")
+            over = "" if cloud in (BEFORE, ALONE) else f"{(own - better).mean().min():+25.3f}"
+            lines.append(f"{cloud:40s}" + "".join(_mean(own[column]) for column in F_SCORES) + over)
+    return "\n".join(lines)
+
+
+def harm_summary(table: pd.DataFrame) -> str:
+    """The least of the changes of F, over directions, scales and runs."""
+    heads = "".join(f"{f'{100 * share:g} %':>9}" for share in THRESHOLDS.values())
+    lines = ["F-score of the completed scene minus that of the scene before, at worst"]
+    for (name, wrong), part in table.groupby(["object", "wrong"], sort=False):
+        lines += ["", f"{f'{name}, wrong: {wrong}':48s}{heads}"]
+        for cloud, changes in part.groupby("cloud", sort=False)[F_SCORES]:
+            lines.append(f"  {cloud:46s}" + "".join(f"{change:+9.3f}" for change in changes.min()))
+    return "\n".join(lines)
+
+
+def _mean(values: pd.Series) -> str:
+    """A cell: mean, and standard deviation over several runs."""
+    return f"{f'{values.mean():.3f}' + (f' ± {values.std():.3f}' if len(values) > 1 else ''):>16}"
+
+
+if __name__ == "__main__":
+    run(completed_scene)
