@@ -25,7 +25,9 @@ LIGHT = np.array([-0.39, -0.55, 0.74])
 """Where the light comes from that shades what is not in photo colours: high, from the left of the first picture."""
 DARKEST = 0.45
 """Shade of a surface that faces away from the light."""
+_CODES = {"before": BEFORE, "both": BOTH, "after": AFTER}
 _SMOOTHED = 12
+"""Points whose normals are averaged before they are lit."""
 _RADIUS = 0.8
 """Radius over spacing: less than in the figures, as these discs face the camera from every side."""
 LEVELS = 31
@@ -109,39 +111,43 @@ def encode(view: View) -> tuple[dict[str, Any], bytes]:
     shown = cloud.fields["shown"]
     # What is shown before, then both, then after: each picture is one run of points.
     order = np.lexsort((_curve(cells), np.choose(shown, [1, 0, 2])))
-    cells, cloud, shown = cells[order], cloud[order], shown[order]
+    planes, about = _planes(cells[order], cloud[order])
+    middle = (low + high) / 2
+    about |= {
+        "points": {name: int((shown == code).sum()) for name, code in _CODES.items()},
+        "step": step.tolist(),
+        "corner": (low - middle).tolist(),
+        "low": (view.low - middle).tolist(),
+        "high": (view.high - middle).tolist(),
+        "azimuth": view.azimuth_deg,
+        "elevation": view.elevation_deg,
+        "unit": view.unit,
+        "sources": {str(number): name for number, name in view.sources.items()},
+        "levels": LEVELS,
+        "total": {"before": view.before_points, "after": view.after_points},
+        "planes": list(planes),
+    }
+    return about, zlib.compress(b"".join(plane.tobytes() for plane in planes.values()), 9)
+
+
+def _planes(cells: NDArray[np.int64], cloud: Cloud) -> tuple[dict[str, Bytes], dict[str, Any]]:
+    """The planes of points in their final order, and the ranges of what is packed between two ends."""
     planes: dict[str, Bytes] = {}
+    about: dict[str, Any] = {}
     for name, column in zip("xyz", cells.T):
         planes |= _difference_planes(name, column)
     if cloud.colors is not None:
         red, green, blue = cloud.colors.T
         # Bytes wrap around; differences to green compress better than red and blue do.
         planes |= {"green": green, "red_less_green": red - green, "blue_less_green": blue - green}
-    radii = _radii(cloud.points, shown)
-    planes["radius_before"], planes["radius_after"], radius_range = _log_bytes(radii)
+    radii = _radii(cloud.points, cloud.fields["shown"])
+    planes["radius_before"], planes["radius_after"], about["radius"] = _log_bytes(radii)
     planes["shade"] = np.rint(LEVELS * _shade(cloud)).astype(np.uint8)
     planes |= {name: cloud.fields[name].astype(np.uint8) for name in ("source", "evidence") if name in cloud.fields}
-    about: dict[str, Any] = {
-        "points": {name: int((shown == code).sum()) for name, code in _CODES.items()},
-        "step": step.tolist(),
-        "corner": (low - (low + high) / 2).tolist(),
-        "low": (view.low - (low + high) / 2).tolist(),
-        "high": (view.high - (low + high) / 2).tolist(),
-        "azimuth": view.azimuth_deg,
-        "elevation": view.elevation_deg,
-        "unit": view.unit,
-        "sources": {str(number): name for number, name in view.sources.items()},
-        "levels": LEVELS,
-        "radius": radius_range,
-        "total": {"before": view.before_points, "after": view.after_points},
-    }
-    if np.isfinite(cloud.fields.get("deviation", np.array([np.nan]))).any():
-        planes["deviation"], about["deviation"] = _deviation(cloud.fields["deviation"])
-    about["planes"] = list(planes)
-    return about, zlib.compress(b"".join(plane.tobytes() for plane in planes.values()), 9)
-
-
-_CODES = {"before": BEFORE, "both": BOTH, "after": AFTER}
+    deviation = cloud.fields.get("deviation")
+    if deviation is not None and (deviation > 0).any():
+        planes["deviation"], about["deviation"] = _deviation(deviation)
+    return planes, about
 
 
 def _curve(cells: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -197,7 +203,7 @@ def _smooth(points: Array, normals: NDArray[np.float32]) -> NDArray[np.float32]:
 def _deviation(values: NDArray[np.float32]) -> tuple[Bytes, list[float]]:
     """Standard deviations as 1 to LEVELS in equal ratios between their 2nd and 98th percentile; 0: there is none."""
     known = np.isfinite(values) & (values > 0)
-    low, high = (float(end) for end in np.percentile(values[known], [2, 98])) if known.any() else (1.0, 1.0)
+    low, high = (float(end) for end in np.percentile(values[known], [2, 98]))
     ratio = np.log(max(high / low, 1.0 + 1e-9))
     share = np.clip(np.log(np.where(known, values, low) / low) / ratio, 0, 1)
     return np.where(known, 1 + np.rint((LEVELS - 1) * share), 0).astype(np.uint8), [low, high]

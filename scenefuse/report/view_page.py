@@ -4,6 +4,7 @@ import base64
 import json
 import zlib
 from html import escape
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -69,8 +70,9 @@ def view_library() -> str:
     package = Path(k3d.__file__).parent
     source = (package / "static/standalone.js").read_bytes()
     packed = base64.b64encode(zlib.compress(source, 9)).decode()
-    notices = (package / "static/standalone.js.LICENSE.txt").read_text(encoding="utf-8").strip()
-    credit = f"K3D-jupyter {k3d.__version__}, MIT licence, https://github.com/K3D-tools/K3D-jupyter\n{notices}"
+    licence = metadata.distribution("k3d").read_text("licenses/LICENSE.txt") or "MIT licence"
+    notices = (package / "static/standalone.js.LICENSE.txt").read_text(encoding="utf-8")
+    credit = f"K3D-jupyter {k3d.__version__}\n{licence.strip()}\nIn it:\n{notices.strip()}"
     return f'<!-- {credit.replace("--", "- -")} -->\n<script type="text/plain" id="k3d">{packed}</script>'
 
 

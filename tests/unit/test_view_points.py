@@ -154,6 +154,12 @@ def test_a_view_without_colours_and_normals_and_of_one_point_is_packed():
     assert "green" not in planes and "deviation" not in planes and planes["shade"][0] == about["levels"]
 
 
+def test_deviations_that_say_nothing_are_left_out():
+    for values in (np.zeros(30, dtype=np.float32), np.full(30, np.nan, dtype=np.float32)):
+        scene = square(30, deviation=values)
+        assert "deviation" not in encode(view_of(merge(scene, scene)))[0]
+
+
 def test_a_written_view_is_read_as_it_was(tmp_path):
     view = view_of(merge(square(30), square(30, 2)), {0: "scene", 1: "house", 2: "shed"}, (30, 30))
     assert read_view(tmp_path) is None
