@@ -68,9 +68,13 @@ class Browser:
         return self.window.find_element("css selector", selector)
 
     def picture(self, selector: str) -> np.ndarray:
-        """(H, W, 3) pixels of an element, as they are on the screen."""
-        data = np.frombuffer(self.find(selector).screenshot_as_png, dtype=np.uint8)
-        return cv2.cvtColor(cv2.imdecode(data, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        """(H, W, 3) pixels of an element, as they are on the screen once they no longer change."""
+        data = b""
+        for _ in range(20):
+            last, data = data, self.find(selector).screenshot_as_png
+            if data == last:
+                break
+        return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
     def drag(self, element, right: float, down: float) -> None:
         self._actions().drag_and_drop_by_offset(element, right, down).perform()
