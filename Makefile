@@ -10,6 +10,7 @@ demo: .venv/ready
 	@cat results/summary/summary.txt
 
 test: .venv/ready
+	envs/browser.sh
 	pip install --quiet --disable-pip-version-check -r tests/requirements.txt
 	pytest
 

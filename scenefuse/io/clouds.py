@@ -94,6 +94,11 @@ def voxel_average(cloud: Cloud, voxel: float) -> Cloud:
     return Cloud(_group_means(cloud.points, group, counts), normals, colors)
 
 
+def occupied_voxels(points: NDArray[np.float64], voxel: float) -> int:
+    """How many points `voxel_downsample` would leave."""
+    return len(_voxels(points, voxel)[1])
+
+
 def _voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The occupied voxel of every point (N,), numbered from 0, and the points in each."""
     cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)

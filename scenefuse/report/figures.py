@@ -1,75 +1,28 @@
 """The figures of an object and of a scene: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.fusion.fuse_object import is_placed
 from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
-from scenefuse.report.object_sheet import SIDES_DEG, inner, object_sheet, upright
+from scenefuse.report.object_sheet import SIDES_DEG, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
-from scenefuse.report.values import find, flatten, number
-from scenefuse.stage import StageError, atomic_directory, read_json, value
-from scenefuse.transforms import Array, Sim3, rotation_between
+from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
+from scenefuse.report.view_file import View, write_view
+from scenefuse.report.view_points import REMOVED, merge, thin, within
+from scenefuse.stage import atomic_directory
+from scenefuse.transforms import Array
 from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
-
-
-@dataclass(frozen=True)
-class _Join:
-    """The clouds of one object in the scene's frame, turned so that z points up.
-
-    Attributes:
-        before: the scene around the object.
-        after: the same part of the scene after fusion.
-        crop: the object's part of the scene, as registration saw it.
-        object_cloud: the object at its estimated pose, or None when there is no pose.
-        framed: (N, 3) points every picture has to show.
-        fused: whether the object was fused.
-        decision: one line: status, reason, scores.
-    """
-
-    before: Cloud
-    after: Cloud
-    crop: Cloud
-    object_cloud: Cloud | None
-    framed: Array
-    fused: bool
-    decision: str
-
-
-@dataclass(frozen=True)
-class FigureInputs:
-    """What the figures of one object show."""
-
-    name: str
-    """The object's name, for titles."""
-    scene: Path
-    """The scene's dense cloud, scene frame."""
-    fused_scene: Path
-    """The whole scene after fusion, with the field `source` (0 scene, 1 object)."""
-    crop: Path
-    """The object's part of the scene, scene frame."""
-    crop_json: Path
-    """JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent."""
-    object_cloud: Path
-    """The object's cloud in its own frame."""
-    fine_json: Path
-    """JSON of the fine registration: status, reason, scene_from_object."""
-    metrics_json: Path
-    """JSON of the metrics, for the scores in titles."""
-    workspace: Path
-    """The object's undistorted COLMAP workspace (images/, sparse/)."""
-    masks: Path
-    """Folder of the object's masks, {photo}.png."""
-    stages: list[Path]
-    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
+Discs = list[tuple[Cloud, NDArray[np.float32]]]
+"""Clouds and the radii of their points' discs."""
+VIEW_POINTS = 150_000
+"""Of an object's 3D view: with three objects and a scene, the page stays well below 15 MB."""
 
 
 def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
@@ -78,21 +31,23 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
     registration.png (object over crop, with the decision) and object.png (frames, masks, depth of the four stages,
-    renders, the object's cloud).
+    renders, the object's cloud); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
-        figures: output folder of PNG files, each below 1 MB.
+        figures: output folder of PNG files, each below 1 MB, and the view.
 
     Raises:
         StageError: a cloud or JSON is missing or damaged.
     """
-    join = _load_join(inputs)
+    join = read_surroundings(inputs)
+    clouds = [(cloud, point_radii(cloud.points)) for cloud in (join.before, join.after)]
+    azimuth_deg = _most_changed(clouds, join.framed)
     pictures = {
-        "before_after": _before_after(inputs.name, join),
-        "provenance": _provenance(inputs.name, join),
+        "before_after": _before_after(inputs.name, join, clouds),
+        "provenance": _provenance(inputs.name, join, clouds[1][1]),
         "registration": _registration(inputs.name, join),
-        **dict(zip(("before", "after"), _most_changed(join))),
+        **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
     }
     cloud = join.object_cloud or upright(read_cloud(inputs.object_cloud), inputs.workspace)
     pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
@@ -100,6 +55,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         for name, picture in pictures.items():
             save_png(folder / f"{name}.png", picture)
             print(f"{name}.png", flush=True)
+        if join.fused:
+            write_view(folder, _view(inputs.name, join, azimuth_deg))
 
 
 def draw_scene(
@@ -153,57 +110,6 @@ def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict
     return to_image(sheet)
 
 
-def _load_join(inputs: FigureInputs) -> _Join:
-    """Read the clouds and turn them upright; the surroundings are cut to a box around the object."""
-    fine, scores = read_json(inputs.fine_json), flatten(read_json(inputs.metrics_json))
-    up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
-    level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
-    crop = read_cloud(inputs.crop).transformed(level)
-    pose = fine.get("scene_from_object", {}).get("value")
-    placed = None
-    if pose is not None:
-        placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
-    fused = is_placed(fine)
-    shown = placed if fused and placed is not None else crop
-    low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
-    reach = np.array([0.35, 0.35, 0.15]) * float(np.linalg.norm(high - low))
-    before, after = (
-        _inside(read_cloud(path).transformed(level), low - reach, high + reach)
-        for path in (inputs.scene, inputs.fused_scene)
-    )
-    if not len(before):
-        raise StageError(
-            f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
-        )
-    return _Join(before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores))
-
-
-def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
-    """One line: the status, the reason of a refusal, and the scores that there are."""
-    fields = flatten(report) | scores
-    parts = [str(value(report, "status"))]
-    reason = find(fields, "reason")
-    if parts[0] != "registered" and reason:
-        parts.append(str(reason))
-    for label, keys in (
-        ("scale", ("scale",)),
-        ("F-score", ("f_score",)),
-        ("fitness", ("registration.fitness",)),
-        ("inlier RMSE / diagonal", ("registration.inlier_rmse_over_diagonal",)),
-        ("normal consistency", ("registration.normal_consistency",)),
-        ("margin", ("margin",)),
-    ):
-        found = find(fields, *keys)
-        if isinstance(found, (int, float)):
-            parts.append(f"{label} {number(found)}")
-    return ", ".join(parts)
-
-
-def _inside(cloud: Cloud, low: Array, high: Array) -> Cloud:
-    """The points within an axis-aligned box."""
-    return cloud[np.all((cloud.points >= low) & (cloud.points <= high), axis=1)]
-
-
 def _box_corners(points: Array) -> Array:
     """The eight corners of the points' bounding box, x slowest."""
     low, high = points.min(0), points.max(0)
@@ -215,23 +121,23 @@ def _added(cloud: Cloud) -> NDArray[np.bool_]:
     return cloud.fields["source"] == 1 if "source" in cloud.fields else np.zeros(len(cloud), dtype=bool)
 
 
-def _radii(cloud: Cloud) -> NDArray[np.float32]:
-    """Disc radii from the spacing of scene points and of added points each: neither closes the other's holes."""
-    radii, added = np.zeros(len(cloud), dtype=np.float32), _added(cloud)
-    for part in (added, ~added):
-        if part.any():
-            radii[part] = point_radii(cloud.points[part])
-    return radii
+def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
+    """The 3D view of an object: its surroundings before and after, thinned."""
+    points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
+    points.fields["near"][:] = within(points.points, low, high)
+    thinned = thin(points, VIEW_POINTS)
+    found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
+    sources = {0: "scene"} | {number: f"added from {name}" for number in found}
+    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, len(join.before), len(join.after))
 
 
-def _before_after(name: str, join: _Join) -> Image:
+def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
     """Rows before and after; four sides from slightly above, and from below with the surroundings cut away."""
     tile = (350, 290)
     low, high = join.framed.min(0), join.framed.max(0)
     margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
     rows: list[list[Image | None]] = []
-    for cloud in (join.before, join.after):
-        radii = _radii(cloud)
+    for cloud, radii in clouds:
         sides = [render(cloud, orbit_camera(join.framed, a, 22.0, tile), radii) for a in SIDES_DEG]
         near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
         from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
@@ -241,9 +147,9 @@ def _before_after(name: str, join: _Join) -> Image:
     return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
 
 
-def _provenance(name: str, join: _Join) -> Image:
+def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
     """Scene points grey, added points coloured."""
-    tile, added, radii = (430, 350), _added(join.after), _radii(join.after)
+    tile, added = (430, 350), _added(join.after)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = (np.where(added[:, None], ADDED_COLOR, SCENE_COLOR) * shade).astype(np.uint8)
     images: list[Image | None] = [
@@ -254,9 +160,10 @@ def _provenance(name: str, join: _Join) -> Image:
     return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
 
 
-def _registration(name: str, join: _Join) -> Image:
+def _registration(name: str, join: Surroundings) -> Image:
     """The object over the crop from three sides."""
-    tile, radii = (480, 390), 0.6 * point_radii(join.crop.points)
+    tile, dots = (480, 390), point_radii(join.crop.points)
+    radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
     colors, framed = np.tile(np.array(CROP_COLOR, dtype=np.uint8), (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])
@@ -274,18 +181,21 @@ def _registration(name: str, join: _Join) -> Image:
     return draw_sheet(Sheet(f"{name}: registration", note, [images], [], list(views), {}, tile))
 
 
-def _most_changed(join: _Join) -> tuple[Image, Image]:
-    """The same large view before and after, from the azimuth where the pictures differ most."""
-    clouds = [(cloud, _radii(cloud)) for cloud in (join.before, join.after)]
+def _large(
+    clouds: Discs, framed: Array, azimuth_deg: float, size_px: tuple[int, int] = (840, 600)
+) -> tuple[Image, Image]:
+    """The same view before and after."""
+    camera = orbit_camera(framed, azimuth_deg, 15.0, size_px, margin=0.1)
+    first, second = (render(cloud, camera, radii) for cloud, radii in clouds)
+    return first, second
 
-    def pair(azimuth_deg: float, size_px: tuple[int, int]) -> tuple[Image, Image]:
-        camera = orbit_camera(join.framed, azimuth_deg, 15.0, size_px, margin=0.1)
-        first, second = (render(cloud, camera, radii) for cloud, radii in clouds)
-        return first, second
 
+def _most_changed(clouds: Discs, framed: Array) -> float:
+    """The azimuth, in degrees, from which before and after differ most."""
     azimuths = np.arange(0.0, 360.0, 45.0)
-    changes = [float(np.abs(np.subtract(*pair(a, (120, 90)), dtype=np.float32)).mean()) for a in azimuths]
-    return pair(float(azimuths[int(np.argmax(changes))]), (840, 600))
+    pairs = (_large(clouds, framed, float(azimuth), (120, 90)) for azimuth in azimuths)
+    changes = [float(np.abs(np.subtract(first, second, dtype=np.float32)).mean()) for first, second in pairs]
+    return float(azimuths[int(np.argmax(changes))])
 
 
 def _brightness(cloud: Cloud) -> Array:

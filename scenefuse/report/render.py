@@ -1,9 +1,9 @@
 """Pictures of point clouds without OpenGL: discs splatted into a z-buffer, blended and shaded, on any headless machine.
 
-Every point is a disc facing the camera whose radius follows the local spacing, so that a sampled surface closes and a
-hole stays a hole. A first pass keeps the nearest depth of each pixel, a second blends the discs that lie on that
-surface (surface splatting without the elliptical kernel: Zwicker et al. 2001, Botsch et al. 2005). Shading is eye-dome
-lighting on the depth buffer (Boucheny 2009) and a head light on the normals where the cloud has them.
+Every point is a disc whose radius follows the local spacing, so that a sampled surface closes and a hole stays a hole;
+it lies in the surface where the cloud has normals and faces the camera where it has none. A first pass keeps the
+nearest depth of each pixel, a second blends the discs that lie on that surface (surface splatting: Zwicker et al. 2001,
+Botsch et al. 2005). Shading is eye-dome lighting on the depth buffer (Boucheny 2009) and a head light on the normals.
 """
 
 from dataclasses import dataclass, replace
@@ -21,6 +21,14 @@ Array = NDArray[np.float64]
 
 WHITE = (255, 255, 255)
 _SUPERSAMPLING = 2
+_EDGE_ON = 0.65
+"""Least cosine between a disc's normal and the ray: its width over its length."""
+_STRAY = 1.4
+"""Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small."""
+_AT_ONCE = 1_000_000
+"""Points whose neighbours are looked up at once: bounds the memory."""
+_SHARPNESS = 3
+"""Power of the blending weight's fall: with more, single points show; with less, fine texture blurs."""
 
 
 @dataclass(frozen=True)
@@ -103,16 +111,27 @@ def orbit_camera(
     return Camera(rotation, middle + distance * direction, float(focal), *size_px)
 
 
-def point_radii(points: Array, neighbours: int = 4, factor: float = 0.75, limit: float = 2.0) -> NDArray[np.float32]:
-    """Disc radii (N,) in the cloud's unit: `factor` x the distance to the k-th neighbour, within `limit` x its median.
+def point_radii(points: Array, neighbours: int = 4, factor: float = 0.9, limit: float = 3.0) -> NDArray[np.float32]:
+    """Disc radii (N,) in the cloud's unit: `factor` x the spacing around a point, at most `limit` x its median.
 
-    The limit keeps a lone point small, so that sparse samples do not close a hole.
+    The spacing is the distance to the k-th neighbour, but not more than that of the neighbours themselves: a stray
+    point off a dense surface is as small as the surface's points, and a sparse surface beside a dense one still closes.
     """
     if len(points) <= neighbours:
         return np.full(len(points), max(float(np.ptp(points, axis=0).max()) * 0.01, 1e-9) if len(points) else 0.0, "f4")
-    distance = cKDTree(points).query(points, k=[neighbours + 1], workers=threads())[0][:, 0]
-    middle = float(np.median(distance)) or 1e-9
-    return (factor * np.clip(distance, middle / limit, middle * limit)).astype(np.float32)
+    tree, most = cKDTree(points), min(2 * neighbours, len(points) - 1)
+    reach, around = np.empty(len(points), dtype=np.float32), np.empty(len(points), dtype=np.float32)
+    nearest = np.empty((len(points), most), dtype=np.int32)
+    parts = [slice(start, start + _AT_ONCE) for start in range(0, len(points), _AT_ONCE)]
+    for part in parts:
+        distance, index = tree.query(points[part], k=most + 1, workers=threads())
+        reach[part], nearest[part] = distance[:, neighbours], index[:, 1:]
+    for part in parts:
+        around[part] = np.median(reach[nearest[part]], axis=1)
+    middle = float(np.median(reach)) or 1e-9
+    # Points that coincide still get a disc.
+    spacing = np.clip(reach, around / 2, _STRAY * around)
+    return (factor * np.clip(spacing, middle / 20, middle * limit)).astype(np.float32)
 
 
 def render(
@@ -143,15 +162,17 @@ def render(
     )
     rgb = _base_colors(cloud, colors) * _head_light(cloud, camera, light)[:, None]
     pixels, depth = fine.project(cloud.points)
+    slopes = _slopes(cloud, fine, pixels)
     radius = np.broadcast_to(np.asarray(radii, dtype=np.float32), (len(cloud),))
     near = max(1e-9, 1e-3 * float(np.median(depth))) if len(cloud) else 0.0
     scale = np.full(len(cloud), fine.focal_px) if camera.orthographic else fine.focal_px / np.maximum(depth, near)
     # Discs of more than a sixth of the image are points next to the lens: they would only hide the rest.
     radius_px = np.clip(radius * scale, 0.75, min(fine.width_px, fine.height_px) / 6.0).astype(np.float32)
     shown = depth > near
-    picture, surface = _splat(
+    picture, surface, size = _splat(
         pixels[shown].astype(np.float32),
         depth[shown].astype(np.float32),
+        slopes[shown],
         radius_px[shown],
         np.ascontiguousarray(radius[shown]),
         rgb[shown].astype(np.float32),
@@ -162,7 +183,7 @@ def render(
     if eye_dome > 0 and covered.any():
         low, high = np.percentile(surface[covered], [2, 98])
         step = np.float32(max(high - low, 1e-6) * 0.02)
-        picture *= _eye_dome(surface, np.float32(1.2 * np.median(radius)), step, np.float32(eye_dome))[..., None]
+        picture *= _eye_dome(surface, 1.2 * size, step, np.float32(eye_dome))[..., None]
     picture[~covered] = np.asarray(background, dtype=np.float32)
     shape = (camera.height_px, _SUPERSAMPLING, camera.width_px, _SUPERSAMPLING, 3)
     return np.clip(picture.reshape(shape).mean((1, 3)) + 0.5, 0, 255).astype(np.uint8)
@@ -186,32 +207,49 @@ def _head_light(cloud: Cloud, camera: Camera, light: float) -> NDArray[np.float3
     return ((1.0 - light + light * cosine) * np.where(facing < 0, 1.0 - light / 3.0, 1.0)).astype(np.float32)
 
 
+def _slopes(cloud: Cloud, camera: Camera, pixels: Array) -> NDArray[np.float32]:
+    """(N, 2) growth of depth along x and y in the tangent planes, lengths in units; zeros without normals."""
+    if cloud.normals is None:
+        return np.zeros((len(cloud), 2), dtype=np.float32)
+    normals = cloud.normals @ camera.cam_from_world.T.astype(np.float32)
+    along = normals[:, 2]
+    if not camera.orthographic:
+        rays = (pixels - np.array([camera.width_px, camera.height_px]) / 2) / camera.focal_px
+        along = along + (normals[:, :2] * rays).sum(1)
+    # A disc seen edge-on keeps some width: normals are not exact.
+    along = np.where(along < 0, -1, 1) * np.maximum(np.abs(along), _EDGE_ON)
+    return np.asarray(-normals[:, :2] / along[:, None], dtype=np.float32)
+
+
 @njit(cache=True, nogil=True)
-def _splat(pixels, depth, radius_px, radius, rgb, width, height):  # type: ignore[no-untyped-def]
-    """Colours (H, W, 3) and nearest depths (H, W; inf where empty) of facing discs, both float32."""
+def _splat(pixels, depth, slopes, radius_px, radius, rgb, width, height):  # type: ignore[no-untyped-def]
+    """Colours (H, W, 3), nearest depths (H, W; inf where empty) and radii of the nearest discs (H, W), all float32."""
     surface = np.full((height, width), np.inf, dtype=np.float32)
+    size = np.zeros((height, width), dtype=np.float32)
     for i in range(len(depth)):
         x, y, r = pixels[i, 0], pixels[i, 1], radius_px[i]
         for v in range(max(0, int(np.floor(y - r))), min(height, int(np.floor(y + r)) + 1)):
             for u in range(max(0, int(np.floor(x - r))), min(width, int(np.floor(x + r)) + 1)):
-                q = ((u + 0.5 - x) ** 2 + (v + 0.5 - y) ** 2) / (r * r)
+                a, b = u + 0.5 - x, v + 0.5 - y
+                t = a * slopes[i, 0] + b * slopes[i, 1]
+                q = (a * a + b * b + t * t) / (r * r)
                 if q <= 1.0:
                     # Bent away from the camera towards the rim, so that the nearest disc wins in its own middle.
-                    z = depth[i] + np.float32(0.5) * radius[i] * np.float32(q)
+                    z = depth[i] + radius[i] * np.float32(t / r + 0.5 * q)
                     if z < surface[v, u]:
                         surface[v, u] = z
+                        size[v, u] = radius[i]
     picture = np.zeros((height, width, 3), dtype=np.float32)
     total = np.zeros((height, width), dtype=np.float32)
     for i in range(len(depth)):
         x, y, r = pixels[i, 0], pixels[i, 1], radius_px[i]
-        reach = depth[i] - np.float32(1.5) * radius[i]
         for v in range(max(0, int(np.floor(y - r))), min(height, int(np.floor(y + r)) + 1)):
             for u in range(max(0, int(np.floor(x - r))), min(width, int(np.floor(x + r)) + 1)):
-                if reach > surface[v, u]:
-                    continue
-                q = ((u + 0.5 - x) ** 2 + (v + 0.5 - y) ** 2) / (r * r)
-                if q <= 1.0:
-                    w = np.float32(1.02 - q) ** 2
+                a, b = u + 0.5 - x, v + 0.5 - y
+                t = a * slopes[i, 0] + b * slopes[i, 1]
+                q = (a * a + b * b + t * t) / (r * r)
+                if q <= 1.0 and depth[i] + radius[i] * np.float32(t / r - 1.5) <= surface[v, u]:
+                    w = np.float32(1.02 - q) ** _SHARPNESS
                     total[v, u] += w
                     for c in range(3):
                         picture[v, u, c] += w * rgb[i, c]
@@ -220,14 +258,14 @@ def _splat(pixels, depth, radius_px, radius, rgb, width, height):  # type: ignor
             if total[v, u] > 0:
                 for c in range(3):
                     picture[v, u, c] /= total[v, u]
-    return picture, surface
+    return picture, surface, size
 
 
 @njit(cache=True, nogil=True)
 def _eye_dome(surface, dead, step, strength):  # type: ignore[no-untyped-def]
     """(H, W) factor that darkens a pixel whose neighbours are nearer (eye-dome lighting).
 
-    Differences up to `dead` are the relief of the discs themselves; from `dead + step` on the full shade is reached.
+    Differences up to `dead` (H, W) are the relief of the discs themselves; from `dead + step` on the shade is full.
     """
     height, width = surface.shape
     shade = np.ones((height, width), dtype=np.float32)
@@ -242,6 +280,6 @@ def _eye_dome(surface, dead, step, strength):  # type: ignore[no-untyped-def]
                     for du in (-ring, 0, ring):
                         a, b = v + dv, u + du
                         if 0 <= a < height and 0 <= b < width and np.isfinite(surface[a, b]):
-                            total += min(max((z - surface[a, b] - dead) / step, 0.0), 1.0)
+                            total += min(max((z - surface[a, b] - dead[v, u]) / step, 0.0), 1.0)
             shade[v, u] = np.exp(-strength * total / 16.0 * 1.5)
     return shade

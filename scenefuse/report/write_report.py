@@ -3,6 +3,7 @@
 import base64
 import csv
 import io
+from dataclasses import replace
 from html import escape
 from pathlib import Path
 
@@ -10,7 +11,14 @@ from PIL import Image as Picture
 
 from scenefuse.report.page import SCRIPT, STYLE
 from scenefuse.report.values import number
+from scenefuse.report.view_file import View, read_view
+from scenefuse.report.view_page import view_library, view_section
+from scenefuse.report.view_points import thin
+from scenefuse.report.view_script import VIEW_SCRIPT, VIEW_STYLE
 from scenefuse.stage import StageError, atomic_file
+
+PAGE_POINTS = 700_000
+"""Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points."""
 
 _TABLES = {
     "scenes": "Scenes",
@@ -58,13 +66,13 @@ _OBJECT_FIGURES = {
 
 
 def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], title: str, report: Path) -> None:
-    """Write the report page of a run: before and after of every object, figures, tables with notes, the text summary.
+    """Write the report page of a run: every object and scene in 3D, figures, tables with notes, the text summary.
 
     Everything is in the one file: no script, font or picture is fetched.
 
     Args:
         summary: folder with the summary's TSV files and summary.txt; an absent table is left out.
-        scenes: result folders of the scenes; scene.png in it is shown.
+        scenes: result folders of the scenes; scene.png and the 3D view in it are shown.
         objects: result folders of the objects; figures/ in it is shown. One without figures is named as such.
         title: heading of the page.
         report: output, one HTML file.
@@ -75,30 +83,41 @@ def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], titl
     text = summary / "summary.txt"
     if not text.is_file():
         raise StageError(f"{text} does not exist; write the summary first")
+    views = _views([*(f / "figures" for f in objects), *scenes])
     tables = {name: _read_table(summary / f"{name}.tsv") for name in _TABLES}
     links = [*(f.name for f in objects), *(f"table-{name}" for name in _TABLES if tables[name])]
     body = [
         f"<h1>{escape(title)}</h1>",
         "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
         "<nav>" + "".join(f'<a href="#{escape(n)}">{escape(n.removeprefix("table-"))}</a>' for n in links) + "</nav>",
-        *(_object_section(folder, tables["registration"]) for folder in objects),
-        *(_scene_section(folder, tables["scenes"]) for folder in scenes),
+        *(_object_section(folder, tables["registration"], views.get(folder / "figures")) for folder in objects),
+        *(_scene_section(folder, tables["scenes"], views.get(folder)) for folder in scenes),
         *(_table_section(name, rows) for name, rows in tables.items() if rows),
         f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
     ]
-    content = "\n".join(body)
+    style, script = (STYLE + VIEW_STYLE, SCRIPT + VIEW_SCRIPT) if views else (STYLE, SCRIPT)
+    content = "\n".join([*body, *([view_library()] if views else [])])
     page = (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{STYLE}</style>\n</head>\n'
-        f"<body>\n{content}\n<script>{SCRIPT}</script>\n</body>\n</html>\n"
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{style}</style>\n</head>\n'
+        f"<body>\n{content}\n<script>{script}</script>\n</body>\n</html>\n"
     )
     with atomic_file(report) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{report}: {len(page) / 1e6:.1f} MB", flush=True)
 
 
-def _scene_section(folder: Path, scenes: list[dict[str, str]]) -> str:
-    """Heading, the completed scene's files, and the figure; nothing without a figure."""
+def _views(folders: list[Path]) -> dict[Path, View]:
+    """The 3D views that there are, by their folders, thinned to what the page holds."""
+    found = {folder: view for folder in folders if (view := read_view(folder)) is not None}
+    most = PAGE_POINTS / max(PAGE_POINTS, sum(len(view.cloud) for view in found.values()))
+    return {
+        folder: replace(view, cloud=thin(view.cloud, int(most * len(view.cloud)))) for folder, view in found.items()
+    }
+
+
+def _scene_section(folder: Path, scenes: list[dict[str, str]], view: View | None) -> str:
+    """Heading, the completed scene's files, its 3D view, and the figure; nothing without a figure."""
     path = folder / "scene.png"
     if not path.is_file():
         return ""
@@ -110,11 +129,13 @@ def _scene_section(folder: Path, scenes: list[dict[str, str]]) -> str:
             f"registered objects in it ({escape(row['completed_by'])}), {escape(row['completed_points'])} points; "
             "<code>source</code> says where each is from, <code>completed.json</code> what its numbers mean.</p>"
         )
+    if view is not None:
+        parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view))
     return "\n".join([*parts, _picture(path, "From above and obliquely: cameras red, objects boxed.")])
 
 
-def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
-    """Heading with the decision, before/after slider, the figures that exist."""
+def _object_section(folder: Path, registration: list[dict[str, str]], view: View | None) -> str:
+    """Heading with the decision, the 3D view, before/after slider, the figures that exist."""
     row = next((r for r in registration if r.get("object") == folder.name), {})
     status, reason = row.get("status", "-"), row.get("reason", "-")
     badge = f'<span class="badge {"ok" if status == "registered" else "no"}">{escape(status)}</span>'
@@ -122,7 +143,13 @@ def _object_section(folder: Path, registration: list[dict[str, str]]) -> str:
     if reason not in ("-", ""):
         parts.append(f"<p>{escape(reason)}</p>")
     if status in ("failed", "missing"):
-        return "\n".join([*parts, "<p>No figures: the object's stages did not finish.</p>"])
+        return "\n".join([*parts, "<p>No 3D view and no figures: the object's stages did not finish.</p>"])
+    if view is not None:
+        parts.append(view_section(f"object-{folder.name}", folder.name, view))
+    elif status == "unregistered":
+        parts.append("<p>No 3D view: the object has no accepted pose and was not added to the scene.</p>")
+    else:
+        parts.append("<p>No 3D view: figures/view.json is missing; draw the figures again.</p>")
     figure_folder = folder / "figures"
     before, after = figure_folder / "before.png", figure_folder / "after.png"
     if before.is_file() and after.is_file():

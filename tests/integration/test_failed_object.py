@@ -17,7 +17,7 @@ import yaml
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import quantity, write_json
 
-GATHERED = ("completed.", "yard/metrics.json", "summary/")
+GATHERED = ("completed.", "view.", "yard/metrics.json", "summary/")
 STATUS = {
     "status": quantity("registered", ""),
     "reason": quantity("", ""),
@@ -34,6 +34,7 @@ def sheet(low, high):
 def write_stages(folder: Path, files: list[str], date: float) -> None:
     """Outputs of the stages before the last ones: real where these read them, else empty."""
     content = {"fine.json": STATUS, "dense.json": {"points": quantity(1000, "points")}}
+    content["georeference.json"] = {"length_unit": quantity("m", "")}
     content["crop.json"] = {"diagonal": quantity(5.0, "m")}
     for path in (folder / file for file in files):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -93,6 +94,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert "shed adds" in text and "without barn, which failed" in text and "object barn: failed" in text
     page = (summary / "report.html").read_text()
     assert '>barn<span class="badge no">failed<' in page and "2.jpg" in page
+    assert 'aria-label="3D view of scene yard"' in page
 
     # As if the barn's stages had run after its photo was mended.
     shutil.copy(tmp_path / "barn/1.jpg", tmp_path / "barn/2.jpg")

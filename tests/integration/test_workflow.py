@@ -28,7 +28,8 @@ def test_everything_a_user_reads_is_there(finished):
     for name in ("registration", "completion", "ablation", "runtime", "scenes", "objects"):
         assert len(pd.read_csv(results / f"summary/{name}.tsv", sep="\t")) > 0
     assert "house" in (results / "summary/summary.txt").read_text()
-    assert "<img" in (results / "summary/report.html").read_text()
+    page = (results / "summary/report.html").read_text()
+    assert "<img" in page and all(f'aria-label="3D view of {name}"' in page for name in ("house", "scene demo"))
     assert {"before_after.png", "object.png"} <= {p.name for p in (results / "objects/house/figures").iterdir()}
 
 
@@ -105,7 +106,10 @@ SUMMARY = {"draw_object", "write_summary", "write_report", "all"}
         ({"metrics": {"tau_fraction": 0.02}}, {"compute_metrics", "compute_variant_metrics", "compute_scene_metrics"}),
         (
             {"fusion": {"density": 2.0}},
-            {"fuse_object", "complete_scene", "compute_metrics", "compute_scene_metrics", "evaluate_object"},
+            {
+                *("fuse_object", "complete_scene", "view_scene"),
+                *("compute_metrics", "compute_scene_metrics", "evaluate_object"),
+            },
         ),
     ],
     ids=["metrics", "fusion"],

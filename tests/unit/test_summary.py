@@ -355,7 +355,7 @@ def test_the_page_names_the_completed_scene_once_every_object_has_a_decision(res
 
 
 def test_the_page_names_objects_without_figures(results):
-    assert "No figures: the object's stages did not finish." in report(results)
+    assert "No 3D view and no figures: the object's stages did not finish." in report(results)
 
 
 def test_a_page_without_a_summary_is_refused(tmp_path):

@@ -5,11 +5,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.io.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
 from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
+from scenefuse.report.view_file import read_view
+from scenefuse.report.view_points import AFTER, BOTH
+from scenefuse.report.view_scene import view_scene
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Sim3
 
@@ -91,12 +94,52 @@ def test_points_behind_the_camera_and_an_empty_cloud_draw_nothing():
     assert (render(plane(0, RED)[np.zeros(3600, dtype=bool)], camera, 0.1) == 255).all()
 
 
-def test_radii_follow_spacing_and_keep_a_lone_point_small():
-    points = np.concatenate([plane(0, RED).points, [[50.0, 0.0, 0.0]]])
-    radii = point_radii(points, factor=1.0, limit=2.0)
-    step = 2.0 / 59
-    assert np.median(radii) == pytest.approx(step, rel=1e-5)
-    assert radii[-1] == pytest.approx(2 * step, rel=1e-5)
+def test_radii_follow_the_local_spacing():
+    dense, sparse = plane(0, RED), plane(0, RED, size=8.0, count=40)
+    sparse = sparse[np.abs(sparse.points[:, :2]).max(1) > 1.2]
+    radii = point_radii(np.concatenate([dense.points, sparse.points]), factor=1.0, limit=20.0)
+    assert np.median(radii[: len(dense)]) == pytest.approx(2 / 59, rel=1e-4)
+    assert np.median(radii[len(dense) :]) == pytest.approx(16 / 39, rel=1e-4)
+
+
+@pytest.mark.parametrize("height", [0.3, 50.0])
+def test_a_stray_point_is_hardly_larger_than_those_of_the_surface(height):
+    points = np.concatenate([plane(0, RED).points, [[0.0, 0.0, height]]])
+    assert point_radii(points, factor=1.0)[-1] <= 1.5 * 2 / 59
+
+
+def test_a_scene_point_among_dense_ones_does_not_hide_them():
+    fine = plane(0.0, GREEN, count=120)
+    coarse = plane(0.01, RED, size=8.0, count=40)
+    cloud = join(fine, coarse)
+    camera = orbit_camera(fine.points, 0.0, 90.0, (200, 200), orthographic=True, margin=0.0)
+    image = render(cloud, camera, point_radii(cloud.points, limit=20.0), eye_dome=0.0)
+    assert (image[..., 0] > 150).mean() < 0.02
+
+
+def test_random_points_make_a_closed_surface_at_full_density():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (20_000, 3)) * [1, 1, 0]
+    cloud = Cloud(points, np.tile(np.float32([0, 0, 1]), (20_000, 1)), np.tile(np.uint8(GREEN), (20_000, 1)))
+    for elevation in (90.0, 35.0):
+        camera = orbit_camera(points, 0.0, elevation, (200, 200), orthographic=True, margin=0.0)
+        image = render(cloud, camera, point_radii(points), background=BLUE)
+        inside = camera.project(points[np.abs(points).max(1) < 0.9])[0].astype(int)
+        seen = image[inside[:, 1], inside[:, 0]]
+        assert (seen[:, 2] < 100).mean() > 0.98
+
+
+def test_discs_lie_in_the_surface():
+    flat = Cloud(np.zeros((1, 3)), np.float32([[0, 0, 1]]), np.uint8([GREEN]))
+    covered = []
+    for elevation in (90.0, 45.0, 5.0):
+        camera = orbit_camera(box_surface(50, 0).points, 0.0, elevation, (200, 200), orthographic=True)
+        covered.append(int((render(flat, camera, 0.5).min(2) < 250).sum()))
+    assert covered[1] / covered[0] == pytest.approx(np.sin(np.pi / 4), rel=0.05)
+    # Seen edge-on it keeps two thirds of its width.
+    assert 0.55 < covered[2] / covered[0] < 0.75
+    facing = render(Cloud(flat.points, None, flat.colors), camera, 0.5)
+    assert (facing.min(2) < 250).sum() == pytest.approx(covered[0], rel=0.3)
 
 
 def test_noise_is_saved_below_a_megabyte(tmp_path):
@@ -131,7 +174,7 @@ def capture(tmp_path_factory):
     write_cloud(folder / "fused_scene.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
     write_cloud(folder / "box/registration/full/crop.ply", half)
     write_cloud(folder / "object.ply", whole.transformed(pose.inverse()))
-    write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], "")})
+    write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], ""), "diagonal": quantity(2.4, "m")})
     write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
     model = pycolmap.Reconstruction()
     pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
@@ -179,7 +222,7 @@ def test_figures_show_what_was_added(capture, tmp_path):
     fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
     draw(capture, fine, tmp_path / "figures")
     names = {"before_after.png", "provenance.png", "registration.png", "object.png", "before.png", "after.png"}
-    assert {p.name for p in (tmp_path / "figures").iterdir()} == names
+    assert {p.name for p in (tmp_path / "figures").iterdir()} == names | {"view.ply", "view.json"}
     assert all(p.stat().st_size < 1_000_000 for p in (tmp_path / "figures").iterdir())
     before, after = (cv2.imread(str(tmp_path / f"figures/{n}.png")).astype(float) for n in ("before", "after"))
     assert (np.abs(before - after).max(2) > 40).mean() > 0.02
@@ -187,10 +230,39 @@ def test_figures_show_what_was_added(capture, tmp_path):
     assert (colors[..., 0] - colors[..., 2] > 60).mean() > 0.01
 
 
+def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path):
+    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
+    draw(capture, fine, tmp_path / "figures")
+    view = read_view(tmp_path / "figures")
+    shown, source = view.cloud.fields["shown"], view.cloud.fields["source"]
+    assert set(shown) == {BOTH, AFTER}
+    np.testing.assert_array_equal(source == 1, shown == AFTER)
+    assert (view.cloud.points[shown == AFTER][:, 2] <= 0.5 + 1e-9).all()
+    assert view.after_points - view.before_points == (shown == AFTER).sum()
+    assert (view.unit, view.sources[1]) == ("m", "added from box")
+    np.testing.assert_allclose([view.low, view.high], [[-1, -0.5, 0], [1, 0.5, 1]], atol=0.05)
+
+
+def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(capture, tmp_path):
+    scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "fused_scene.ply")
+    far = Cloud(np.array([[900.0, 0, 0]]), None, np.uint8([RED]))
+    write_cloud(tmp_path / "dense.ply", join(scene, far))
+    write_json(tmp_path / "completed.json", {"sources": quantity({"0": "scene", "1": "box"}, "")})
+    write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
+    jsons = {"completed_json": tmp_path / "completed.json", "georeference_json": tmp_path / "georeference.json"}
+    dense = tmp_path / "dense.ply"
+    view_scene(dense=dense, completed=capture / "fused_scene.ply", **jsons, folder=tmp_path / "view")
+    view = read_view(tmp_path / "view")
+    assert (view.sources, view.unit) == ({0: "scene", 1: "box"}, "m")
+    assert view.cloud.points.max() < 10 and len(view.cloud) == len(fused)
+
+
 def test_a_refused_object_without_a_pose_still_gets_its_figures(capture, tmp_path):
     fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit equally well", "")}
     draw(capture, fine, tmp_path / "figures")
     assert (tmp_path / "figures/registration.png").is_file()
+    assert read_view(tmp_path / "figures") is None
 
 
 def test_an_object_far_from_the_scene_is_named(capture, tmp_path):

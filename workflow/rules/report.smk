@@ -1,7 +1,7 @@
 # Figures, tables, and the report page.
 #
 # INPUTS    everything before
-# OUTPUTS   results/scenes/{scene}/scene.png, results/objects/{object}/figures/
+# OUTPUTS   results/scenes/{scene}/scene.png, view.ply, view.json, results/objects/{object}/figures/
 #           results/summary/*.tsv, summary.txt, report.html
 
 
@@ -89,6 +89,35 @@ rule draw_object:
         " --figures {output} &> {log}"
 
 
+rule view_scene:
+    """The scene before and after, thinned for the 3D view of the report page."""
+    input:
+        dense="results/scenes/{scene}/dense.ply",
+        completed="results/scenes/{scene}/completed.ply",
+        completed_json="results/scenes/{scene}/completed.json",
+        georeference="results/scenes/{scene}/georeference.json",
+    output:
+        "results/scenes/{scene}/view.ply",
+        "results/scenes/{scene}/view.json",
+    log:
+        "results/logs/view_scene/{scene}.log",
+    benchmark:
+        "results/benchmarks/view_scene/{scene}.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        script=script("report/view_scene.py"),
+        code=code("report/view_scene.py"),
+    message:
+        "Scene {wildcards.scene}: 3D view"
+    shell:
+        "exec python {params.script} --dense {input.dense} --completed {input.completed} --completed-json {input.completed_json}"
+        " --georeference-json {input.georeference} --folder results/scenes/{wildcards.scene} &> {log}"
+
+
 rule write_summary:
     """Tables, and a text that reads well over ssh."""
     input:
@@ -123,6 +152,7 @@ rule write_report:
     input:
         summary="results/summary/summary.txt",
         scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
+        views=expand("results/scenes/{scene}/view.json", scene=SCENES),
         figures=expand("results/objects/{object}/figures", object=OBJECTS),
     output:
         "results/summary/report.html",
@@ -156,6 +186,9 @@ onerror:
             run_anyway(job, options)
     for job in held_up("compute_scene_metrics"):
         if keep_going and Path(job.input.cloud).is_file():
+            run_anyway(job)
+    for job in held_up("view_scene"):
+        if keep_going and Path(job.input.completed).is_file():
             run_anyway(job)
     for job in held_up("write_summary"):
         workflow.persistence.started(job)

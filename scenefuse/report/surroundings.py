@@ -1,0 +1,126 @@
+"""One object's part of the scene before and after fusion, turned upright: what figures and the 3D view show."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.fusion.fuse_object import is_placed
+from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.report.object_sheet import inner
+from scenefuse.report.values import find, flatten, load, number, unit_of
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import Array, Sim3, rotation_between
+
+# How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
+REACH = (0.35, 0.35, 0.15)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The clouds of one object in the scene's frame, turned so that z points up.
+
+    Attributes:
+        before: the scene around the object.
+        after: the same part of the scene after fusion.
+        crop: the object's part of the scene, as registration saw it.
+        object_cloud: the object at its estimated pose, or None when there is no pose.
+        framed: (N, 3) points every picture has to show.
+        fused: whether the object was fused.
+        decision: one line: status, reason, scores.
+        unit: of the scene's lengths.
+    """
+
+    before: Cloud
+    after: Cloud
+    crop: Cloud
+    object_cloud: Cloud | None
+    framed: Array
+    fused: bool
+    decision: str
+    unit: str
+
+
+@dataclass(frozen=True)
+class FigureInputs:
+    """What the figures of one object show."""
+
+    name: str
+    """The object's name, for titles."""
+    scene: Path
+    """The scene's dense cloud, scene frame."""
+    fused_scene: Path
+    """The whole scene after fusion, with the field `source` (0 scene, 1 object)."""
+    crop: Path
+    """The object's part of the scene, scene frame."""
+    crop_json: Path
+    """JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent."""
+    object_cloud: Path
+    """The object's cloud in its own frame."""
+    fine_json: Path
+    """JSON of the fine registration: status, reason, scene_from_object."""
+    metrics_json: Path
+    """JSON of the metrics, for the scores in titles."""
+    workspace: Path
+    """The object's undistorted COLMAP workspace (images/, sparse/)."""
+    masks: Path
+    """Folder of the object's masks, {photo}.png."""
+    stages: list[Path]
+    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
+
+
+def read_surroundings(inputs: FigureInputs) -> Surroundings:
+    """Read the clouds and turn them upright; the surroundings are cut to a box around the object.
+
+    Raises:
+        StageError: a file is missing or damaged, or the scene has no points around the object.
+    """
+    fine, scores = read_json(inputs.fine_json), flatten(read_json(inputs.metrics_json))
+    up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
+    level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    crop = read_cloud(inputs.crop).transformed(level)
+    pose = fine.get("scene_from_object", {}).get("value")
+    placed = None
+    if pose is not None:
+        placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
+    fused = is_placed(fine)
+    shown = placed if fused and placed is not None else crop
+    low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
+    reach = np.array(REACH) * float(np.linalg.norm(high - low))
+    before, after = (
+        _inside(read_cloud(path).transformed(level), low - reach, high + reach)
+        for path in (inputs.scene, inputs.fused_scene)
+    )
+    if not len(before):
+        raise StageError(
+            f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
+        )
+    unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
+    return Surroundings(before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit)
+
+
+def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
+    """One line: the status, the reason of a refusal, and the scores that there are."""
+    fields = flatten(report) | scores
+    parts = [str(value(report, "status"))]
+    reason = find(fields, "reason")
+    if parts[0] != "registered" and reason:
+        parts.append(str(reason))
+    for label, keys in (
+        ("scale", ("scale",)),
+        ("F-score", ("f_score",)),
+        ("fitness", ("registration.fitness",)),
+        ("inlier RMSE / diagonal", ("registration.inlier_rmse_over_diagonal",)),
+        ("normal consistency", ("registration.normal_consistency",)),
+        ("margin", ("margin",)),
+    ):
+        found = find(fields, *keys)
+        if isinstance(found, (int, float)):
+            parts.append(f"{label} {number(found)}")
+    return ", ".join(parts)
+
+
+def _inside(cloud: Cloud, low: Array, high: Array) -> Cloud:
+    """The points within an axis-aligned box."""
+    return cloud[np.all((cloud.points >= low) & (cloud.points <= high), axis=1)]

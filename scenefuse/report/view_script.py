@@ -1,0 +1,405 @@
+"""Style and script of the 3D views of the report page. K3D-jupyter's own front end draws; this feeds and steers it.
+
+K3D draws every point as a disc of a size in the scene's unit, with the depth of a ball, so that neighbours share the
+pixels between them. Picking follows the same rule, here, because K3D's own would fetch a worker from a server.
+"""
+
+VIEW_STYLE = """
+.view { border: 1px solid var(--line); border-radius: 6px; margin: 14px 0 22px; overflow: hidden; background: #fff; }
+.view-stage { position: relative; isolation: isolate; height: clamp(300px, 62vh, 640px); background: #f7f8f9;
+  border-bottom: 1px solid var(--line); cursor: grab; }
+.view-stage:active { cursor: grabbing; } .view-stage.measuring { cursor: crosshair; }
+.view-stage:focus-visible { outline: 3px solid var(--accent); outline-offset: -3px; }
+.view-canvas { position: absolute; z-index: 0; inset: 0; touch-action: none; }
+.view-stage svg.marks { position: absolute; z-index: 1; inset: 0; width: 100%; height: 100%; pointer-events: none; }
+.marks line { stroke: #fff; stroke-width: 5; } .marks line + line { stroke: var(--ink); stroke-width: 2; }
+.marks circle { fill: var(--accent); stroke: #fff; stroke-width: 2; }
+.marks text { font: 600 14px system-ui, sans-serif; fill: var(--ink); stroke: #fff; stroke-width: 4;
+  paint-order: stroke; text-anchor: middle; }
+.view-note { margin: 0; padding: 6px 10px 0; max-width: none; font-size: 12.5px; }
+.view[data-state=failed] > :not(.view-note) { display: none; }
+.view[data-state=failed] .view-note { padding: 10px; font-size: 15px; }
+.view-tools { display: flex; flex-wrap: wrap; gap: 8px 16px; align-items: center; padding: 8px 10px;
+  border-bottom: 1px solid var(--line); }
+.view-tools fieldset { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0; align-items: center; }
+.view-tools legend { float: left; padding: 0 8px 0 0; color: var(--soft); font-size: 13px; }
+.view-tools label span, .view-tools button { display: inline-block; min-height: 34px; padding: 5px 12px;
+  border: 1px solid #c3cad1; background: #fff; font: inherit; font-size: 13.5px; color: var(--ink); cursor: pointer; }
+.view-tools label span { margin-left: -1px; } .view-tools button { border-radius: 6px; }
+.view-tools label:first-of-type span { border-radius: 6px 0 0 6px; margin-left: 0; }
+.view-tools label:last-of-type span { border-radius: 0 6px 6px 0; }
+.view-tools input { position: absolute; opacity: 0; width: 1px; height: 1px; }
+.view-tools input:checked + span, .view-tools button[aria-pressed=true] { background: var(--ink); color: #fff;
+  border-color: var(--ink); }
+.view-tools input:focus-visible + span, .view-tools button:focus-visible { outline: 3px solid var(--accent);
+  outline-offset: 1px; position: relative; z-index: 1; }
+.view-legend { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: center; padding: 2px 10px 6px;
+  min-height: 34px; font-size: 13px; color: var(--soft); }
+.view-legend i { display: inline-block; width: 12px; height: 12px; border-radius: 50%; margin-right: 6px;
+  vertical-align: -1px; border: 1px solid #0003; }
+.view-legend .ramp { width: 140px; height: 12px; border-radius: 6px; margin: 0 6px; }
+.view-legend .count { margin-left: auto; } .view:fullscreen { display: flex; flex-direction: column; }
+.view:fullscreen .view-stage { flex: 1; height: auto; }
+@media print { .view { display: none; } }
+"""
+VIEW_SCRIPT = """
+const inflate = async (text) => {
+  const packed = atob(text), bytes = new Uint8Array(packed.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
+  const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+  return new Uint8Array(await new Response(stream).arrayBuffer());
+};
+
+// K3D comes as an AMD module without dependencies; it is unpacked once, when the first view comes near.
+let k3d = null;
+const library = () => k3d ??= inflate(document.getElementById("k3d").textContent).then((bytes) => {
+  let found;
+  new Function("define", new TextDecoder().decode(bytes))((_name, _needs, make) => { found = make(); });
+  return found;
+});
+
+// Every view holds a WebGL context, and browsers drop the oldest of too many.
+const MOST_LIVE = 4, live = [];
+const FIELD_OF_VIEW = 35;
+
+const decode = (about, bytes) => {
+  const counts = about.points, count = counts.before + counts.both + counts.after;
+  const planes = {};
+  about.planes.forEach((name, k) => { planes[name] = bytes.subarray(k * count, (k + 1) * count); });
+  const positions = new Float32Array(3 * count);
+  ["x", "y", "z"].forEach((axis, a) => {
+    const low = planes[axis + "_low"], high = planes[axis + "_high"];
+    for (let i = 0, cell = 0; i < count; i++) {
+      const folded = low[i] | (high[i] << 8);
+      cell = (cell + (folded & 1 ? -(folded + 1) >> 1 : folded >> 1)) & 65535;
+      positions[3 * i + a] = about.corner[a] + cell * about.step[a];
+    }
+  });
+  const [least, largest] = about.radius, diameters = {};
+  for (const when of ["before", "after"]) {
+    const levels = planes["radius_" + when];
+    diameters[when] = Float32Array.from(levels, (v) => 2 * least * (largest / least) ** ((v - 1) / (about.levels - 1)));
+  }
+  const runs = { before: [0, counts.before + counts.both], after: [counts.before, count] };
+  return { count, planes, positions, diameters, runs };
+};
+
+const hex = (color) => parseInt(color.slice(1), 16);
+const dimmed = (color, shade) => ((((color >> 16) * shade) & 255) << 16)
+  | (((((color >> 8) & 255) * shade) & 255) << 8) | (((color & 255) * shade) & 255);
+
+// Packed RGB of every point. Photo colours hold their own light; all others are shaded.
+const paint = (mode, about, { count, planes }) => {
+  const colors = new Uint32Array(count);
+  if (mode.name === "photo") {
+    const { green, red_less_green: red, blue_less_green: blue } = planes;
+    for (let i = 0; i < count; i++) {
+      const g = green[i];
+      colors[i] = (((red[i] + g) & 255) << 16) | (g << 8) | ((blue[i] + g) & 255);
+    }
+    return colors;
+  }
+  const table = new Uint32Array(256).fill(hex(mode.other.color)), plane = planes[mode.name];
+  mode.entries.forEach((entry) => { table[entry.code] = hex(entry.color); });
+  // Along a ramp brightness means something: shade it less.
+  const least = mode.ramp ? 0.5 : 0;
+  for (let i = 0; i < count; i++)
+    colors[i] = dimmed(table[plane[i]], least + (1 - least) * planes.shade[i] / about.levels);
+  return colors;
+};
+
+const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+const scaled = (a, s) => a.map((x) => x * s);
+const plus = (a, b) => a.map((x, k) => x + b[k]);
+const minus = (a, b) => a.map((x, k) => x - b[k]);
+const norm = (a) => Math.hypot(...a);
+const toward = (azimuth, elevation) =>
+  [Math.cos(azimuth) * Math.cos(elevation), Math.sin(azimuth) * Math.cos(elevation), Math.sin(elevation)];
+
+// Eye, target and up so that the points in the box fill a picture of that aspect (width over height).
+const firstCamera = (about, positions, aspect) => {
+  const { low, high } = about, middle = scaled(plus(low, high), 0.5), azimuth = about.azimuth * Math.PI / 180;
+  const away = toward(azimuth, about.elevation * Math.PI / 180);
+  const right = [-Math.sin(azimuth), Math.cos(azimuth), 0], up = cross(away, right);
+  const slope = Math.tan(FIELD_OF_VIEW * Math.PI / 360);
+  let distance = 0;
+  const every = 3 * Math.ceil(positions.length / 30000);
+  for (let i = 0; i < positions.length; i += every) {
+    const point = [positions[i], positions[i + 1], positions[i + 2]];
+    if (point.some((x, k) => x < low[k] || x > high[k])) continue;
+    const along = (axis) => axis.reduce((sum, a, k) => sum + a * (point[k] - middle[k]), 0);
+    const wide = Math.max(Math.abs(along(right)) / aspect, Math.abs(along(up)));
+    distance = Math.max(distance, along(away) + 1.1 * wide / slope);
+  }
+  return [...plus(middle, scaled(away, distance)), ...middle, 0, 0, 1];
+};
+
+class View {
+  constructor(section) {
+    this.section = section;
+    this.stage = section.querySelector(".view-stage");
+    this.about = JSON.parse(section.querySelector(".about").textContent);
+    this.legend = section.querySelector(".view-legend");
+    this.output = section.querySelector("output");
+    this.marks = section.querySelector(".marks");
+    this.button = section.querySelector(".measure");
+    this.picked = [];
+    this.camera = null;
+    this.plot = null;
+    this.listen();
+  }
+
+  get shown() { return this.section.querySelector(".when input:checked").value; }
+  get mode() {
+    const name = this.section.querySelector(".colour input:checked").value;
+    return this.about.modes.find((mode) => mode.name === name);
+  }
+  get measuring() { return this.button.getAttribute("aria-pressed") === "true"; }
+
+  async start() {
+    if (this.starting) return;
+    this.starting = true;
+    try {
+      this.data ??= decode(this.about, await inflate(this.section.querySelector(".points").textContent));
+      const { K3D, ThreeJsProvider } = await library();
+      if (!this.starting) return;
+      while (live.length >= MOST_LIVE) live[0].stop();
+      live.push(this);
+      this.canvas = this.stage.insertBefore(document.createElement("div"), this.stage.firstChild);
+      this.canvas.className = "view-canvas";
+      this.plot = new K3D(ThreeJsProvider, this.canvas, {
+        menuVisibility: false, gridVisible: false, gridAutoFit: false, cameraAutoFit: false, axesHelper: 0,
+        grid: [...this.about.corner, ...scaled(this.about.corner, -1)],
+        cameraMode: "orbit", cameraUpAxis: "z", cameraFov: FIELD_OF_VIEW, clearColor: 0xf7f8f9, antialias: 1,
+      });
+      this.plot.on(this.plot.events.RENDERED, () => this.drawMarks());
+      await this.show();
+      if (!this.plot) return;
+      this.plot.setCamera(this.camera ?? this.home());
+      this.plot.render();
+      this.section.dataset.state = "ready";
+    } catch (error) {
+      this.fail(error);
+    }
+  }
+
+  stop() {
+    live.splice(live.indexOf(this), 1);
+    this.camera = this.plot?.getWorld().controls.getCameraArray() ?? null;
+    this.plot?.disable();
+    this.canvas?.remove();
+    this.plot = null;
+    this.starting = false;
+    this.section.dataset.state = "stopped";
+  }
+
+  fail(error) {
+    const note = this.section.querySelector(".view-note");
+    note.textContent = `The 3D view cannot be shown (${error?.message ?? error}). It needs a browser with WebGL 2; `
+      + "the pictures of this page show the same from fixed sides.";
+    this.section.dataset.state = "failed";
+    if (this.plot) this.stop();
+    this.starting = true;
+  }
+
+  home() { return firstCamera(this.about, this.data.positions, this.stage.clientWidth / this.stage.clientHeight); }
+
+  // The points of the chosen picture in the chosen colours.
+  async show() {
+    const { data, shown, mode } = this, [from, to] = data.runs[shown];
+    this.colors = this.painted === mode.name ? this.colors : paint(mode, this.about, data);
+    this.painted = mode.name;
+    this.describe();
+    if (!this.plot) return;
+    const array = (values, width) => ({ data: values, shape: width > 1 ? [to - from, width] : [to - from] });
+    const points = {
+      id: 1, type: "Points", shader: "flat", visible: true, opacity: 1, point_size: 1,
+      positions: array(data.positions.subarray(3 * from, 3 * to), 3),
+      colors: array(this.colors.subarray(from, to), 1),
+      point_sizes: array(data.diameters[shown].subarray(from, to), 1),
+      model_matrix: { data: new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]), shape: [4, 4] },
+    };
+    if (this.plot.getWorld().ObjectsById[1]) this.plot.removeObject(1);
+    await this.plot.load({ objects: [points] });
+    this.plot.render();
+  }
+
+  describe() {
+    const { about, mode, legend, shown } = this;
+    legend.replaceChildren();
+    const entry = (color, text) => {
+      const item = document.createElement("span"), dot = document.createElement("i");
+      dot.style.background = color;
+      item.append(dot, text);
+      legend.append(item);
+    };
+    if (mode.ramp) {
+      const item = document.createElement("span"), ramp = document.createElement("i");
+      ramp.className = "ramp";
+      ramp.style.background = `linear-gradient(90deg, ${mode.ramp.join(", ")})`;
+      item.append(mode.low, ramp, mode.high);
+      legend.append(item);
+      entry(mode.other.color, mode.other.label);
+    } else if (mode.entries) {
+      mode.entries.filter((e) => e.when.includes(shown)).forEach((e) => entry(e.color, e.label));
+    } else {
+      legend.append(mode.label);
+    }
+    const count = document.createElement("span"), [from, to] = this.data.runs[shown], all = about.total[shown];
+    count.className = "count";
+    const some = to - from < all ? `${(to - from).toLocaleString("en")} of ` : "";
+    count.textContent = `${some}${all.toLocaleString("en")} points`;
+    legend.append(count);
+  }
+
+  // Projection of the camera, column by column as WebGL has it, and the stage's size.
+  projection() {
+    const { camera } = this.plot.getWorld();
+    camera.updateMatrixWorld();
+    const p = camera.projectionMatrix.elements, v = camera.matrixWorldInverse.elements, m = new Float64Array(16);
+    for (let c = 0; c < 4; c++) for (let r = 0; r < 4; r++)
+      for (let k = 0; k < 4; k++) m[4 * c + r] += p[4 * k + r] * v[4 * c + k];
+    const { clientWidth: wide, clientHeight: high } = this.stage;
+    return { m, wide, high, focal: p[5] * high / 2 };
+  }
+
+  // The point whose disc is drawn at a pixel of the stage, else the nearest within `reach` pixels, else null.
+  pick(x, y, reach = 12) {
+    const { m, wide, high, focal } = this.projection(), { positions, diameters, runs } = this.data;
+    const sizes = diameters[this.shown], [from, to] = runs[this.shown];
+    let front = Infinity, hit = -1, nearest = reach * reach, beside = -1;
+    for (let i = from; i < to; i++) {
+      const px = positions[3 * i], py = positions[3 * i + 1], pz = positions[3 * i + 2];
+      const w = m[3] * px + m[7] * py + m[11] * pz + m[15];
+      if (w <= 0) continue;
+      const u = ((m[0] * px + m[4] * py + m[8] * pz + m[12]) / w * 0.5 + 0.5) * wide - x;
+      const v = (0.5 - (m[1] * px + m[5] * py + m[9] * pz + m[13]) / w * 0.5) * high - y;
+      const off = u * u + v * v, radius = sizes[i] / 2, disc = (radius * focal / w) ** 2;
+      if (off <= disc) {
+        const depth = w - radius * Math.sqrt(1 - off / disc);
+        if (depth < front) { front = depth; hit = i; }
+      } else if (off < nearest) { nearest = off; beside = i; }
+    }
+    const found = hit >= 0 ? hit : beside;
+    return found < 0 ? null : Array.from(positions.subarray(3 * found, 3 * found + 3));
+  }
+
+  measure(x, y) {
+    const point = this.pick(x, y);
+    if (!point) { this.output.textContent = "No point there."; return; }
+    this.picked = this.picked.length === 1 ? [this.picked[0], point] : [point];
+    this.output.textContent = this.picked.length === 1 ? "Now the second point." : this.distance();
+    this.drawMarks();
+  }
+
+  distance() {
+    const length = norm(minus(...this.picked));
+    return `${Number(length.toPrecision(4))} ${this.about.unit}`;
+  }
+
+  drawMarks() {
+    if (!this.plot || (!this.picked.length && !this.marks.childNodes.length)) return;
+    const { m, wide, high } = this.projection();
+    const draw = (name, attributes, text) => {
+      const node = document.createElementNS("http://www.w3.org/2000/svg", name);
+      for (const [key, value] of Object.entries(attributes)) node.setAttribute(key, value);
+      if (text) node.textContent = text;
+      return node;
+    };
+    const seen = this.picked.map(([x, y, z]) => {
+      const w = m[3] * x + m[7] * y + m[11] * z + m[15];
+      return w <= 0 ? null : [((m[0] * x + m[4] * y + m[8] * z + m[12]) / w * 0.5 + 0.5) * wide,
+        (0.5 - (m[1] * x + m[5] * y + m[9] * z + m[13]) / w * 0.5) * high];
+    });
+    const nodes = [], [a, b] = seen;
+    if (a && b) {
+      const ends = { x1: a[0], y1: a[1], x2: b[0], y2: b[1] };
+      nodes.push(draw("line", ends), draw("line", ends));
+    }
+    seen.filter(Boolean).forEach(([cx, cy]) => nodes.push(draw("circle", { cx, cy, r: 5 })));
+    if (a && b) nodes.push(draw("text", { x: (a[0] + b[0]) / 2, y: (a[1] + b[1]) / 2 - 8 }, this.distance()));
+    this.marks.replaceChildren(...nodes);
+  }
+
+  setMeasuring(on) {
+    this.button.setAttribute("aria-pressed", on);
+    this.stage.classList.toggle("measuring", on);
+    this.picked = [];
+    this.output.textContent = on ? "Click two points." : "";
+    this.drawMarks();
+  }
+
+  // Turn about the target by angles, or come nearer by a factor.
+  move(turn, tilt, nearer) {
+    const [ex, ey, ez, ...rest] = this.plot.getWorld().controls.getCameraArray(), target = rest.slice(0, 3);
+    const [x, y, z] = minus([ex, ey, ez], target), flat = Math.hypot(x, y), far = Math.hypot(flat, z) / nearer;
+    const azimuth = Math.atan2(y, x) + turn;
+    const elevation = Math.min(1.55, Math.max(-1.55, Math.atan2(z, flat) + tilt));
+    this.plot.setCamera([...plus(target, scaled(toward(azimuth, elevation), far)), ...target, 0, 0, 1]);
+    this.plot.render();
+  }
+
+  // Turn about a point from now on.
+  center(point) {
+    const camera = this.plot.getWorld().controls.getCameraArray();
+    this.plot.setCamera([...camera.slice(0, 3), ...point, 0, 0, 1]);
+    this.plot.render();
+  }
+
+  key(event) {
+    const step = 0.12, moves = {
+      ArrowLeft: [-step, 0, 1], ArrowRight: [step, 0, 1], ArrowUp: [0, step, 1], ArrowDown: [0, -step, 1],
+      "+": [0, 0, 1.15], "=": [0, 0, 1.15], "-": [0, 0, 1 / 1.15],
+    };
+    if (!this.plot || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (moves[event.key]) this.move(...moves[event.key]);
+    else if (event.key === "Enter" && this.measuring)
+      this.measure(this.stage.clientWidth / 2, this.stage.clientHeight / 2);
+    else if (event.key === "Escape" && this.measuring) this.setMeasuring(false);
+    else return;
+    event.preventDefault();
+  }
+
+  listen() {
+    const { section, stage, button } = this;
+    section.querySelectorAll("input").forEach((input) => input.addEventListener("change", () => this.show()));
+    button.addEventListener("click", () => this.setMeasuring(!this.measuring));
+    section.querySelector(".home").addEventListener("click", () => {
+      this.plot?.setCamera(this.home());
+      this.plot?.render();
+    });
+    const full = section.querySelector(".full");
+    full.hidden = !document.fullscreenEnabled;
+    full.addEventListener("click", () => document.fullscreenElement ? document.exitFullscreen()
+      : section.requestFullscreen());
+    stage.addEventListener("keydown", (event) => this.key(event));
+    // The wheel scrolls the page until the view is in use.
+    stage.addEventListener("wheel", (event) => {
+      if (!stage.contains(document.activeElement)) event.stopPropagation();
+    }, { capture: true });
+    let down = null;
+    stage.addEventListener("pointerdown", (event) => {
+      stage.focus({ preventScroll: true });
+      down = event.isPrimary ? [event.clientX, event.clientY] : null;
+    }, { capture: true });
+    stage.addEventListener("dblclick", (event) => {
+      if (this.measuring || !this.plot) return;
+      const box = stage.getBoundingClientRect(), point = this.pick(event.clientX - box.left, event.clientY - box.top);
+      if (point) this.center(point);
+    });
+    stage.addEventListener("pointerup", (event) => {
+      const still = down && Math.hypot(event.clientX - down[0], event.clientY - down[1]) < 6;
+      down = null;
+      if (!still || !this.plot || !this.measuring || event.button !== 0) return;
+      const box = stage.getBoundingClientRect();
+      this.measure(event.clientX - box.left, event.clientY - box.top);
+    }, { capture: true });
+  }
+}
+
+const views = new Map([...document.querySelectorAll(".view")].map((section) => [section, new View(section)]));
+const near = new IntersectionObserver((entries) => {
+  for (const entry of entries) if (entry.isIntersecting) views.get(entry.target).start();
+}, { rootMargin: "300px" });
+views.forEach((_view, section) => near.observe(section));
+"""

@@ -1,0 +1,335 @@
+"""The report page in a real browser, opened from a file: 3D views, colours, measuring, touch, a phone's width."""
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from support.browser import chromium, click, touch
+
+from scenefuse.io.clouds import Cloud
+from scenefuse.report.figures import VIEW_POINTS
+from scenefuse.report.view_file import View, write_view
+from scenefuse.report.view_points import merge, thin
+from scenefuse.report.view_scene import VIEW_POINTS as SCENE_POINTS
+from scenefuse.report.write_report import write_report
+
+SECTION = "[aria-label='3D view of house']"
+STAGE = f"{SECTION} .view-stage"
+RED, BLUE = (230, 0, 0), (0, 0, 230)
+ACCENT = (199, 86, 11)
+TAB, ESCAPE, ARROW_RIGHT = "\ue004", "\ue00c", "\ue014"  # as WebDriver names keys
+SETTLE = "for (let k = 0; k < 3; k++) await new Promise((next) => requestAnimationFrame(next));"
+
+
+def grid(count=21, step=0.1, height=0.0, color=(140, 150, 140)):
+    """A flat grid of points about the origin, facing up."""
+    x, y = np.meshgrid(*[(np.arange(count) - count // 2) * step] * 2)
+    points = np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+    return Cloud(points, np.tile(np.float32([0, 0, 1]), (x.size, 1)), np.tile(np.uint8(color), (x.size, 1)))
+
+
+def completed(before, added, **fields):
+    source = np.repeat([0, 1], [len(before), len(added)]).astype(np.uint16)
+    return Cloud(
+        np.concatenate([before.points, added.points]),
+        np.concatenate([before.normals, added.normals]),
+        np.concatenate([before.colors, added.colors]),
+        {"source": source, **fields},
+    )
+
+
+def view_of(before, after, reach=1.0):
+    cloud, corner = merge(before, after), reach * np.array([1.0, 1.0, 0.5])
+    return View(cloud, {0: "scene", 1: "added"}, "m", -corner, corner, -90.0, 60.0, len(before), len(after))
+
+
+def report(folder, views, status="registered"):
+    """The page of a run of these objects; `views` by object, None for one without."""
+    (folder / "summary").mkdir()
+    (folder / "summary/summary.txt").write_text("all well\n")
+    rows = "".join(f"{name}\tfull\t{status}\tbecause\n" for name in views)
+    (folder / "summary/registration.tsv").write_text(f"object\tvariant\tstatus\treason\n{rows}")
+    for name, view in views.items():
+        (folder / name / "figures").mkdir(parents=True)
+        if view is not None:
+            write_view(folder / name / "figures", view)
+    page = folder / "summary/report.html"
+    objects = [folder / name for name in views]
+    write_report(summary=folder / "summary", scenes=[], objects=objects, title="test", report=page)
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    """A house with all fields, a red and a blue point in it 1.2 m apart; a shed without fields; a large scene."""
+    before, added = grid(), grid(9, 0.05, 0.4, (200, 190, 60))
+    for cloud, place, color in ((before, [-0.6, -0.6, 0], RED), (added, [0.2, 0.2, 0.4], BLUE)):
+        cloud.colors[np.isclose(cloud.points, place).all(1)] = color
+    count = len(before) + len(added)
+    evidence = np.repeat([0, 1, 2, 3], [200, 141, 100, 81]).astype(np.uint8)
+    deviation = np.linspace(0.001, 0.05, count).astype(np.float32)
+    house = view_of(before, completed(before, added, evidence=evidence, deviation=deviation))
+    plain, large = grid(), grid(step=100.0)
+    views = {"house": house, "shed": view_of(plain, completed(plain, added)), "land": view_of(large, large, 1000.0)}
+    return report(tmp_path_factory.mktemp("run"), views)
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium() as window:
+        yield window
+
+
+@pytest.fixture
+def opened(browser, page):
+    browser.open(page)
+    ready(browser)
+    return browser
+
+
+def ready(browser, name="house"):
+    """Wait until a view has drawn."""
+    browser.value(
+        """
+        const section = document.querySelector(`[aria-label="3D view of ${given[0]}"]`);
+        section.scrollIntoView({ block: "center", behavior: "instant" });
+        while (section.dataset.state !== "ready") {
+          if (section.dataset.state === "failed") throw section.querySelector(".view-note").textContent;
+          await new Promise((next) => setTimeout(next, 20));
+        }
+        """
+        + SETTLE,
+        name,
+    )
+
+
+def camera_of(browser, name="house"):
+    """Eye, target and up of a view."""
+    script = "for (const [s, v] of views) if (s.getAttribute('aria-label') === `3D view of ${given[0]}`) "
+    return browser.value(script + "return Array.from(v.plot.getWorld().controls.getCameraArray());", name)
+
+
+def choose(browser, text, name="house"):
+    """Press one of a view's buttons and let it draw."""
+    section = f"//section[@aria-label='3D view of {name}']"
+    browser.window.find_element("xpath", f"{section}//*[self::span or self::button][.='{text}']").click()
+    browser.value("await new Promise((next) => setTimeout(next, 100));" + SETTLE)
+
+
+def changed(first, second):
+    """Share of pixels that differ clearly."""
+    return float((np.abs(first.astype(int) - second).max(2) > 30).mean())
+
+
+def middle_of(picture, color):
+    """Where on a picture a colour is, x and y."""
+    rows, columns = np.nonzero(np.abs(picture.astype(int) - color).max(2) < 40)
+    assert len(rows) > 20, "the point is not seen"
+    return float(columns.mean()), float(rows.mean())
+
+
+def test_the_page_draws_before_and_after_and_asks_for_nothing(opened):
+    after = opened.picture(STAGE)
+    assert after.reshape(-1, 3).std(0).max() > 20
+    choose(opened, "Before")
+    before = opened.picture(STAGE)
+    assert before.reshape(-1, 3).std(0).max() > 20
+    assert changed(before, after) > 0.01
+    choose(opened, "After")
+    assert changed(opened.picture(STAGE), after) < 0.001
+    assert opened.complaints() == []
+    assert {url.split(":")[0] for url in opened.requests()} <= {"file", "data", "blob"}
+
+
+def test_photo_colours_are_those_of_the_points(opened):
+    picture = opened.picture(STAGE)
+    for color in (RED, BLUE, (140, 150, 140), (200, 190, 60)):
+        assert (np.abs(picture.astype(int) - color).max(2) <= 3).sum() > 20, color
+
+
+def test_a_scene_of_kilometres_fills_its_view(browser, page):
+    browser.open(page)
+    ready(browser, "land")
+    picture = browser.picture("[aria-label='3D view of land'] .view-stage")
+    covered = (np.abs(picture.astype(int) - (140, 150, 140)).max(2) <= 3).mean()
+    # Discs of half the size would leave gaps: 0.21.
+    assert covered > 0.32
+
+
+def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
+    pictures = {}
+    for mode, words in {
+        "Photo": "Colours of the photos",
+        "Source": "added",
+        "Class": "NeRF only: no photo confirms it",
+        "Std. deviation": "0.049 m",
+    }.items():
+        choose(opened, mode)
+        pictures[mode] = opened.picture(STAGE)
+        assert words in opened.find(f"{SECTION} .view-legend").text, mode
+    names = list(pictures)
+    for k, first in enumerate(names):
+        for second in names[k + 1 :]:
+            assert changed(pictures[first], pictures[second]) > 0.02, (first, second)
+    choose(opened, "Before")
+    assert "added" not in opened.find(f"{SECTION} .view-legend").text
+
+
+def test_colours_whose_fields_are_absent_are_not_offered(opened):
+    labels = opened.find("[aria-label='3D view of shed'] .colour").text
+    assert "Photo" in labels and "Source" in labels
+    assert "Class" not in labels and "deviation" not in labels
+
+
+def test_two_clicked_points_are_measured_in_the_scenes_unit(opened):
+    choose(opened, "Measure")
+    picture, stage = opened.picture(STAGE), opened.find(STAGE)
+    for color in (RED, BLUE):
+        click(opened, stage, *middle_of(picture, color))
+    assert opened.find(f"{SECTION} output").text == "1.2 m"
+    assert "1.2 m" in opened.find(f"{SECTION} .marks").get_attribute("textContent")
+    assert (np.abs(opened.picture(STAGE).astype(int) - ACCENT).max(2) < 20).sum() > 50
+    # The marks stay on the points while the view turns.
+    stage.send_keys(ARROW_RIGHT * 3)
+    opened.value(SETTLE)
+    marks = opened.value(
+        "return [...document.querySelectorAll(given[0])].map((c) => [+c.getAttribute('cx'), +c.getAttribute('cy')]);",
+        f"{SECTION} .marks circle",
+    )
+    stage.send_keys(ESCAPE)
+    turned = opened.picture(STAGE)
+    assert changed(turned, picture) > 0.05
+    for mark, color in zip(marks, (RED, BLUE)):
+        # A ball's visible part is not quite around its middle.
+        np.testing.assert_allclose(mark, middle_of(turned, color), atol=8)
+        assert np.abs(np.subtract(mark, middle_of(picture, color))).max() > 15
+    assert opened.find(f"{SECTION} output").text == ""
+
+
+def test_dragging_turns_and_the_wheel_zooms_once_the_view_is_in_use(opened):
+    stage, first = opened.find(STAGE), opened.picture(STAGE)
+    camera = camera_of(opened)
+    opened.wheel(stage, -240)
+    opened.value("await new Promise((next) => setTimeout(next, 300));")
+    np.testing.assert_allclose(camera_of(opened), camera, atol=1e-9)
+    ready(opened)
+    opened.drag(stage, 150, 0)
+    opened.value(SETTLE)
+    assert changed(opened.picture(STAGE), first) > 0.05
+    turned = camera_of(opened)
+    np.testing.assert_allclose(np.linalg.norm(turned[:3]), np.linalg.norm(camera[:3]), rtol=1e-3)
+    opened.wheel(stage, -240)
+    opened.value("await new Promise((next) => setTimeout(next, 300));")
+    assert np.linalg.norm(camera_of(opened)[:3]) < 0.99 * np.linalg.norm(turned[:3])
+    choose(opened, "Reset view")
+    assert changed(opened.picture(STAGE), first) < 0.001
+
+
+def test_everything_is_named_and_reached_by_the_keyboard(opened):
+    opened.value("document.querySelector(given[0]).focus();", f"{SECTION} .when input:checked")
+    kinds = []
+    for _ in range(6):
+        opened.window.switch_to.active_element.send_keys(TAB)
+        active = opened.window.switch_to.active_element
+        kinds.append(active.get_attribute("name") or active.get_attribute("role") or active.text)
+        assert active.accessible_name, kinds
+    assert kinds[:1] == ["colour-object-house"] and {"Measure", "Reset view", "application"} <= set(kinds)
+    first = opened.picture(STAGE)
+    opened.find(STAGE).send_keys("+++")
+    opened.value(SETTLE)
+    assert changed(opened.picture(STAGE), first) > 0.05
+
+
+def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
+    with chromium(phone=True) as phone:
+        phone.open(page)
+        ready(phone)
+        assert phone.value("return [innerWidth, document.documentElement.scrollWidth];") == [390, 390]
+        boxes = phone.value(
+            "return [...document.querySelectorAll(given[0])].map((b) => b.getBoundingClientRect().toJSON());",
+            f"{SECTION} .view-tools span, {SECTION} button:not([hidden])",
+        )
+        assert all(box["left"] >= 0 and box["right"] <= 390 and box["height"] >= 34 for box in boxes)
+        stage, first = phone.find(STAGE), phone.picture(STAGE)
+        assert 300 <= stage.size["height"] <= 0.7 * 844 and first.reshape(-1, 3).std(0).max() > 20
+        choose(phone, "Measure")
+        for color in (RED, BLUE):
+            touch(phone, stage, [middle_of(first, color)])
+        assert phone.find(f"{SECTION} output").text == "1.2 m"
+        choose(phone, "Measure")
+        camera, top = camera_of(phone), phone.value("return scrollY;")
+        touch(phone, stage, [(100, 100), (160, 140), (220, 160)])
+        phone.value(SETTLE)
+        assert np.abs(np.subtract(camera_of(phone), camera)).max() > 0.1
+        assert phone.value("return scrollY;") == top
+        assert phone.complaints() == []
+
+
+def test_a_browser_without_webgl_says_so(page):
+    with chromium("--disable-gpu", "--disable-3d-apis") as old:
+        old.open(page)
+        note = f"{SECTION} .view-note"
+        old.value("while (!document.querySelector('[data-state=failed]')) await new Promise((n) => setTimeout(n, 20));")
+        assert "The 3D view cannot be shown" in old.find(note).text and "WebGL" in old.find(note).text
+
+
+def test_a_page_of_many_views_keeps_few_of_them_alive(browser, tmp_path):
+    view = view_of(grid(), completed(grid(), grid(9, 0.05, 0.4, (200, 190, 60))))
+    names = [f"house{k}" for k in range(6)]
+    browser.open(report(tmp_path, dict.fromkeys(names, view)))
+    for name in names:
+        ready(browser, name)
+        assert browser.value("return live.length;") <= 4
+    ready(browser, names[0])
+    assert browser.picture(f"[aria-label='3D view of {names[0]}'] .view-stage").reshape(-1, 3).std(0).max() > 20
+    # K3D gives a context back twice, and WebGL says so.
+    assert [line for line in browser.complaints() if "context" not in line.lower()] == []
+
+
+def test_a_double_click_moves_the_centre_of_turning(opened):
+    point = middle_of(opened.picture(STAGE), RED)
+    opened.double_click(opened.find(STAGE), *point)
+    np.testing.assert_allclose(camera_of(opened)[3:6], [-0.6, -0.6, -0.2], atol=1e-3)
+    opened.value(SETTLE)
+    moved = middle_of(opened.picture(STAGE), RED)
+    box = opened.find(STAGE).size
+    np.testing.assert_allclose(moved, [box["width"] / 2, box["height"] / 2], atol=12)
+
+
+def test_objects_that_are_not_in_the_scene_have_no_view(tmp_path):
+    text = report(tmp_path, {"house": None}, status="unregistered").read_text()
+    assert "No 3D view: the object has no accepted pose and was not added to the scene." in text
+    assert 'class="view"' not in text and 'id="k3d"' not in text
+
+
+def test_more_views_than_a_page_holds_get_fewer_points_each(tmp_path, monkeypatch):
+    monkeypatch.setattr("scenefuse.report.write_report.PAGE_POINTS", 2000)
+    view = view_of(grid(40), completed(grid(40), grid(9, 0.05, 0.4)))
+    text = report(tmp_path, {"house": view, "shed": view}).read_text()
+    counts = [sum(json.loads(about)["points"].values()) for about in re.findall(r'class="about">(.*?)</script>', text)]
+    assert len(counts) == 2 and all(700 < count <= 1000 for count in counts)
+
+
+def test_a_page_of_three_objects_of_a_million_points_stays_below_15_mb(tmp_path):
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(1_000_000, 3))
+    points *= (5 + rng.normal(0, 0.01, (1_000_000, 1))) / np.linalg.norm(points, axis=1, keepdims=True)
+    colors = np.clip(rng.normal(128, 40, (1_000_000, 1)) + rng.normal(0, 10, (1_000_000, 3)), 0, 255)
+    fields = {"deviation": rng.gamma(2, 0.01, 1_000_000).astype(np.float32)}
+    fields |= {
+        name: rng.integers(0, most, 1_000_000).astype(np.uint8) for name, most in (("evidence", 4), ("source", 2))
+    }
+    after = Cloud(points, (points / 5).astype(np.float32), colors.astype(np.uint8), fields)
+    whole = view_of(after[fields["source"] == 0], after)
+    of_object, of_scene = (replace(whole, cloud=thin(whole.cloud, most)) for most in (VIEW_POINTS, SCENE_POINTS))
+    views = {"house": of_object, "shed": of_object, "barn": of_object, "all": of_scene}
+    assert sum(len(view.cloud) for view in views.values()) > 600_000
+    page = report(tmp_path, views)
+    assert 3_000_000 < page.stat().st_size < 11_000_000  # the pictures of three objects take 3 MB
+    with chromium() as browser:
+        browser.open(page)
+        for name in views:
+            ready(browser, name)
+        assert browser.complaints() == []
