@@ -37,11 +37,14 @@ LEAST_VIEWS = 3
 SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
 """Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 the sparser side where that is more; never farther than this share of the diagonal."""
+CLEARLY = 1.5
+"""The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
+denser ones, and equals would alternate."""
 SMOOTH_POINTS = 8
 """Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
 SUPPORT = 0.5
-"""Share of the neighbours of a measured point that are measured too, for it to be part of the surface that hides and is
-seen: here and there a point matches by chance."""
+"""Share of a point and its neighbours that photos must confirm for it to be measured: here and there a point matches by
+chance."""
 NORMAL_POINTS = 16
 """Neighbours that a missing normal is fitted to."""
 
@@ -82,8 +85,8 @@ class Weighed:
 def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
     """Check the points of an object and of the scene around it in the photos of both.
 
-    A point is measured where three photos of its own side confirm it; a scene's point also where three of the object's
-    do. A side without photos is judged by the other's. Measured points are the surface that hides and is seen: what
+    A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
+    where three of the object's do. A side without photos is judged by the other's. Measured points are the surface that hides and is seen: what
     photos see through, and what no photo can see, is not there. Where both sides measured a place, the smaller
     standard deviation stays.
 
@@ -95,42 +98,43 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
     obj, scene = replace(obj, cloud=_with_normals(obj.cloud)), replace(scene, cloud=_with_normals(scene.cloud))
     diagonal = obj.cloud.diagonal
     of_obj, of_scene = _own(obj, scene), _own(scene, obj)
-    found = settle(obj.cloud[of_obj.measured], scene.cloud[of_scene.measured], diagonal)
+    on_obj = _supported(obj.cloud.points, of_obj.measured)
+    on_scene = _supported(scene.cloud.points, of_scene.measured)
+    found = settle(obj.cloud[on_obj], scene.cloud[on_scene], diagonal)
     settled, moved = found or (Sim3.identity(), None)
     obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
     across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
-    measured = of_scene.measured | across.measured
-    surface = obj.cloud[_supported(obj.cloud.points, of_obj.measured)]
+    on_scene = _supported(scene.cloud.points, of_scene.measured | across.measured)
+    surface = obj.cloud[on_obj]
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
     reason[seen.through >= LEAST_THROUGH] = SEEN_THROUGH
-    left = measured & (reason == KEPT)
-    surface = concatenate([surface, scene.cloud[_supported(scene.cloud.points, left)]])
-    behind = _seen(obj.cloud.points, surface, obj, scene, diagonal)
+    left = on_scene & (reason == KEPT)
+    behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
-    added = of_obj.measured & ~contradicted
-    worse, better = _compare(obj.cloud.points, of_obj, added, scene.cloud.points, of_scene, left, diagonal)
-    reason[(reason == KEPT) & worse] = REPLACED
-    added &= ~better
-    if nerf_only:
-        added |= _gaps(obj.cloud.points, ~of_obj.measured & ~contradicted, added, scene.cloud.points[reason == KEPT])
+    added = on_obj & ~contradicted
     sure = replace(of_scene, photos=np.maximum(of_scene.photos, across.photos),
                    match=np.maximum(of_scene.match, across.match),
                    deviation=np.minimum(of_scene.deviation, across.deviation))  # fmt: skip
+    worse, better = _compare(obj.cloud.points, of_obj, added, scene.cloud.points, sure, left, diagonal)
+    reason[(reason == KEPT) & worse] = REPLACED
+    added &= ~better
+    if nerf_only:
+        added |= _gaps(obj.cloud.points, ~on_obj & ~contradicted, added, scene.cloud.points[reason == KEPT])
     return Weighed(
-        settled, moved, with_evidence(obj.cloud, of_obj, NERF_ONLY), added, contradicted,
-        with_evidence(scene.cloud, sure, STEREO_ONLY), reason, _notes(obj, scene, of_obj, moved),
+        settled, moved, with_evidence(obj.cloud, of_obj, on_obj, NERF_ONLY), added, contradicted,
+        with_evidence(scene.cloud, sure, on_scene, STEREO_ONLY), reason, _notes(obj, scene, on_obj, moved),
     )  # fmt: skip
 
 
-def _notes(obj: Side, scene: Side, of_obj: Matches, moved: float | None) -> tuple[str, ...]:
+def _notes(obj: Side, scene: Side, on_obj: NDArray[np.bool_], moved: float | None) -> tuple[str, ...]:
     """What a user should know of the check."""
     notes = []
     for side, name, other in ((obj, "object", "scene"), (scene, "scene", "object")):
         if len(side.photos.views) < LEAST_PHOTOS:
             notes.append(f"fewer than {LEAST_PHOTOS} photos of the {name} see it: it is judged by those of the {other}")
-    if not of_obj.measured.any():
+    if not on_obj.any():
         notes.append("no photo confirms any point of the object, so nothing is added")
     if moved is None:
         notes.append(
@@ -145,24 +149,21 @@ def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
     return ((scene.points >= low - margin) & (scene.points <= high + margin)).all(1)
 
 
-def with_evidence(cloud: Cloud, matches: Matches, otherwise: int) -> Cloud:
-    """The cloud with only these fields: what photos know of its points, and `evidence`, `otherwise` if not MEASURED."""
+def with_evidence(cloud: Cloud, matches: Matches, measured: NDArray[np.bool_], otherwise: int) -> Cloud:
+    """The cloud with only these fields: what photos know of its points, and `evidence`: MEASURED or `otherwise`."""
     fields: dict[str, NDArray[Any]] = {
         "photos": matches.photos.astype(np.uint16),
         "match": np.where(matches.tested > 0, matches.match, np.nan).astype(np.float32),
         "deviation": np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32),
-        "evidence": np.where(matches.measured, MEASURED, otherwise).astype(np.uint8),
+        "evidence": np.where(measured, MEASURED, otherwise).astype(np.uint8),
     }
     return replace(cloud, fields=fields)
 
 
 def unchecked(cloud: Cloud) -> Cloud:
     """The cloud with the same fields, empty: no photo was asked."""
-    nothing = np.full(len(cloud), np.nan)
-    return with_evidence(
-        cloud, Matches(nothing, np.zeros(len(cloud), np.int64), np.zeros(len(cloud), np.int64), *[nothing] * 3),
-        UNCHECKED,
-    )  # fmt: skip
+    nothing, none = np.full(len(cloud), np.nan), np.zeros(len(cloud), np.int64)
+    return with_evidence(cloud, Matches(nothing, none, none, *[nothing] * 3), none > 0, UNCHECKED)
 
 
 def _with_normals(cloud: Cloud) -> Cloud:
@@ -205,6 +206,24 @@ def _compare(
     # What the scene did not measure lies as far off as what it measured, at least.
     typical = float(np.median(theirs[on_scene])) if on_scene.any() else 0.0
     step = SAME_SPACINGS * max(spacing(obj[on_obj]), spacing(scene) if len(scene) > 1 else 0.0)
+
+    def same(distance: Array, first: Array, second: Array) -> NDArray[np.bool_]:
+        common = np.hypot(first, np.where(np.isfinite(second), second, typical))
+        return np.asarray(distance <= np.clip(SAME_DEVIATIONS * common, step, SAME_MOST * diagonal))
+
+    distance, partner = cKDTree(obj[on_obj]).query(scene, workers=threads())
+    worse = same(distance, mine[partner], theirs) & (mine[partner] <= CLEARLY * theirs)
+    if on_scene.any():
+        distance, partner = cKDTree(scene[on_scene]).query(obj[on_obj], workers=threads())
+        other = theirs[on_scene][partner]
+        better[on_obj] = same(distance, mine, other) & (mine > CLEARLY * other)
+    return worse, better
+    mine = _smooth(obj[on_obj], of_obj.deviation[on_obj])
+    theirs = np.full(len(scene), np.inf)
+    theirs[on_scene] = _smooth(scene[on_scene], of_scene.deviation[on_scene])
+    # What the scene did not measure lies as far off as what it measured, at least.
+    typical = float(np.median(theirs[on_scene])) if on_scene.any() else 0.0
+    step = SAME_SPACINGS * max(spacing(obj[on_obj]), spacing(scene) if len(scene) > 1 else 0.0)
     distance, partner = cKDTree(obj[on_obj]).query(scene, workers=threads())
     common = np.hypot(mine[partner], np.where(np.isfinite(theirs), theirs, typical))
     same = distance <= np.clip(SAME_DEVIATIONS * common, step, SAME_MOST * diagonal)
@@ -218,7 +237,7 @@ def _compare(
 
 
 def _supported(points: Array, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(N,) measured points among whose neighbours measured ones are in the majority."""
+    """(N,) points that photos confirm with most of their neighbours."""
     if not measured.any():
         return measured
     near = cKDTree(points).query(points[measured], k=min(SMOOTH_POINTS + 1, len(points)), workers=threads())[1]
