@@ -3,6 +3,8 @@
 Source: Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
 """
 
+import math
+
 import cv2
 import numpy as np
 import torch
@@ -17,6 +19,8 @@ HIGH_PASS_PX = 12.0
 """Slower changes of brightness are taken away before matching, so that sums over a window stay small and exact."""
 FLAT = 1.5e-5
 """One grey level of 255, squared: keeps windows without texture from matching anything."""
+ALIKE = 0.1
+"""Difference of grey values, 0..1, at which a pixel's weight in its neighbour's support has fallen to 1 / e."""
 OUTSIDE = -0.5
 """Score of a hypothesis outside a source photo: worse than a window that does not match."""
 
@@ -27,7 +31,7 @@ class Matcher:
     Attributes:
         reference: (h, w) float32 the photo, high-passed.
         mean, variance: (h, w) of its windows.
-        window: their side.
+        along, across: (h, window, w) weights of the pixels in a window, see `support_weights`.
         best: sources that count.
     """
 
@@ -39,19 +43,21 @@ class Matcher:
         window_px: int,
         device: torch.device | str,
         high_pass_px: float = HIGH_PASS_PX,
+        flat: float = FLAT,
     ) -> None:
         """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
 
         Small photos may keep their slow changes of brightness: `high_pass_px` 0.
         """
         height, width = reference.height, reference.width
-        self.window, self.best = window_px, min(best_sources, len(sources))
+        self.best, self.flat = min(best_sources, len(sources)), flat
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
         self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
-        self.mean = box(self.reference, self.window)
-        self.variance = (box(self.reference**2, self.window) - self.mean**2).clamp(min=0)
+        self.along, self.across = support_weights(torch.from_numpy(reference.pixels).to(device), window_px)
+        self.mean = self._mean(self.reference)
+        self.variance = (self._mean(self.reference**2) - self.mean**2).clamp(min=0)
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
         for source in sources:
             turn = source.cam_from_world[:3, :3] @ rotation.T
@@ -77,8 +83,9 @@ class Matcher:
 
     def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """The same as `keep_best`, by the CPU's kernel."""
-        photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
-        keep_best_on_cpu(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
+        windows = self.reference, self.mean, self.variance, self.along, self.across
+        first, last = (inverse.contiguous(), *windows), (gray[0, 0], directions, move, best)
+        keep_best_on_cpu(*(p.numpy() for p in first), np.float32(self.flat), *(p.numpy() for p in last))  # type: ignore[call-arg]
 
     def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """Put the scores of one of `sources` among the best (K, D, h, w), the largest first."""
@@ -107,11 +114,20 @@ class Matcher:
         grid = grid.reshape(1, count * height, width, 2)
         warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)
         warped = warped.reshape(count, height, width)
-        mean = box(warped, self.window)
-        variance = (box(warped * warped, self.window) - mean * mean).clamp(min=0)
-        covariance = box(warped * self.reference, self.window) - mean * self.mean
-        ncc = covariance / torch.sqrt((variance + FLAT) * (self.variance + FLAT))
+        mean = self._mean(warped)
+        variance = (self._mean(warped * warped) - mean * mean).clamp(min=0)
+        covariance = self._mean(warped * self.reference) - mean * self.mean
+        ncc = covariance / torch.sqrt((variance + self.flat) * (self.variance + self.flat))
         return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE))
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """Weighted mean of values (..., h, w) over the support of each pixel."""
+        window, radius = self.along.shape[1], self.along.shape[1] // 2
+        height, width = values.shape[-2:]
+        row = F.pad(values, (radius, radius))
+        sums = sum(self.along[:, k] * row[..., k : k + width] for k in range(window))
+        rows = F.pad(sums, (0, 0, radius, radius))  # type: ignore[arg-type]
+        return sum(self.across[:, k] * rows[..., k : k + height, :] for k in range(window))  # type: ignore[return-value]
 
     def shift_per_inverse_depth(self, low: float, high: float) -> float:
         """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
@@ -128,6 +144,31 @@ class Matcher:
                 length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
                 shifts.append(float(length[inside].median()))
         return max(shifts)
+
+
+def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
+    """Weights of the pixels along a row, and of the rows across it, in each pixel's support: (h, window, w) each.
+
+    A pixel counts as far as it is near and of the same grey (Yoon, Kweon 2006), along the rows first and then across
+    them (Pham, van Vliet 2005), so that a window of n x n pixels costs 2 n products. A pixel's weights sum to one, and
+    are zero outside the photo.
+
+    Args:
+        gray: (h, w) in 0..1.
+        window: its side, odd.
+    """
+    radius = window // 2
+    parts = []
+    for axis in (0, 1):
+        values = gray.movedim(axis, 0)  # the axis that the support runs along, first
+        padded = F.pad(values, (0, 0, radius, radius), value=float("inf"))
+        steps = [padded[k : k + len(values)] - values for k in range(window)]
+        near = [math.exp(-abs(k - radius) / radius) for k in range(window)]
+        parts.append(torch.stack([n * torch.exp(-step.abs() / ALIKE) for n, step in zip(near, steps)]).movedim(1, 1 + axis))
+    across, along = (part.transpose(0, 1).contiguous() for part in parts)
+    along /= along.sum(1, keepdim=True)
+    across /= across.sum(1, keepdim=True)
+    return along, across
 
 
 def box(values: Tensor, window: int) -> Tensor:
