@@ -19,7 +19,8 @@ HIGH_PASS_PX = 12.0
 """Slower changes of brightness are taken away before matching, so that sums over a window stay small and exact."""
 FLAT = 1.5e-5
 """One grey level of 255, squared: keeps windows without texture from matching anything."""
-ALIKE = 0.1
+ALIKE = 0.07
+FLOOR, POW, FALL = 0.0, 1, 0.6
 """Difference of grey values, 0..1, at which a pixel's weight in its neighbour's support has fallen to 1 / e."""
 OUTSIDE = -0.5
 """Score of a hypothesis outside a source photo: worse than a window that does not match."""
@@ -55,7 +56,8 @@ class Matcher:
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
         self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
-        self.along, self.across = support_weights(torch.from_numpy(reference.pixels).to(device), window_px)
+        self.gray = torch.from_numpy(reference.pixels).to(device)
+        self.along, self.across = support_weights(self.gray, window_px)
         self.mean = self._mean(self.reference)
         self.variance = (self._mean(self.reference**2) - self.mean**2).clamp(min=0)
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -163,8 +165,8 @@ def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
         values = gray.movedim(axis, 0)  # the axis that the support runs along, first
         padded = F.pad(values, (0, 0, radius, radius), value=float("inf"))
         steps = [padded[k : k + len(values)] - values for k in range(window)]
-        near = [math.exp(-abs(k - radius) / radius) for k in range(window)]
-        parts.append(torch.stack([n * torch.exp(-step.abs() / ALIKE) for n, step in zip(near, steps)]).movedim(1, 1 + axis))
+        near = [math.exp(-abs(k - radius) / radius / FALL) for k in range(window)]
+        parts.append(torch.stack([n * (FLOOR + (1-FLOOR) * torch.exp(-(step.abs() / ALIKE)**POW)) * (step.abs() < 9) for n, step in zip(near, steps)]).movedim(1, 1 + axis))
     across, along = (part.transpose(0, 1).contiguous() for part in parts)
     along /= along.sum(1, keepdim=True)
     across /= across.sum(1, keepdim=True)

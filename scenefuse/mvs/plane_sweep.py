@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from scenefuse.mvs.matcher import Matcher, box
+from scenefuse.mvs.matcher import FLAT, Matcher, box
 from scenefuse.stage import setting
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
@@ -92,14 +92,18 @@ def estimate_depth(
         first, *others = (v.resized(*size) for v, size in zip((reference, *sources), sizes))
         matcher = Matcher(first, others, settings.best_sources, settings.window_px, device)
         if level == 0:
-            inverse, step = _sweep(matcher, 1 / far, 1 / near, settings)
+            inverse, step, measured = _sweep(matcher, 1 / far, 1 / near, settings)
         else:
             inverse, step = _upsampled(inverse, first.width, first.height), step / 2
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
-    inverse, slopes = _local_planes(inverse, score)
+    inverse, _ = _local_planes(inverse, score, int(PW))
     inverse, score = _refine_once(matcher, inverse[None], step / 2)
+    _, slopes = _local_planes(inverse, score, int(NW))
     normals = _normals(inverse, slopes, reference.intrinsics)
     good = (score >= settings.min_score) & (inverse > 0.5 / far)
+    good &= _upsampled(measured.float(), reference.width, reference.height) >= 0.5
+    if LEAD > 0:
+        good &= _alone(matcher, inverse, score, AWAY * step)
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
@@ -137,7 +141,7 @@ def refine_by_matching(
     return refined.cpu().numpy(), moved.cpu().numpy(), inconsistent.cpu().numpy() & known
 
 
-def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float]:
+def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float, Tensor]:
     """Inverse depth per pixel, (h, w), by a fronto-parallel sweep with semi-global smoothing, and the plane step."""
     shift = matcher.shift_per_inverse_depth(low, high)
     count = int(np.clip(math.ceil(shift / 0.75), 16, settings.planes))
@@ -153,7 +157,30 @@ def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings
     before, middle, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     step = (high - low) / (count - 1)
     inverse = planes[chosen] + step * _parabola(before, middle, after) * (inner == chosen)
-    return inverse, step
+    lead = _lead(cost, chosen)
+    if DUMP is not None:
+        DUMP.update(lead=lead, variance=matcher.variance, chosen=chosen, cost=cost)
+    return inverse, step, lead >= SWEEP_LEAD + NOISE * FLAT / matcher.variance.clamp(min=1e-9)
+
+
+DUMP = None
+
+
+def _lead(cost: Tensor, chosen: Tensor) -> Tensor:
+    """By how much the match at a chosen plane (h, w) beats every other peak of a (D, h, w) matching cost."""
+    height, width = chosen.shape
+    rival = torch.full_like(cost[0], 2.0)
+    own = torch.full_like(cost[0], 2.0)
+    for d in range(len(cost)):
+        off = (chosen - d).abs()
+        own = torch.where(off <= 1, torch.minimum(own, cost[d]), own)
+        peak = off > 2
+        if d > 0:
+            peak &= cost[d] <= cost[d - 1]
+        if d + 1 < len(cost):
+            peak &= cost[d] <= cost[d + 1]
+        rival = torch.where(peak, torch.minimum(rival, cost[d]), rival)
+    return rival - own
 
 
 def _semi_global(cost: Tensor, small: float, large: float) -> Tensor:
@@ -263,6 +290,25 @@ def _normals(inverse: Tensor, slopes: Tensor, intrinsics: Array) -> Tensor:
     # n . X = d and X = z K^-1 x give 1/z = n . K^-1 x / d: linear in the pixel.
     n = torch.stack([slopes[0] * fx, slopes[1] * fy, inverse - slopes[0] * (u - cx) - slopes[1] * (v - cy)], dim=-1)
     return -F.normalize(n, dim=-1)
+
+
+NW=11
+PW=9
+SWEEP_LEAD=0.05
+NOISE=1.0
+AWAY, LEAD = 1.0, 0.05
+RADIUS=3
+
+def _alone(matcher: Matcher, inverse: Tensor, score: Tensor, away: float) -> Tensor:
+    """True (h, w) where no depth from beyond an edge nearby matches about as well."""
+    alone = torch.ones_like(score, dtype=torch.bool)
+    side = 2 * int(RADIUS) + 1
+    lead = LEAD + matcher.flat*1 / matcher.variance.clamp(min=1e-9)
+    for sign in (-1, 1):
+        other = sign * F.max_pool2d(sign * inverse[None], side, 1, int(RADIUS))[0]
+        rival = matcher.score(other[None])[0]
+        alone &= ((other - inverse).abs() <= away) | (rival < score - lead)
+    return alone
 
 
 def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:
