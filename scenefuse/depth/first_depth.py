@@ -129,7 +129,7 @@ def _best_hypothesis(
     sources = [_gray(photos, int(source), WHOLE, shrink) for source in chosen]
     depths = depth_from_disparity(hypotheses.clamp(0.0, 1.0), photos.near, photos.far)
     window = WINDOW_PX if shrink == 1 else COARSE_WINDOW_PX
-    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, high_pass_px=0, flat=SMALL_WINDOW_FLAT)
+    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, flat=SMALL_WINDOW_FLAT)
     scores = matcher.score((1.0 / depths).contiguous())
     moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
     outside = _outside_silhouettes(photos.masks[chosen], depths, moves, reference, sources)

@@ -3,9 +3,6 @@
 Source: Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
 """
 
-import math
-
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -15,13 +12,13 @@ from torch import Tensor
 from scenefuse.mvs.matching_kernel import keep_best as keep_best_on_cpu
 from scenefuse.workspace import View
 
-HIGH_PASS_PX = 12.0
-"""Slower changes of brightness are taken away before matching, so that sums over a window stay small and exact."""
 FLAT = 1.5e-5
-"""One grey level of 255, squared: keeps windows without texture from matching anything."""
-ALIKE = 0.07
-FLOOR, POW, FALL = 0.0, 1, 0.6
-"""Difference of grey values, 0..1, at which a pixel's weight in its neighbour's support has fallen to 1 / e."""
+"""One grey level of 255, squared, the noise of a photo: keeps windows without texture from matching anything."""
+ALIKE, UNLIKE = 0.07, 0.28
+"""Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e, and at which it ends: beside
+a dark statue, the smallest weight is texture enough for a blank sky to match at the statue's depth."""
+FALL = 0.6
+"""Distance, in radii of the window, at which it falls to 1 / e."""
 OUTSIDE = -0.5
 """Score of a hypothesis outside a source photo: worse than a window that does not match."""
 
@@ -30,7 +27,7 @@ class Matcher:
     """Scores inverse-depth hypotheses of one reference photo by the mean NCC of its best sources.
 
     Attributes:
-        reference: (h, w) float32 the photo, high-passed.
+        reference: (h, w) float32 the photo, without its mean.
         mean, variance: (h, w) of its windows.
         along, across: (h, window, w) weights of the pixels in a window, see `support_weights`.
         best: sources that count.
@@ -43,21 +40,19 @@ class Matcher:
         best_sources: int,
         window_px: int,
         device: torch.device | str,
-        high_pass_px: float = HIGH_PASS_PX,
         flat: float = FLAT,
     ) -> None:
         """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
 
-        Small photos may keep their slow changes of brightness: `high_pass_px` 0.
+        `flat` is the variance that is added to all windows', see FLAT.
         """
         height, width = reference.height, reference.width
         self.best, self.flat = min(best_sources, len(sources)), flat
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
-        self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
-        self.gray = torch.from_numpy(reference.pixels).to(device)
-        self.along, self.across = support_weights(self.gray, window_px)
+        self.reference = torch.from_numpy(_centred(reference.pixels)).to(device)
+        self.along, self.across = support_weights(self.reference, window_px)
         self.mean = self._mean(self.reference)
         self.variance = (self._mean(self.reference**2) - self.mean**2).clamp(min=0)
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -69,7 +64,7 @@ class Matcher:
             directions = (to_grid @ turn @ rays).reshape(3, height, width)
             self.sources.append(
                 (
-                    torch.from_numpy(_high_pass(source.pixels, high_pass_px))[None, None].to(device),
+                    torch.from_numpy(_centred(source.pixels))[None, None].to(device),
                     torch.from_numpy(directions.astype(np.float32)).to(device),
                     torch.from_numpy((to_grid @ move).astype(np.float32)).to(device),
                 )
@@ -149,7 +144,7 @@ class Matcher:
 
 
 def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    """Weights of the pixels along a row, and of the rows across it, in each pixel's support: (h, window, w) each.
+    """Weights of pixels along a row, and of rows across it, in each pixel's support, (h, window, w) each.
 
     A pixel counts as far as it is near and of the same grey (Yoon, Kweon 2006), along the rows first and then across
     them (Pham, van Vliet 2005), so that a window of n x n pixels costs 2 n products. A pixel's weights sum to one, and
@@ -164,13 +159,14 @@ def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
     for axis in (0, 1):
         values = gray.movedim(axis, 0)  # the axis that the support runs along, first
         padded = F.pad(values, (0, 0, radius, radius), value=float("inf"))
-        steps = [padded[k : k + len(values)] - values for k in range(window)]
-        near = [math.exp(-abs(k - radius) / radius / FALL) for k in range(window)]
-        parts.append(torch.stack([n * (FLOOR + (1-FLOOR) * torch.exp(-(step.abs() / ALIKE)**POW)) * (step.abs() < 9) for n, step in zip(near, steps)]).movedim(1, 1 + axis))
-    across, along = (part.transpose(0, 1).contiguous() for part in parts)
-    along /= along.sum(1, keepdim=True)
-    across /= across.sum(1, keepdim=True)
-    return along, across
+        weights = []
+        for k in range(window):
+            step = (padded[k : k + len(values)] - values).abs()
+            weights.append(torch.exp(-step / ALIKE - abs(k - radius) / (FALL * radius)) * (step < UNLIKE))
+        stacked = torch.stack(weights, dim=1)
+        stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
+        parts.append(stacked.contiguous())
+    return parts[1], parts[0]
 
 
 def box(values: Tensor, window: int) -> Tensor:
@@ -182,6 +178,6 @@ def box(values: Tensor, window: int) -> Tensor:
     return (sums[..., window:, :] - sums[..., :-window, :]) / window**2
 
 
-def _high_pass(gray: NDArray[np.float32], high_pass_px: float) -> NDArray[np.float32]:
-    """The photo (H, W) without its slow changes of brightness, or with 0 without its mean."""
-    return gray - (cv2.GaussianBlur(gray, (0, 0), high_pass_px) if high_pass_px else gray.mean())
+def _centred(gray: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The photo (H, W) without its mean, so that sums of squares stay small and exact."""
+    return gray - gray.mean()

@@ -67,9 +67,10 @@ def _sums_along(value, reference, weight, sums):
     for k in range(3):
         for x in range(width):
             inner[x] = value[x] * (_ONE if k == 0 else value[x] if k == 1 else reference[x])
-        out = sums[k * width : (k + 1) * width]
-        out[:] = _ZERO
-        for w in range(len(weight)):
+        out, share = sums[k * width : (k + 1) * width], weight[0]
+        for x in range(width):
+            out[x] = share[x] * row[x]
+        for w in range(1, len(weight)):
             shifted, share = row[w : w + width], weight[w]
             for x in range(width):
                 out[x] += share[x] * shifted[x]
@@ -81,14 +82,17 @@ def _sum_across(rows, first, weight, total):
 
     weight (window, w): of the rows from top to bottom in the support of each pixel.
     """
-    width = weight.shape[1]
-    total[:] = _ZERO
-    for w in range(len(rows)):
-        row, share = rows[(first + w) % len(rows)], weight[w]
-        for k in range(3):
-            out, part = total[k * width : (k + 1) * width], row[k * width : (k + 1) * width]
-            for x in range(width):
-                out[x] += share[x] * part[x]
+    window, width = weight.shape
+    for k in range(3):
+        out = total[k * width : (k + 1) * width]
+        for w in range(window):
+            part, share = rows[(first + w) % window, k * width : (k + 1) * width], weight[w]
+            if w == 0:
+                for x in range(width):
+                    out[x] = share[x] * part[x]
+            else:
+                for x in range(width):
+                    out[x] += share[x] * part[x]
 
 
 @njit(fastmath=_MATH, error_model="numpy")

@@ -92,7 +92,7 @@ def estimate_depth(
         first, *others = (v.resized(*size) for v, size in zip((reference, *sources), sizes))
         matcher = Matcher(first, others, settings.best_sources, settings.window_px, device)
         if level == 0:
-            inverse, step, measured = _sweep(matcher, 1 / far, 1 / near, settings)
+            inverse, step = _sweep(matcher, 1 / far, 1 / near, settings)
         else:
             inverse, step = _upsampled(inverse, first.width, first.height), step / 2
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
@@ -101,9 +101,10 @@ def estimate_depth(
     _, slopes = _local_planes(inverse, score, int(NW))
     normals = _normals(inverse, slopes, reference.intrinsics)
     good = (score >= settings.min_score) & (inverse > 0.5 / far)
-    good &= _upsampled(measured.float(), reference.width, reference.height) >= 0.5
-    if LEAD > 0:
-        good &= _alone(matcher, inverse, score, AWAY * step)
+    beside = matcher.score(torch.stack([inverse - OFF * step, inverse + OFF * step])).amax(0)
+    if DUMP is not None:
+        DUMP.update(score=score.numpy(), beside=beside.numpy(), variance=matcher.variance.numpy(), inverse=inverse.numpy())
+    good &= score - beside >= PEAK
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
@@ -141,7 +142,7 @@ def refine_by_matching(
     return refined.cpu().numpy(), moved.cpu().numpy(), inconsistent.cpu().numpy() & known
 
 
-def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float, Tensor]:
+def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings) -> tuple[Tensor, float]:
     """Inverse depth per pixel, (h, w), by a fronto-parallel sweep with semi-global smoothing, and the plane step."""
     shift = matcher.shift_per_inverse_depth(low, high)
     count = int(np.clip(math.ceil(shift / 0.75), 16, settings.planes))
@@ -157,30 +158,7 @@ def _sweep(matcher: Matcher, low: float, high: float, settings: DepthMapSettings
     before, middle, after = (total.gather(0, (inner + k)[None])[0] for k in (-1, 0, 1))
     step = (high - low) / (count - 1)
     inverse = planes[chosen] + step * _parabola(before, middle, after) * (inner == chosen)
-    lead = _lead(cost, chosen)
-    if DUMP is not None:
-        DUMP.update(lead=lead, variance=matcher.variance, chosen=chosen, cost=cost)
-    return inverse, step, lead >= SWEEP_LEAD + NOISE * FLAT / matcher.variance.clamp(min=1e-9)
-
-
-DUMP = None
-
-
-def _lead(cost: Tensor, chosen: Tensor) -> Tensor:
-    """By how much the match at a chosen plane (h, w) beats every other peak of a (D, h, w) matching cost."""
-    height, width = chosen.shape
-    rival = torch.full_like(cost[0], 2.0)
-    own = torch.full_like(cost[0], 2.0)
-    for d in range(len(cost)):
-        off = (chosen - d).abs()
-        own = torch.where(off <= 1, torch.minimum(own, cost[d]), own)
-        peak = off > 2
-        if d > 0:
-            peak &= cost[d] <= cost[d - 1]
-        if d + 1 < len(cost):
-            peak &= cost[d] <= cost[d + 1]
-        rival = torch.where(peak, torch.minimum(rival, cost[d]), rival)
-    return rival - own
+    return inverse, step
 
 
 def _semi_global(cost: Tensor, small: float, large: float) -> Tensor:
@@ -294,21 +272,9 @@ def _normals(inverse: Tensor, slopes: Tensor, intrinsics: Array) -> Tensor:
 
 NW=11
 PW=9
-SWEEP_LEAD=0.05
-NOISE=1.0
-AWAY, LEAD = 1.0, 0.05
-RADIUS=3
-
-def _alone(matcher: Matcher, inverse: Tensor, score: Tensor, away: float) -> Tensor:
-    """True (h, w) where no depth from beyond an edge nearby matches about as well."""
-    alone = torch.ones_like(score, dtype=torch.bool)
-    side = 2 * int(RADIUS) + 1
-    lead = LEAD + matcher.flat*1 / matcher.variance.clamp(min=1e-9)
-    for sign in (-1, 1):
-        other = sign * F.max_pool2d(sign * inverse[None], side, 1, int(RADIUS))[0]
-        rival = matcher.score(other[None])[0]
-        alone &= ((other - inverse).abs() <= away) | (rival < score - lead)
-    return alone
+OFF = 2.0
+PEAK = 0.1
+DUMP = None
 
 
 def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:
