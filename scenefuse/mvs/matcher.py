@@ -119,12 +119,7 @@ class Matcher:
 
     def _mean(self, values: Tensor) -> Tensor:
         """Weighted mean of values (..., h, w) over the support of each pixel."""
-        window, radius = self.along.shape[1], self.along.shape[1] // 2
-        height, width = values.shape[-2:]
-        row = F.pad(values, (radius, radius))
-        sums = sum(self.along[:, k] * row[..., k : k + width] for k in range(window))
-        rows = F.pad(sums, (0, 0, radius, radius))  # type: ignore[arg-type]
-        return sum(self.across[:, k] * rows[..., k : k + height, :] for k in range(window))  # type: ignore[return-value]
+        return supported_mean(values, self.along, self.across)
 
     def shift_per_inverse_depth(self, low: float, high: float) -> float:
         """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
@@ -167,6 +162,20 @@ def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
         stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
         parts.append(stacked.contiguous())
     return parts[1], parts[0]
+
+
+def supported_mean(values: Tensor, along: Tensor, across: Tensor) -> Tensor:
+    """Mean of values (..., h, w) over each pixel's support, weighted as `support_weights` says."""
+    window, radius = along.shape[1], along.shape[1] // 2
+    height, width = values.shape[-2:]
+    row = F.pad(values, (radius, radius))
+    sums, total = torch.zeros_like(values), torch.zeros_like(values)
+    for k in range(window):
+        sums.addcmul_(along[:, k], row[..., k : k + width])
+    rows = F.pad(sums, (0, 0, radius, radius))
+    for k in range(window):
+        total.addcmul_(across[:, k], rows[..., k : k + height, :])
+    return total
 
 
 def box(values: Tensor, window: int) -> Tensor:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from scenefuse.mvs.matcher import FLAT, Matcher, box
+from scenefuse.mvs.matcher import Matcher, box, support_weights, supported_mean
 from scenefuse.stage import setting
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
@@ -105,6 +105,7 @@ def estimate_depth(
     if DUMP is not None:
         DUMP.update(score=score.numpy(), beside=beside.numpy(), variance=matcher.variance.numpy(), inverse=inverse.numpy())
     good &= score - beside >= PEAK
+    good &= ~_blank(matcher, good)
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
@@ -275,6 +276,18 @@ PW=9
 OFF = 2.0
 PEAK = 0.1
 DUMP = None
+
+
+BLANK_WINDOW, BLANK_SHARE = 11, 0.25
+
+
+def _blank(matcher: Matcher, measured: Tensor) -> Tensor:
+    """True (h, w) where the pixels around that look alike have no texture, and no depth of their own."""
+    along, across = support_weights(matcher.reference, BLANK_WINDOW)
+    known, empty = measured.float(), ((matcher.variance < matcher.flat) & ~measured).float()
+    for _ in range(2):
+        known, empty = (supported_mean(values, along, across) for values in (known, empty))
+    return empty > BLANK_SHARE * (known + empty)
 
 
 def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:

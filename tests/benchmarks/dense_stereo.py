@@ -48,6 +48,8 @@ EDGE_PX, JUMP = 7, 0.03
 """A pixel lies beside an edge where a surface so much nearer (a share of the depth) is within so many pixels of it."""
 SKY_BRIGHTNESS, SKY_CHANGE = 150, 12
 """Sky, in 255ths: brighter than this, connected to the top of the photo without a larger step between two pixels."""
+SKY_SPREAD, SKY_PATCH_PX = 15, 60
+"""Patches of sky that the statue encloses: at most so much darker than the sky's middle, and at least so large."""
 OFF_SHARE = 0.15
 """A point is sky where it lies in the sky of so many of the photos that have it in view: no surface does."""
 
@@ -174,6 +176,10 @@ def sky_of(photo: NDArray[np.uint8]) -> NDArray[np.bool_]:
     smooth = (low > SKY_BRIGHTNESS) & (steps < SKY_CHANGE)
     labels, _ = ndimage.label(smooth)
     sky = np.isin(labels, np.unique(labels[0][labels[0] > 0]))
+    # Between arms and legs: as bright as the sky above.
+    enclosed = ndimage.label((low > np.median(low[sky]) - SKY_SPREAD) & ~sky)[0] if sky.any() else sky.astype(int)
+    large = np.flatnonzero(np.bincount(enclosed.ravel()) >= SKY_PATCH_PX)
+    sky |= np.isin(enclosed, large[large > 0]) & (steps < SKY_CHANGE)
     return ndimage.binary_dilation(sky, iterations=2) & (low > SKY_BRIGHTNESS)
 
 
