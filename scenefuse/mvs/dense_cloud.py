@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.io.units import length_unit
-from scenefuse.mvs.temporary_workspace import MAPS, linked_workspace
+from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.mvs.votes import neighbours, vote
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, value, write_json

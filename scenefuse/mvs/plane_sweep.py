@@ -17,11 +17,15 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from scenefuse.mvs.matcher import Matcher, box, support_weights, supported_mean
+from scenefuse.mvs.matcher import Matcher, box
+from scenefuse.mvs.measured import is_measured
 from scenefuse.stage import setting
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
 
+PLANE_PX, NORMAL_PX = 9, 11
+"""Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
+pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things."""
 MIN_GAIN = 0.02
 """Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere."""
 TEXTURE = 3 / 255
@@ -96,16 +100,12 @@ def estimate_depth(
         else:
             inverse, step = _upsampled(inverse, first.width, first.height), step / 2
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
-    inverse, _ = _local_planes(inverse, score, int(PW))
+    inverse, _ = _local_planes(inverse, score, PLANE_PX)
     inverse, score = _refine_once(matcher, inverse[None], step / 2)
-    _, slopes = _local_planes(inverse, score, int(NW))
+    _, slopes = _local_planes(inverse, score, NORMAL_PX)
     normals = _normals(inverse, slopes, reference.intrinsics)
-    good = (score >= settings.min_score) & (inverse > 0.5 / far)
-    beside = matcher.score(torch.stack([inverse - OFF * step, inverse + OFF * step])).amax(0)
-    if DUMP is not None:
-        DUMP.update(score=score.numpy(), beside=beside.numpy(), variance=matcher.variance.numpy(), inverse=inverse.numpy())
-    good &= score - beside >= PEAK
-    good &= ~_blank(matcher, good)
+    pixel = (1 / near - 1 / far) / max(matcher.shift_per_inverse_depth(1 / far, 1 / near), 1e-6)
+    good = is_measured(matcher, inverse, score, settings.min_score, pixel) & (inverse > 0.5 / far)
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
@@ -269,25 +269,6 @@ def _normals(inverse: Tensor, slopes: Tensor, intrinsics: Array) -> Tensor:
     # n . X = d and X = z K^-1 x give 1/z = n . K^-1 x / d: linear in the pixel.
     n = torch.stack([slopes[0] * fx, slopes[1] * fy, inverse - slopes[0] * (u - cx) - slopes[1] * (v - cy)], dim=-1)
     return -F.normalize(n, dim=-1)
-
-
-NW=11
-PW=9
-OFF = 2.0
-PEAK = 0.1
-DUMP = None
-
-
-BLANK_WINDOW, BLANK_SHARE = 11, 0.25
-
-
-def _blank(matcher: Matcher, measured: Tensor) -> Tensor:
-    """True (h, w) where the pixels around that look alike have no texture, and no depth of their own."""
-    along, across = support_weights(matcher.reference, BLANK_WINDOW)
-    known, empty = measured.float(), ((matcher.variance < matcher.flat) & ~measured).float()
-    for _ in range(2):
-        known, empty = (supported_mean(values, along, across) for values in (known, empty))
-    return empty > BLANK_SHARE * (known + empty)
 
 
 def _upsampled(inverse: Tensor, width: int, height: int) -> Tensor:

@@ -102,7 +102,8 @@ def test_matching_kernel_scores_as_its_twin(window):
     poses = np.repeat(np.eye(4)[None], 4, axis=0)
     poses[:, 0, 3], poses[:, 1, 3] = (0, 1, -2, 9), 0.1
     sizes = [(50, 70), (50, 70), (50, 70), (40, 80)]
-    photos = [View("", intrinsics, p, s[1], s[0], rng.random(s, np.float32)) for p, s in zip(poses, sizes)]
+    pixels = [cv2.GaussianBlur(rng.random(size, np.float32), (0, 0), 1) for size in sizes]
+    photos = [View("", intrinsics, p, s[1], s[0], g) for p, s, g in zip(poses, sizes, pixels)]
     matcher = Matcher(photos[0], photos[1:], 2, window, "cpu")
     # From behind the camera to far in front of it, some places beside the source photos.
     inverse = torch.linspace(-0.3, 0.5, 5)[:, None, None] + torch.from_numpy(0.05 * rng.random((5, 50, 70), np.float32))
