@@ -45,7 +45,7 @@ class DenseCloudSettings:
     """Largest distance between a pixel and the point of another photo projected into it."""
     max_depth_error: float = setting(0.01, least=0)
     """Largest relative difference of two photos' depths of a point."""
-    max_normal_error_deg: float = setting(90, unit="deg", least=0)
+    max_normal_error_deg: float = setting(30, unit="deg", least=0)
     """Largest angle between two photos' normals of a point."""
 
 

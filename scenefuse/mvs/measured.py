@@ -9,7 +9,7 @@ from torch import Tensor
 
 from scenefuse.mvs.matcher import Matcher, support_weights, supported_mean
 
-PEAK_PX = 1.5
+PEAK_PX = 2.0
 """How far beside a match, in the pixels of the source photo that moves most, it must be worse."""
 PEAK, PEAK_PER_NOISE = 0.02, 0.25
 """By how much, in NCC, and how much more for noise as strong as the texture: in that ratio noise changes NCC."""
