@@ -30,8 +30,8 @@ def read_depth(path: Path) -> NDArray[np.float32]:
 def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
     """Write an (H, W, 3) float32 map of unit normals in the camera frame; zeros mark pixels without a normal.
 
-    COLMAP's files hold all x, then all y, then all z. pycolmap.NormalMap, of 4.2 at least, takes and gives arrays in the
-    order of the file, which mixes the three up: so it is not used here.
+    COLMAP's files hold all x, then all y, then all z. pycolmap.NormalMap (4.2) takes and gives arrays in the order of
+    the file, which mixes the three up, so it is not used here.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     height, width, _ = normals.shape

@@ -27,8 +27,6 @@ MAX_TRAVERSAL_DEPTH = 100
 """Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
 CACHED_MAPS = 64
 """Depth maps that are kept in memory for the next photo's vote."""
-AGREE = 1
-"""Photos that must agree."""
 OUTLIER_NEIGHBOURS = 8
 """Neighbours whose mean distance tells a point far from all others."""
 OUTLIER_RATIO = 4.0
@@ -59,7 +57,7 @@ def fuse_depth_maps(
     cloud: Path,
     report: Path,
 ) -> None:
-    """Fuse the depth maps of all chunks into one cloud by COLMAP's stereo fusion.
+    """Let the depth maps of all chunks vote on each other, and fuse what is left by COLMAP's stereo fusion.
 
     Args:
         workspace: the undistorted COLMAP workspace that the maps belong to.
@@ -70,7 +68,7 @@ def fuse_depth_maps(
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
         report: output JSON: number of points, spacing, backend, what was dropped, the share of the pixels with a depth
-            that are in the cloud, and a note where it is small.
+            that are in the cloud, and a note where it is small, and the share that other maps voted out.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -95,7 +93,8 @@ def fuse_depth_maps(
     measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
     content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
     write_cloud(cloud, kept)
-    write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
+    content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(outvoted, "1")}
+    write_json(report, content)
 
 
 def _all(stages: list[dict[str, Any]], name: str) -> str:
@@ -184,7 +183,7 @@ def _options(settings: DenseCloudSettings) -> pycolmap.StereoFusionOptions:
 def _voted(
     workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
 ) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
-    """Each photo, its number of depths, and its depths (H, W) without those that fewer photos confirm than refute."""
+    """Each photo, its number of depths, and its depths (H, W) that more maps confirm than see through."""
     cameras = {view.name: view for view in read_views(workspace / "sparse")}
 
     @lru_cache(CACHED_MAPS)
@@ -196,7 +195,9 @@ def _voted(
         view = depths(name)
         others = [depths(other) for other in near.get(name, []) if other in maps]
         votes = vote(view, others, settings.max_depth_error, settings.max_reprojection_px)
-        stays = (votes.agree >= min(AGREE, len(others))) & (votes.agree > votes.through)
+        stays = votes.agree > votes.through
+        if settings.min_photos < 2:
+            stays |= votes.through == 0
         yield name, int((view.pixels > 0).sum()), np.where(stays, view.pixels, np.float32(0))
 
 

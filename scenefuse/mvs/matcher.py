@@ -123,7 +123,15 @@ class Matcher:
 
     def shift_per_inverse_depth(self, low: float, high: float) -> float:
         """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
-        shifts = [0.0]
+        return max(self._shifts(low, high))
+
+    def middle_shift_per_inverse_depth(self, low: float, high: float) -> float:
+        """The same in the middle one of the source photos: half of them move by at least as much."""
+        return float(np.median(self._shifts(low, high)))
+
+    def _shifts(self, low: float, high: float) -> list[float]:
+        """Shift in each source photo, in its pixels; 0 where both ends of the range never lie in it."""
+        shifts = []
         for gray, directions, move in self.sources:
             half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
             thinned = directions[:, ::8, ::8]
@@ -132,10 +140,9 @@ class Matcher:
                 p = thinned + move[:, None, None] * inverse
                 ends.append(p[:2] / p[2].clamp(min=1e-6))
             inside = (ends[0].abs().amax(0) < 1) & (ends[1].abs().amax(0) < 1)
-            if inside.any():
-                length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
-                shifts.append(float(length[inside].median()))
-        return max(shifts)
+            length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
+            shifts.append(float(length[inside].median()) if inside.any() else 0.0)
+        return shifts
 
 
 def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:

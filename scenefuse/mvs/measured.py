@@ -9,8 +9,8 @@ from torch import Tensor
 
 from scenefuse.mvs.matcher import Matcher, support_weights, supported_mean
 
-PEAK_PX = 2.0
-"""How far beside a match, in the pixels of the source photo that moves most, it must be worse."""
+PEAK_PX = 1.5
+"""How far beside a match, in pixels of the middle one of the source photos, it must be worse."""
 PEAK, PEAK_PER_NOISE = 0.02, 0.25
 """By how much, in NCC, and how much more for noise as strong as the texture: in that ratio noise changes NCC."""
 LOOK_PX = 11
@@ -27,7 +27,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
         inverse: (h, w) inverse depths.
         score: (h, w) their mean NCC.
         min_score: smallest score of a match, -1..1.
-        pixel: difference of inverse depth that moves a pixel by one in the source photo that moves most.
+        pixel: difference of inverse depth that moves a pixel by one in the middle one of the source photos.
     """
     beside = matcher.score(torch.stack([inverse - PEAK_PX * pixel, inverse + PEAK_PX * pixel])).amax(0)
     noise = matcher.flat / matcher.variance.clamp(min=1e-12)

@@ -1,7 +1,8 @@
 """A scene's depth maps and cloud, with this code and with another checkout's: accuracy, coverage, fringe, sky, time.
 
-python tests/benchmarks/dense_stereo.py --workspace results/scenes/demo/undistorted --truth results/demo/demo/truth/scene
-python tests/benchmarks/dense_stereo.py --workspace results/scenes/statue/undistorted --sky --before ../before
+python tests/benchmarks/dense_stereo.py --workspace results/scenes/demo/undistorted \\
+    --truth results/demo/demo/truth/scene --before ../before
+python tests/benchmarks/dense_stereo.py --workspace results/scenes/statue/undistorted --sky True --before ../before
 """
 
 import os
@@ -67,10 +68,12 @@ def make(checkout: Path, folder: Path, workspace: Path, stereo: str, fusion: str
     """Depth maps and cloud by a checkout's own scripts, on one thread; processor seconds of both."""
     folder.mkdir(parents=True, exist_ok=True)
     spent = []
-    for script, options in (
-        ("estimate_depth_maps", f"--chunk 0 --chunks 1 --seed 0 --depth {folder}/depth --report {folder}/depth.json {stereo}"),
-        ("fuse_depth_maps", f"--depth {folder}/depth --depth-json {folder}/depth.json --cloud {folder}/dense.ply --report {folder}/dense.json {fusion}"),
-    ):  # fmt: skip
+    maps, cloud = f"--depth {folder}/depth", f"--cloud {folder}/dense.ply --report {folder}/dense.json"
+    stages = {
+        "estimate_depth_maps": f"--chunk 0 --chunks 1 --seed 0 {maps} --report {folder}/depth.json {stereo}",
+        "fuse_depth_maps": f"{maps} --depth-json {folder}/depth.json {cloud} {fusion}",
+    }
+    for script, options in stages.items():
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         words = [sys.executable, f"scripts/mvs/{script}.py", "--workspace", str(workspace), *shlex.split(options)]
         environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
@@ -154,8 +157,8 @@ class Truth:
         return result
 
     def _beside_edges(self, made: Made, read: Workspace) -> dict[str, Any]:
-        """Share of the pixels behind an edge that got a depth on the near side of the middle, or none; normals."""
-        near, missing, angles = [], [], []
+        """Share of the pixels behind an edge that got a depth on the near side of the middle, or none."""
+        near, missing = [], []
         for view, depth in list(maps_of(made, read).values())[::EVERY]:
             true = true_depth(self.scene, view, self.from_model, (view.width, view.height))[0] / self.from_model.scale
             seen = np.isfinite(true)
