@@ -81,10 +81,19 @@ def test_a_blank_wall_gets_no_depth_beside_a_card_that_keeps_its_own(noise):
     assert (np.abs(depth - CARD) < 0.2)[card].mean() > 0.9
 
 
-def test_a_wall_that_only_grows_darker_gets_no_depth():
-    shade = np.tile(np.linspace(0.2, 0.9, 800, dtype=np.float32), (800, 1))
-    views, card = photos(texture(0, 0.05, 0.35), shade)
+def test_a_wall_with_nothing_but_shading_gets_no_depth():
+    shade = 0.6 + 0.3 * np.sin(2 * np.pi * np.arange(800, dtype=np.float32) / 240)
+    views, card = photos(texture(0, 0.05, 0.35), np.tile(shade, (800, 1)), noise=1.0)
     assert (depth_of(views).depth > 0)[inner() & ~grown(card, 2)].mean() < 0.02
+
+
+def test_the_glow_of_an_edge_is_no_texture_of_the_blank_wall_behind_it():
+    views, card = photos(texture(0, 0.05, 0.35), np.full((800, 800), 0.9, np.float32))
+    glowing = [0.9 * view.pixels + 0.1 * cv2.GaussianBlur(view.pixels, (0, 0), 2) for view in views]
+    views = [replace(v, pixels=np.round(255 * g).astype(np.float32) / 255) for v, g in zip(views, glowing)]
+    depth = depth_of(views).depth
+    assert (depth > 0)[grown(card, 6) & ~grown(card, 1)].mean() < 0.005
+    assert (np.abs(depth - CARD) < 0.2)[card].mean() > 0.9
 
 
 def test_a_textured_wall_keeps_its_depth():
