@@ -29,7 +29,8 @@ class Matcher:
     Attributes:
         reference: (h, w) float32 the photo, without its mean.
         mean, variance: (h, w) of its windows.
-        along, across: (h, window, w) weights of the pixels in a window, see `support_weights`.
+        weights: (2, h, window, w) of the pixels in a window, see `support_weights`.
+        windows: (3, h, w) reference, mean and variance.
         best: sources that count.
     """
 
@@ -51,10 +52,11 @@ class Matcher:
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
-        self.reference = torch.from_numpy(_centred(reference.pixels)).to(device)
-        self.along, self.across = support_weights(self.reference, window_px)
-        self.mean = self._mean(self.reference)
-        self.variance = (self._mean(self.reference**2) - self.mean**2).clamp(min=0)
+        pixels = torch.from_numpy(_centred(reference.pixels)).to(device)
+        self.weights = support_weights(pixels, window_px)
+        mean = self._mean(pixels)
+        self.windows = torch.stack([pixels, mean, (self._mean(pixels**2) - mean**2).clamp(min=0)])
+        self.reference, self.mean, self.variance = self.windows
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
         for source in sources:
             turn = source.cam_from_world[:3, :3] @ rotation.T
@@ -80,8 +82,7 @@ class Matcher:
 
     def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """The same as `keep_best`, by the CPU's kernel."""
-        windows = self.reference, self.mean, self.variance, self.along, self.across
-        first, last = (inverse.contiguous(), *windows), (gray[0, 0], directions, move, best)
+        first, last = (inverse.contiguous(), self.windows, self.weights), (gray[0, 0], directions, move, best)
         keep_best_on_cpu(*(p.numpy() for p in first), np.float32(self.flat), *(p.numpy() for p in last))  # type: ignore[call-arg]
 
     def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
@@ -119,7 +120,7 @@ class Matcher:
 
     def _mean(self, values: Tensor) -> Tensor:
         """Weighted mean of values (..., h, w) over the support of each pixel."""
-        return supported_mean(values, self.along, self.across)
+        return supported_mean(values, self.weights)
 
     def shift_per_inverse_depth(self, low: float, high: float) -> float:
         """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
@@ -145,8 +146,8 @@ class Matcher:
         return shifts
 
 
-def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
-    """Weights of pixels along a row, and of rows across it, in each pixel's support, (h, window, w) each.
+def support_weights(gray: Tensor, window: int) -> Tensor:
+    """Weights of pixels along a row, and of rows across it, in each pixel's support, (2, h, window, w).
 
     A pixel counts as far as it is near and of the same grey (Yoon, Kweon 2006), along the rows first and then across
     them (Pham, van Vliet 2005), so that a window of n x n pixels costs 2 n products. A pixel's weights sum to one, and
@@ -167,12 +168,13 @@ def support_weights(gray: Tensor, window: int) -> tuple[Tensor, Tensor]:
             weights.append(torch.exp(-step / ALIKE - abs(k - radius) / (FALL * radius)) * (step < UNLIKE))
         stacked = torch.stack(weights, dim=1)
         stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
-        parts.append(stacked.contiguous())
-    return parts[1], parts[0]
+        parts.append(stacked)
+    return torch.stack([parts[1], parts[0]])
 
 
-def supported_mean(values: Tensor, along: Tensor, across: Tensor) -> Tensor:
+def supported_mean(values: Tensor, weights: Tensor) -> Tensor:
     """Mean of values (..., h, w) over each pixel's support, weighted as `support_weights` says."""
+    along, across = weights
     window, radius = along.shape[1], along.shape[1] // 2
     height, width = values.shape[-2:]
     row = F.pad(values, (radius, radius))

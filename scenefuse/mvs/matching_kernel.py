@@ -122,16 +122,16 @@ def _insert(score, best):
 
 
 @njit(parallel=True, cache=True)
-def keep_best(  # type: ignore[no-untyped-def]
-    inverse, reference, mean, variance, along, across, flat, gray, directions, move, best
-):
+def keep_best(inverse, windows, weights, flat, gray, directions, move, best):  # type: ignore[no-untyped-def]
     """Match D hypotheses per pixel in one source photo, and keep the best scores seen so far.
 
-    All float32: inverse (D, h, w) inverse depths; reference (h, w) and the mean and variance of its windows; along and
-    across (h, window, w) the weights of a pixel's support, as `support_weights` makes them; flat: variance that is
-    added to all windows'; gray (H, W) source photo; directions (3, h, w) and move (3,) give its places in -1..1; best
-    (K, D, h, w), sorted, the largest first: changed in place.
+    All float32: inverse (D, h, w) inverse depths; windows (3, h, w) the reference, and the mean and variance of its
+    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; flat: variance
+    that is added to all windows'; gray (H, W) source photo; directions (3, h, w) and move (3,) give its places in
+    -1..1; best (K, D, h, w), sorted, the largest first: changed in place.
     """
+    reference, mean, variance = windows[0], windows[1], windows[2]
+    along, across = weights[0], weights[1]
     count, height, width = inverse.shape
     window = along.shape[1]
     radius = window // 2

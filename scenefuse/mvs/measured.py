@@ -37,8 +37,8 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
 
 def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
     """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
-    along, across = support_weights(matcher.reference, LOOK_PX)
+    weights = support_weights(matcher.reference, LOOK_PX)
     known, blank = measured.float(), (~measured & (matcher.variance < matcher.flat)).float()
     for _ in range(2):
-        known, blank = (supported_mean(values, along, across) for values in (known, blank))
+        known, blank = (supported_mean(values, weights) for values in (known, blank))
     return blank > MOST_BLANK * (known + blank)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from scenefuse.demo.cameras import read_cameras, visible
-from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample
+from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.maps import read_depth
 from scenefuse.metrics.evaluate_scene import within
 from scenefuse.metrics.truth import (
@@ -53,6 +53,8 @@ SKY_SPREAD, SKY_PATCH_PX = 15, 60
 """Patches of sky that the statue encloses: at most so much darker than the sky's middle, and at least so large."""
 OFF_SHARE = 0.15
 """A point is sky where it lies in the sky of so many of the photos that have it in view: no surface does."""
+KEPT = 0.01
+"""A point is kept where the other cloud has one so near, a share of the diagonal."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,8 @@ class Truth:
         rest = cast_together([other for key, other in self.meshes.items() if key != name])
         own = distances(mesh.caster(), points)
         mine = belongs_to_object(points, own, distances(rest, points), low, high, margin)
-        to_cloud, result = nearest(sample_surface(mesh, SAMPLES, 0), points[mine]), {}
+        to_cloud = nearest(sample_surface(mesh, SAMPLES, 0), points[mine])
+        result: dict[str, Any] = {}
         for share in (0.5, 1.0, 2.0):
             precision, recall, score = f_score(own[mine], to_cloud, share / 100 * diagonal)
             result |= {f"{name}_p_{share:g}": precision, f"{name}_r_{share:g}": recall, f"{name}_f_{share:g}": score}
@@ -198,22 +201,30 @@ def draw(path: Path, read: Workspace, sky: dict[str, NDArray[np.bool_]]) -> None
     cv2.imwrite(str(path), np.vstack(rows))
 
 
+def in_box(made: Made, box: Array | None) -> Cloud:
+    """The cloud's points between two corners (6,), or all."""
+    cloud = read_cloud(made.folder / "dense.ply")
+    return cloud if box is None else cloud[((cloud.points >= box[:3]) & (cloud.points <= box[3:])).all(1)]
+
+
 def sky_scores(made: Made, read: Workspace, sky: dict[str, NDArray[np.bool_]], box: Array | None) -> dict[str, Any]:
     """Share of the sky's pixels with a depth, and of the cloud's points (in a box) that lie in the sky."""
     depths = maps_of(made, read)
     inside = [depths[name][1][resized(mask, depths[name][1])] > 0 for name, mask in sky.items() if name in depths]
-    cloud = read_cloud(made.folder / "dense.ply")
-    if box is not None:
-        cloud = cloud[((cloud.points >= box[:3]) & (cloud.points <= box[3:])).all(1)]
+    cloud = in_box(made, box)
     share = off_share(cloud, read, sky)
-    solid, extent = cloud[share == 0], np.linalg.norm(np.ptp(cloud.points, axis=0))
     return {
         "sky_pixels_with_depth_pct": 100 * float(np.concatenate(inside).mean()),
         "points_in_box": len(cloud),
         "sky_points_pct": 100 * float((share >= OFF_SHARE).mean()),
-        "solid_points": int((share < OFF_SHARE).sum()),
-        "solid_cells": len(voxel_downsample(solid, 0.005 * float(extent))),
     }
+
+
+def kept(before: Made, now: Made, read: Workspace, sky: dict[str, NDArray[np.bool_]], box: Array | None) -> float:
+    """Percentage of the earlier points in no photo's sky that still have a point within KEPT of the diagonal."""
+    old = in_box(before, box)
+    old = old[np.flatnonzero(off_share(old, read, sky) == 0)]
+    return 100 * float((nearest(old.points, in_box(now, box).points) <= KEPT * old.diagonal).mean())
 
 
 def resized(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -255,21 +266,24 @@ def dense_stereo(
         out: folder of the tables, maps and clouds.
     """
     workspace, out = workspace.resolve(), out.resolve()
-    read, rows = read_workspace(workspace), {}
+    read, rows, all_made = read_workspace(workspace), {}, {}
     masks = {view.name: sky_of(read.rgb(view).pixels) for view in read.views} if sky else {}
     out.mkdir(parents=True, exist_ok=True)
     if sky:
         draw(out / "sky.png", read, masks)
+    corners = None if box is None else np.array(box)
     known = Truth(truth, workspace / "sparse") if truth is not None else None
     for name, checkout in {"before": before, "now": ROOT}.items():
         if checkout is None:
             continue
-        made = make(checkout.resolve(), out / f"dense_stereo_{name}", workspace, stereo, fusion)
+        made = all_made[name] = make(checkout.resolve(), out / f"dense_stereo_{name}", workspace, stereo, fusion)
         rows[name] = general(made, read)
         if known is not None:
             rows[name] |= known.scores(made, read)
         if sky:
-            rows[name] |= sky_scores(made, read, masks, None if box is None else np.array(box))
+            rows[name] |= sky_scores(made, read, masks, corners)
+    if sky and before is not None:
+        rows["now"]["kept_pct"] = kept(all_made["before"], all_made["now"], read, masks, corners)
     table = pd.DataFrame(rows)
     if "before" in rows:
         table["ratio"] = table["now"] / table["before"]
