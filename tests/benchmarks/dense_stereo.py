@@ -204,7 +204,9 @@ def draw(path: Path, read: Workspace, sky: dict[str, NDArray[np.bool_]]) -> None
 def in_box(made: Made, box: Array | None) -> Cloud:
     """The cloud's points between two corners (6,), or all."""
     cloud = read_cloud(made.folder / "dense.ply")
-    return cloud if box is None else cloud[((cloud.points >= box[:3]) & (cloud.points <= box[3:])).all(1)]
+    if box is None:
+        return cloud
+    return cloud[np.flatnonzero(((cloud.points >= box[:3]) & (cloud.points <= box[3:])).all(1))]
 
 
 def sky_scores(made: Made, read: Workspace, sky: dict[str, NDArray[np.bool_]], box: Array | None) -> dict[str, Any]:
@@ -266,24 +268,22 @@ def dense_stereo(
         out: folder of the tables, maps and clouds.
     """
     workspace, out = workspace.resolve(), out.resolve()
-    read, rows, all_made = read_workspace(workspace), {}, {}
-    masks = {view.name: sky_of(read.rgb(view).pixels) for view in read.views} if sky else {}
     out.mkdir(parents=True, exist_ok=True)
-    if sky:
-        draw(out / "sky.png", read, masks)
-    corners = None if box is None else np.array(box)
+    read, corners = read_workspace(workspace), None if box is None else np.array(box)
+    masks = {view.name: sky_of(read.rgb(view).pixels) for view in read.views} if sky else {}
     known = Truth(truth, workspace / "sparse") if truth is not None else None
+    rows, made = {}, {}
     for name, checkout in {"before": before, "now": ROOT}.items():
         if checkout is None:
             continue
-        made = all_made[name] = make(checkout.resolve(), out / f"dense_stereo_{name}", workspace, stereo, fusion)
-        rows[name] = general(made, read)
-        if known is not None:
-            rows[name] |= known.scores(made, read)
+        made[name] = make(checkout.resolve(), out / f"dense_stereo_{name}", workspace, stereo, fusion)
+        rows[name] = general(made[name], read) | (known.scores(made[name], read) if known is not None else {})
         if sky:
-            rows[name] |= sky_scores(made, read, masks, corners)
+            rows[name] |= sky_scores(made[name], read, masks, corners)
+    if sky:
+        draw(out / "sky.png", read, masks)
     if sky and before is not None:
-        rows["now"]["kept_pct"] = kept(all_made["before"], all_made["now"], read, masks, corners)
+        rows["now"]["kept_pct"] = kept(made["before"], made["now"], read, masks, corners)
     table = pd.DataFrame(rows)
     if "before" in rows:
         table["ratio"] = table["now"] / table["before"]
