@@ -12,7 +12,7 @@ from torch.nn import functional
 from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.networks import depth_from_disparity, disparity_from_depth
 from scenefuse.depth.self_supervision import points_in_cam, warp
-from scenefuse.mvs.matcher import Matcher
+from scenefuse.mvs.matcher import FLAT, Matcher
 from scenefuse.workspace import View
 
 # Side of the matching windows at full and at half size: small, because the cut photos are small.
@@ -22,9 +22,9 @@ COARSE_WINDOW_PX = 3
 MEDIAN_PX = 5
 # Photos that a photo is matched with, and of these the ones that count: others may not see the place.
 SWEEP_SOURCES, BEST_SOURCES = 4, 2
-# Windows this small hold little contrast: with more of it, what the matcher allows for flat windows does not outweigh
-# theirs. For the same reason the slow changes of brightness are kept.
-CONTRAST = np.float32(4.0)
+# Windows this small hold little contrast: what the matcher allows for flat ones must not outweigh theirs, and the slow
+# changes of brightness are kept.
+SMALL_WINDOW_FLAT = FLAT / 16
 # Masks are widened by this window's radius before a depth may be outside them.
 HULL_PX = 5
 WHOLE = (slice(None), slice(None))
@@ -129,7 +129,7 @@ def _best_hypothesis(
     sources = [_gray(photos, int(source), WHOLE, shrink) for source in chosen]
     depths = depth_from_disparity(hypotheses.clamp(0.0, 1.0), photos.near, photos.far)
     window = WINDOW_PX if shrink == 1 else COARSE_WINDOW_PX
-    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, high_pass_px=0)
+    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, flat=SMALL_WINDOW_FLAT)
     scores = matcher.score((1.0 / depths).contiguous())
     moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
     outside = _outside_silhouettes(photos.masks[chosen], depths, moves, reference, sources)
@@ -144,14 +144,14 @@ def _best_hypothesis(
 
 
 def _gray(photos: DepthPhotos, index: int, cut: tuple[slice, slice], shrink: int) -> View:
-    """A cut of a photo in grey, smaller by a whole number, in more contrast (CONTRAST)."""
+    """A cut of a photo in grey, smaller by a whole number."""
     pixels = _smaller(photos.images[index].mean(0)[cut][None, None], shrink)[0, 0]
     intrinsics = photos.intrinsics[index].double().cpu().numpy().copy()
     intrinsics[:2, 2] -= [cut[1].start or 0, cut[0].start or 0]
     intrinsics[:2] /= shrink
     pose = np.linalg.inv(photos.object_from_cam[index].double().cpu().numpy())
     height, width = pixels.shape
-    return View(str(index), intrinsics, pose, width, height, CONTRAST * pixels.cpu().numpy())
+    return View(str(index), intrinsics, pose, width, height, pixels.cpu().numpy())
 
 
 def _outside_silhouettes(masks: Tensor, depths: Tensor, moves: Tensor, reference: View, sources: list[View]) -> Tensor:

@@ -28,16 +28,22 @@ def read_depth(path: Path) -> NDArray[np.float32]:
 
 
 def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
-    """Write an (H, W, 3) float32 map of unit normals in the camera frame; zeros mark pixels without a normal."""
+    """Write an (H, W, 3) float32 map of unit normals in the camera frame; zeros mark pixels without a normal.
+
+    COLMAP's files hold all x, then all y, then all z. pycolmap.NormalMap (4.2) takes and gives arrays in the order of
+    the file, which mixes the three up, so it is not used here.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
-    pycolmap.NormalMap.from_array(np.ascontiguousarray(normals, dtype=np.float32)).write(path)
+    height, width, _ = normals.shape
+    planes = np.ascontiguousarray(np.moveaxis(normals, 2, 0), dtype="<f4")
+    path.write_bytes(f"{width}&{height}&3&".encode() + planes.tobytes())
 
 
 def read_normals(path: Path) -> NDArray[np.float32]:
     """Read an (H, W, 3) float32 normal map; StageError when the file is missing or damaged."""
-    normal_map = pycolmap.NormalMap()
     try:
-        normal_map.read(path)
-    except Exception as error:
+        width, height, channels, values = path.read_bytes().split(b"&", 3)
+        planes = np.frombuffer(values, dtype="<f4").reshape(int(channels), int(height), int(width))
+    except (OSError, ValueError) as error:
         raise StageError(f"{path} is not a readable COLMAP map ({error}); rerun the stage that writes it") from None
-    return np.array(normal_map.to_array(), dtype=np.float32)
+    return np.ascontiguousarray(np.moveaxis(planes, 0, 2), dtype=np.float32)

@@ -88,7 +88,7 @@ def _cloud_results(
     scene = cast_together(meshes)
     to_truth = distances(scene, sampled(points, samples, seed))
     low, high = (np.array(corner) for corner in value(content, "mapped_area"))
-    ground = sample_surface(_within(meshes[0], low, high), samples, seed)
+    ground = sample_surface(within(meshes[0], low, high), samples, seed)
     seen = visible(scene, cameras, ground, HIDDEN)[1].sum(0) >= 3
     covered = nearest(ground[seen], points) <= 3 * gsd
     return {
@@ -112,7 +112,7 @@ def _georeference_error(report: dict[str, Any], truth: dict[str, Any], posed: Po
     return float(np.median(np.linalg.norm(centres - expected, axis=1)))
 
 
-def _within(mesh: Mesh, low: Array, high: Array) -> Mesh:
+def within(mesh: Mesh, low: Array, high: Array) -> Mesh:
     """The triangles whose middle lies in a rectangle on the ground."""
     middles = mesh.vertices[mesh.triangles].mean(1)[:, :2]
     return Mesh(mesh.vertices, mesh.triangles[((middles >= low) & (middles <= high)).all(1)])

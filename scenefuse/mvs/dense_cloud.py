@@ -1,7 +1,8 @@
 """The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,21 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
-from scenefuse.io.maps import read_depth
+from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.io.units import length_unit
-from scenefuse.mvs.temporary_workspace import MAPS, linked_workspace
+from scenefuse.mvs.temporary_workspace import linked_workspace
+from scenefuse.mvs.votes import neighbours, vote
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.transforms import Array
+from scenefuse.workspace import View, read_views
 
 FEW_FUSED = 0.01
 """Share of the measured pixels below which the cameras or the limits are probably wrong."""
 MAX_TRAVERSAL_DEPTH = 100
 """Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
+CACHED_MAPS = 64
+"""Depth maps that are kept in memory for the next photo's vote."""
 OUTLIER_NEIGHBOURS = 8
 """Neighbours whose mean distance tells a point far from all others."""
 OUTLIER_RATIO = 4.0
@@ -38,7 +43,7 @@ class DenseCloudSettings:
     """Largest distance between a pixel and the point of another photo projected into it."""
     max_depth_error: float = setting(0.01, least=0)
     """Largest relative difference of two photos' depths of a point."""
-    max_normal_error_deg: float = setting(90, unit="deg", least=0)
+    max_normal_error_deg: float = setting(30, unit="deg", least=0)
     """Largest angle between two photos' normals of a point."""
 
 
@@ -52,7 +57,7 @@ def fuse_depth_maps(
     cloud: Path,
     report: Path,
 ) -> None:
-    """Fuse the depth maps of all chunks into one cloud by COLMAP's stereo fusion.
+    """Let the depth maps of all chunks vote on each other, and fuse what is left by COLMAP's stereo fusion.
 
     Args:
         workspace: the undistorted COLMAP workspace that the maps belong to.
@@ -63,7 +68,7 @@ def fuse_depth_maps(
         cloud: output PLY in the workspace's frame: float64 positions, normals, colours, `views` (photos
             that agree on the point).
         report: output JSON: number of points, spacing, backend, what was dropped, the share of the pixels with a depth
-            that are in the cloud, and a note where it is small.
+            that are in the cloud, and a note where it is small, and the share that other maps voted out.
 
     Raises:
         StageError: no depth maps, or no point on which enough photos agree.
@@ -77,7 +82,8 @@ def fuse_depth_maps(
         raise StageError(f"no depth maps in {', '.join(map(str, depth))}; run the depth stage first")
     stages = [read_json(path) for path in depth_json]
     print(f"fusing {len(maps)} depth maps by {_all(stages, 'backend')}", flush=True)
-    fused = _fuse(workspace, maps, settings, cloud)
+    sources = {name: photo["sources"] for stage in stages for name, photo in stage["photos"].items()}
+    fused, outvoted = _fuse(workspace, maps, neighbours(sources), settings, cloud)
     # COLMAP counts pixels, of which one photo may bring several; we count photos.
     agreed = fused[fused.fields["views"] >= settings.min_photos]
     if len(agreed) == 0:
@@ -87,7 +93,8 @@ def fuse_depth_maps(
     measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
     content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
     write_cloud(cloud, kept)
-    write_json(report, content | {"depth_maps": quantity(len(maps), "1")})
+    content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(outvoted, "1")}
+    write_json(report, content)
 
 
 def _all(stages: list[dict[str, Any]], name: str) -> str:
@@ -121,18 +128,48 @@ def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, An
     }
 
 
-def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSettings, beside: Path) -> Cloud:
-    """COLMAP's fusion as a cloud with `views`.
+def _fuse(
+    workspace: Path,
+    maps: Mapping[str, Path],
+    near: Mapping[str, list[str]],
+    settings: DenseCloudSettings,
+    beside: Path,
+) -> tuple[Cloud, float]:
+    """COLMAP's fusion of what is left of the maps after their vote, as a cloud with `views`; the share outvoted.
 
     Args:
         workspace: that the maps belong to.
         maps: photo -> folder that its maps lie below.
+        near: photo -> photos that vote on its map.
         settings: see DenseCloudSettings.
         beside: path that COLMAP works beside.
 
     Raises:
         StageError: no point at all.
     """
+    widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
+    with linked_workspace(workspace, beside, widths) as folder:
+        for name, source in maps.items():
+            link = folder / "stereo/normal_maps" / f"{name}.geometric.bin"
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(_path(source, "normal_maps", name).resolve())
+        measured, left = 0, 0
+        for name, before, depth in _voted(workspace, maps, near, settings):
+            write_depth(folder / "stereo/depth_maps" / f"{name}.geometric.bin", depth)
+            measured, left = measured + before, left + int((depth > 0).sum())
+        (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
+        path = folder / "fused.ply"
+        fused = cancellable(
+            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings), "PLY"
+        )
+        if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
+            raise _no_points(settings)
+        cloud, views = read_cloud(path), _read_visibility(path.with_suffix(".ply.vis"))
+    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), 1 - left / max(measured, 1)
+
+
+def _options(settings: DenseCloudSettings) -> pycolmap.StereoFusionOptions:
+    """COLMAP's own settings."""
     options = pycolmap.StereoFusionOptions()
     options.num_threads = 1  # With more, which thread comes first decides the points.
     options.min_num_pixels = settings.min_photos
@@ -140,20 +177,28 @@ def _fuse(workspace: Path, maps: Mapping[str, Path], settings: DenseCloudSetting
     options.max_depth_error = settings.max_depth_error
     options.max_normal_error = settings.max_normal_error_deg
     options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
-    widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
-    with linked_workspace(workspace, beside, widths) as folder:
-        for name, source in maps.items():
-            for part in MAPS:
-                link = folder / "stereo" / part / f"{name}.geometric.bin"
-                link.parent.mkdir(parents=True, exist_ok=True)
-                link.symlink_to(_path(source, part, name).resolve())
-        (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
-        path = folder / "fused.ply"
-        fused = cancellable(pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", options, "PLY")
-        if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
-            raise _no_points(settings)
-        cloud, views = read_cloud(path), _read_visibility(path.with_suffix(".ply.vis"))
-    return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views})
+    return options
+
+
+def _voted(
+    workspace: Path, maps: Mapping[str, Path], near: Mapping[str, list[str]], settings: DenseCloudSettings
+) -> Iterator[tuple[str, int, NDArray[np.float32]]]:
+    """Each photo, its number of depths, and its depths (H, W) that more maps confirm than see through."""
+    cameras = {view.name: view for view in read_views(workspace / "sparse")}
+
+    @lru_cache(CACHED_MAPS)
+    def depths(name: str) -> View:
+        pixels = read_depth(_path(maps[name], "depth_maps", name))
+        return replace(cameras[name].resized(pixels.shape[1], pixels.shape[0]), pixels=pixels)
+
+    for name in sorted(maps):
+        view = depths(name)
+        others = [depths(other) for other in near.get(name, []) if other in maps]
+        votes = vote(view, others, settings.max_depth_error, settings.max_reprojection_px)
+        stays = votes.agree > votes.through
+        if settings.min_photos < 2:
+            stays |= votes.through == 0
+        yield name, int((view.pixels > 0).sum()), np.where(stays, view.pixels, np.float32(0))
 
 
 def _no_points(settings: DenseCloudSettings) -> StageError:

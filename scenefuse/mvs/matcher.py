@@ -3,7 +3,6 @@
 Source: Goesele et al. 2006 (the best K of several views are averaged, which leaves occluded ones out).
 """
 
-import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -13,10 +12,13 @@ from torch import Tensor
 from scenefuse.mvs.matching_kernel import keep_best as keep_best_on_cpu
 from scenefuse.workspace import View
 
-HIGH_PASS_PX = 12.0
-"""Slower changes of brightness are taken away before matching, so that sums over a window stay small and exact."""
 FLAT = 1.5e-5
-"""One grey level of 255, squared: keeps windows without texture from matching anything."""
+"""One grey level of 255, squared, the noise of a photo: keeps windows without texture from matching anything."""
+ALIKE, UNLIKE = 0.07, 0.28
+"""Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e, and at which it ends: beside
+a dark statue, the smallest weight is texture enough for a blank sky to match at the statue's depth."""
+FALL = 0.6
+"""Distance, in radii of the window, at which it falls to 1 / e."""
 OUTSIDE = -0.5
 """Score of a hypothesis outside a source photo: worse than a window that does not match."""
 
@@ -25,9 +27,10 @@ class Matcher:
     """Scores inverse-depth hypotheses of one reference photo by the mean NCC of its best sources.
 
     Attributes:
-        reference: (h, w) float32 the photo, high-passed.
+        reference: (h, w) float32 the photo, without its mean.
         mean, variance: (h, w) of its windows.
-        window: their side.
+        weights: (2, h, window, w) of the pixels in a window, see `support_weights`.
+        windows: (3, h, w) reference, mean and variance.
         best: sources that count.
     """
 
@@ -38,20 +41,22 @@ class Matcher:
         best_sources: int,
         window_px: int,
         device: torch.device | str,
-        high_pass_px: float = HIGH_PASS_PX,
+        flat: float = FLAT,
     ) -> None:
         """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
 
-        Small photos may keep their slow changes of brightness: `high_pass_px` 0.
+        `flat` is the variance that is added to all windows', see FLAT.
         """
         height, width = reference.height, reference.width
-        self.window, self.best = window_px, min(best_sources, len(sources))
+        self.best, self.flat = min(best_sources, len(sources)), flat
         u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
         rays = np.linalg.inv(reference.intrinsics) @ np.stack([u, v, np.ones_like(u)]).reshape(3, -1)
         rotation, shift = reference.cam_from_world[:3, :3], reference.cam_from_world[:3, 3]
-        self.reference = torch.from_numpy(_high_pass(reference.pixels, high_pass_px)).to(device)
-        self.mean = box(self.reference, self.window)
-        self.variance = (box(self.reference**2, self.window) - self.mean**2).clamp(min=0)
+        pixels = torch.from_numpy(_centred(reference.pixels)).to(device)
+        self.weights = support_weights(pixels, window_px)
+        mean = self._mean(pixels)
+        self.windows = torch.stack([pixels, mean, (self._mean(pixels**2) - mean**2).clamp(min=0)])
+        self.reference, self.mean, self.variance = self.windows
         self.sources: list[tuple[Tensor, Tensor, Tensor]] = []
         for source in sources:
             turn = source.cam_from_world[:3, :3] @ rotation.T
@@ -61,7 +66,7 @@ class Matcher:
             directions = (to_grid @ turn @ rays).reshape(3, height, width)
             self.sources.append(
                 (
-                    torch.from_numpy(_high_pass(source.pixels, high_pass_px))[None, None].to(device),
+                    torch.from_numpy(_centred(source.pixels))[None, None].to(device),
                     torch.from_numpy(directions.astype(np.float32)).to(device),
                     torch.from_numpy((to_grid @ move).astype(np.float32)).to(device),
                 )
@@ -77,8 +82,8 @@ class Matcher:
 
     def _keep_best_on_cpu(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """The same as `keep_best`, by the CPU's kernel."""
-        photos = inverse.contiguous(), self.reference, self.mean, self.variance, gray[0, 0], directions, move
-        keep_best_on_cpu(*(p.numpy() for p in photos), self.window, best.numpy())  # type: ignore[call-arg]
+        first, last = (inverse.contiguous(), self.windows, self.weights), (gray[0, 0], directions, move, best)
+        keep_best_on_cpu(*(p.numpy() for p in first), np.float32(self.flat), *(p.numpy() for p in last))  # type: ignore[call-arg]
 
     def keep_best(self, inverse: Tensor, best: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> None:
         """Put the scores of one of `sources` among the best (K, D, h, w), the largest first."""
@@ -107,15 +112,27 @@ class Matcher:
         grid = grid.reshape(1, count * height, width, 2)
         warped = F.grid_sample(gray, grid, padding_mode="border", align_corners=False)
         warped = warped.reshape(count, height, width)
-        mean = box(warped, self.window)
-        variance = (box(warped * warped, self.window) - mean * mean).clamp(min=0)
-        covariance = box(warped * self.reference, self.window) - mean * self.mean
-        ncc = covariance / torch.sqrt((variance + FLAT) * (self.variance + FLAT))
+        mean = self._mean(warped)
+        variance = (self._mean(warped * warped) - mean * mean).clamp(min=0)
+        covariance = self._mean(warped * self.reference) - mean * self.mean
+        ncc = covariance / torch.sqrt((variance + self.flat) * (self.variance + self.flat))
         return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE))
+
+    def _mean(self, values: Tensor) -> Tensor:
+        """Weighted mean of values (..., h, w) over the support of each pixel."""
+        return supported_mean(values, self.weights)
 
     def shift_per_inverse_depth(self, low: float, high: float) -> float:
         """Largest shift in any source photo, in its pixels, between the two ends of the inverse depth range."""
-        shifts = [0.0]
+        return max(self._shifts(low, high))
+
+    def middle_shift_per_inverse_depth(self, low: float, high: float) -> float:
+        """The same in the middle one of the source photos: half of them move by at least as much."""
+        return float(np.median(self._shifts(low, high)))
+
+    def _shifts(self, low: float, high: float) -> list[float]:
+        """Shift in each source photo, in its pixels; 0 where both ends of the range never lie in it."""
+        shifts = []
         for gray, directions, move in self.sources:
             half = torch.tensor([gray.shape[-1] / 2, gray.shape[-2] / 2], device=gray.device)
             thinned = directions[:, ::8, ::8]
@@ -124,10 +141,50 @@ class Matcher:
                 p = thinned + move[:, None, None] * inverse
                 ends.append(p[:2] / p[2].clamp(min=1e-6))
             inside = (ends[0].abs().amax(0) < 1) & (ends[1].abs().amax(0) < 1)
-            if inside.any():
-                length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
-                shifts.append(float(length[inside].median()))
-        return max(shifts)
+            length = ((ends[1] - ends[0]) * half[:, None, None]).norm(dim=0)
+            shifts.append(float(length[inside].median()) if inside.any() else 0.0)
+        return shifts
+
+
+def support_weights(gray: Tensor, window: int) -> Tensor:
+    """Weights of pixels along a row, and of rows across it, in each pixel's support, (2, h, window, w).
+
+    A pixel counts as far as it is near and of the same grey (Yoon, Kweon 2006), along the rows first and then across
+    them (Pham, van Vliet 2005), so that a window of n x n pixels costs 2 n products. A pixel's weights sum to one, and
+    are zero outside the photo.
+
+    Args:
+        gray: (h, w) in 0..1.
+        window: its side, odd.
+    """
+    radius = window // 2
+    parts = []
+    for axis in (0, 1):
+        values = gray.movedim(axis, 0)  # the axis that the support runs along, first
+        padded = F.pad(values, (0, 0, radius, radius), value=float("inf"))
+        weights = []
+        for k in range(window):
+            step = (padded[k : k + len(values)] - values).abs()
+            weights.append(torch.exp(-step / ALIKE - abs(k - radius) / (FALL * radius)) * (step < UNLIKE))
+        stacked = torch.stack(weights, dim=1)
+        stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
+        parts.append(stacked)
+    return torch.stack([parts[1], parts[0]])
+
+
+def supported_mean(values: Tensor, weights: Tensor) -> Tensor:
+    """Mean of values (..., h, w) over each pixel's support, weighted as `support_weights` says."""
+    along, across = weights
+    window, radius = along.shape[1], along.shape[1] // 2
+    height, width = values.shape[-2:]
+    row = F.pad(values, (radius, radius))
+    sums, total = torch.zeros_like(values), torch.zeros_like(values)
+    for k in range(window):
+        sums.addcmul_(along[:, k], row[..., k : k + width])
+    rows = F.pad(sums, (0, 0, radius, radius))
+    for k in range(window):
+        total.addcmul_(across[:, k], rows[..., k : k + height, :])
+    return total
 
 
 def box(values: Tensor, window: int) -> Tensor:
@@ -139,6 +196,6 @@ def box(values: Tensor, window: int) -> Tensor:
     return (sums[..., window:, :] - sums[..., :-window, :]) / window**2
 
 
-def _high_pass(gray: NDArray[np.float32], high_pass_px: float) -> NDArray[np.float32]:
-    """The photo (H, W) without its slow changes of brightness, or with 0 without its mean."""
-    return gray - (cv2.GaussianBlur(gray, (0, 0), high_pass_px) if high_pass_px else gray.mean())
+def _centred(gray: NDArray[np.float32]) -> NDArray[np.float32]:
+    """The photo (H, W) without its mean, so that sums of squares stay small and exact."""
+    return gray - gray.mean()

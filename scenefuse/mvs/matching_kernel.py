@@ -10,7 +10,6 @@ import numpy as np
 from numba import njit, prange
 
 _BAND = 32
-_FLAT = np.float32(1.5e-5)
 _ZERO, _ONE, _HALF = np.float32(0.0), np.float32(1.0), np.float32(0.5)
 _MATH = {"contract", "reassoc", "nsz"}
 
@@ -56,49 +55,60 @@ def _warp(flat, width, place, part_x, part_y, value):
 
 
 @njit(fastmath=_MATH)
-def _sums_along(value, reference, window, sums):
-    """Sums over `window` pixels of a row value (w,), of its square and of its product with the reference (w,).
+def _sums_along(value, reference, weight, sums):
+    """Weighted sums along a row of a value (w,), of its square and of its product with the reference (w,).
 
-    Written: sums (3 w,), one behind the other; outside the row is zero.
+    weight (window, w): of the pixels from left to right in the support of each. Written: sums (3 w,), one behind the
+    other; outside the row is zero.
     """
-    width, radius = len(value), window // 2
+    width, radius = len(value), len(weight) // 2
     row = np.zeros(width + 2 * radius, np.float32)
     inner = row[radius : radius + width]
     for k in range(3):
         for x in range(width):
             inner[x] = value[x] * (_ONE if k == 0 else value[x] if k == 1 else reference[x])
-        out = sums[k * width : (k + 1) * width]
-        out[:] = row[:width]
-        for w in range(1, window):
-            shifted = row[w : w + width]
+        out, share = sums[k * width : (k + 1) * width], weight[0]
+        for x in range(width):
+            out[x] = share[x] * row[x]
+        for w in range(1, len(weight)):
+            shifted, share = row[w : w + width], weight[w]
             for x in range(width):
-                out[x] += shifted[x]
+                out[x] += share[x] * shifted[x]
 
 
 @njit(fastmath=_MATH)
-def _sum_across(rows, out):
-    """Sum of the rows (n, w), into out (w,)."""
-    out[:] = rows[0]
-    for w in range(1, len(rows)):
-        row = rows[w]
-        for x in range(len(out)):
-            out[x] += row[x]
+def _sum_across(rows, first, weight, total):
+    """Weighted sums across rows (window, 3 w), a ring of which `first` is the uppermost, into total (3 w,).
+
+    weight (window, w): of the rows from top to bottom in the support of each pixel.
+    """
+    window, width = weight.shape
+    for k in range(3):
+        out = total[k * width : (k + 1) * width]
+        for w in range(window):
+            part, share = rows[(first + w) % window, k * width : (k + 1) * width], weight[w]
+            if w == 0:
+                for x in range(width):
+                    out[x] = share[x] * part[x]
+            else:
+                for x in range(width):
+                    out[x] += share[x] * part[x]
 
 
 @njit(fastmath=_MATH, error_model="numpy")
-def _correlate(sums, share, mean, variance, inside, score):
+def _correlate(sums, mean, variance, inside, flat, score):
     """Normalised cross-correlation of a row's windows, into score (w,).
 
-    sums (3 w,) as `_sums_along` writes them, over whole windows; share: 1 / pixels of a window; mean and variance (w,)
-    of the reference's windows; inside (w,) as `_place` writes it.
+    sums (3 w,): weighted means over whole windows, as `_sums_along` orders them; mean and variance (w,) of the
+    reference's windows; inside (w,) as `_place` writes it; flat: variance that is added to all.
     """
     width = len(score)
     first, second, both = sums[:width], sums[width : 2 * width], sums[2 * width :]
     for x in range(width):
-        average = first[x] * share
-        spread = max(second[x] * share - average * average, _ZERO)
-        covariance = both[x] * share - average * mean[x]
-        ncc = covariance / math.sqrt((spread + _FLAT) * (variance[x] + _FLAT))
+        average = first[x]
+        spread = max(second[x] - average * average, _ZERO)
+        covariance = both[x] - average * mean[x]
+        ncc = covariance / math.sqrt((spread + flat) * (variance[x] + flat))
         score[x] = ncc if inside[x] > _ZERO else -_HALF
 
 
@@ -112,20 +122,23 @@ def _insert(score, best):
 
 
 @njit(parallel=True, cache=True)
-def keep_best(inverse, reference, mean, variance, gray, directions, move, window, best):  # type: ignore[no-untyped-def]
+def keep_best(inverse, windows, weights, flat, gray, directions, move, best):  # type: ignore[no-untyped-def]
     """Match D hypotheses per pixel in one source photo, and keep the best scores seen so far.
 
-    All float32: inverse (D, h, w) inverse depths; reference (h, w) and the mean and variance of its windows; gray
-    (H, W) source photo; directions (3, h, w) and move (3,) give its places in -1..1; window: its side, odd; best
-    (K, D, h, w), sorted, the largest first: changed in place.
+    All float32: inverse (D, h, w) inverse depths; windows (3, h, w) the reference, and the mean and variance of its
+    windows; weights (2, h, window, w) along the rows and across them, as `support_weights` makes them; flat: variance
+    that is added to all windows'; gray (H, W) source photo; directions (3, h, w) and move (3,) give its places in
+    -1..1; best (K, D, h, w), sorted, the largest first: changed in place.
     """
+    reference, mean, variance = windows[0], windows[1], windows[2]
+    along, across = weights[0], weights[1]
     count, height, width = inverse.shape
+    window = along.shape[1]
     radius = window // 2
-    share = _ONE / np.float32(window * window)
     bands = (height + _BAND - 1) // _BAND
     for job in prange(count * bands):
         d, top = job // bands, job % bands * _BAND
-        flat, size_x, size_y = gray.ravel(), gray.shape[1], gray.shape[0]
+        pixels, size_x, size_y = gray.ravel(), gray.shape[1], gray.shape[0]
         place, inside = np.zeros(width, np.int32), np.zeros((window, width), np.float32)
         part_x, part_y = np.zeros(width, np.float32), np.zeros(width, np.float32)
         value, score = np.zeros(width, np.float32), np.zeros(width, np.float32)
@@ -135,13 +148,13 @@ def keep_best(inverse, reference, mean, variance, gray, directions, move, window
             slot = (y + window) % window
             if 0 <= y < height:
                 _place(inverse[d, y], directions, move, y, size_x, size_y, place, part_x, part_y, inside[slot])
-                _warp(flat, np.uint32(size_x), place, part_x, part_y, value)
-                _sums_along(value, reference[y], window, sums[slot])
+                _warp(pixels, np.uint32(size_x), place, part_x, part_y, value)
+                _sums_along(value, reference[y], along[y], sums[slot])
             else:
                 sums[slot] = _ZERO
             middle = y - radius
             if middle >= top:
-                _sum_across(sums, total)
-                _correlate(total, share, mean[middle], variance[middle], inside[middle % window], score)
+                _sum_across(sums, (slot + 1) % window, across[middle], total)
+                _correlate(total, mean[middle], variance[middle], inside[middle % window], flat, score)
                 for k in range(best.shape[0]):
                     _insert(score, best[k, d, middle])

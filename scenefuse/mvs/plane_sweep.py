@@ -18,14 +18,20 @@ from scipy import ndimage
 from torch import Tensor
 
 from scenefuse.mvs.matcher import Matcher, box
+from scenefuse.mvs.measured import is_measured
 from scenefuse.stage import setting
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
 
+PLANE_PX, NORMAL_PX = 9, 11
+"""Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
+pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things."""
+KNOWN_PLANE_PX = 7
+"""The same where depths are already nearly right: smaller, since objects are curved."""
 MIN_GAIN = 0.02
 """Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere."""
-TEXTURE = 3 / 255
-"""Windows whose grey values deviate by this much (three of 255 levels) have a texture that must match somewhere."""
+TEXTURE = 2 / 255
+"""Windows whose grey values deviate by this much (two of 255 levels) have a texture that must match somewhere."""
 
 
 @dataclass(frozen=True)
@@ -96,10 +102,12 @@ def estimate_depth(
         else:
             inverse, step = _upsampled(inverse, first.width, first.height), step / 2
         inverse, score = _refine(matcher, inverse, step, 1 / far, 1 / near)
-    inverse, slopes = _local_planes(inverse, score)
+    inverse, _ = _local_planes(inverse, score, PLANE_PX)
     inverse, score = _refine_once(matcher, inverse[None], step / 2)
+    _, slopes = _local_planes(inverse, score, NORMAL_PX)
     normals = _normals(inverse, slopes, reference.intrinsics)
-    good = (score >= settings.min_score) & (inverse > 0.5 / far)
+    pixel = (1 / near - 1 / far) / max(matcher.middle_shift_per_inverse_depth(1 / far, 1 / near), 1e-6)
+    good = is_measured(matcher, inverse, score, settings.min_score, pixel) & (inverse > 0.5 / far)
     depth = torch.where(good, 1 / inverse.clamp(min=1e-12), torch.zeros_like(inverse))
     return DepthEstimate(depth.cpu().numpy(), (normals * good[..., None]).cpu().numpy(), score.cpu().numpy())
 
@@ -126,7 +134,7 @@ def refine_by_matching(
     step = reach_px * (high - low) / max(matcher.shift_per_inverse_depth(low, high), 1e-6)
     inverse, _ = _refine_once(matcher, first[None], step / 2)
     inverse, score = _refine(matcher, _median3(inverse), step / 4, low, high)
-    inverse, _ = _local_planes(inverse, score)
+    inverse, _ = _local_planes(inverse, score, KNOWN_PLANE_PX)
     inverse, score = _refine_once(matcher, inverse[None], step / 8)
     before = matcher.score(first[None])[0]
     moved = (score >= min_score) & (score - before >= MIN_GAIN) & ((inverse - first).abs() <= step)
@@ -210,7 +218,7 @@ def _parabola(before: Tensor, middle: Tensor, after: Tensor) -> Tensor:
     return torch.where(inside, offset.clamp(-1, 1), torch.where((before < middle) | (after < middle), ends, 0.0))
 
 
-def _local_planes(inverse: Tensor, score: Tensor, window: int = 5) -> tuple[Tensor, Tensor]:
+def _local_planes(inverse: Tensor, score: Tensor, window: int) -> tuple[Tensor, Tensor]:
     """Smoothed inverse depth (h, w) and its slopes per pixel (2, h, w), from plane fits that keep edges.
 
     A plane's inverse depth is linear in the pixel, so a weighted linear fit in a window is a plane fit.

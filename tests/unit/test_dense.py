@@ -102,7 +102,8 @@ def test_matching_kernel_scores_as_its_twin(window):
     poses = np.repeat(np.eye(4)[None], 4, axis=0)
     poses[:, 0, 3], poses[:, 1, 3] = (0, 1, -2, 9), 0.1
     sizes = [(50, 70), (50, 70), (50, 70), (40, 80)]
-    photos = [View("", intrinsics, p, s[1], s[0], rng.random(s, np.float32)) for p, s in zip(poses, sizes)]
+    pixels = [cv2.GaussianBlur(rng.random(size, np.float32), (0, 0), 1) for size in sizes]
+    photos = [View("", intrinsics, p, s[1], s[0], g) for p, s, g in zip(poses, sizes, pixels)]
     matcher = Matcher(photos[0], photos[1:], 2, window, "cpu")
     # From behind the camera to far in front of it, some places beside the source photos.
     inverse = torch.linspace(-0.3, 0.5, 5)[:, None, None] + torch.from_numpy(0.05 * rng.random((5, 50, 70), np.float32))
@@ -124,7 +125,18 @@ def test_depth_and_normals_of_a_slanted_plane(maps):
     assert np.median(error) < 0.03
     towards_camera = np.array([0.3, -0.2, -1]) / np.linalg.norm([0.3, -0.2, -1])
     angle = np.degrees(np.arccos(np.clip((normals[inner] @ towards_camera)[depth[inner] > 0], -1, 1)))
-    assert np.median(angle) < 4
+    assert np.median(angle) < 1.5
+
+
+def test_normal_maps_are_in_the_order_of_colmap(tmp_path):
+    # COLMAP's own script of reading: (width, height, channels) in Fortran's order, transposed.
+    normals = np.random.default_rng(0).random((4, 5, 3), np.float32)
+    write_normals(tmp_path / "n.bin", normals)
+    header, values = (tmp_path / "n.bin").read_bytes()[:6], (tmp_path / "n.bin").read_bytes()[6:]
+    assert header == b"5&4&3&"
+    planes = np.frombuffer(values, np.float32).reshape((5, 4, 3), order="F")
+    assert np.array_equal(np.transpose(planes, (1, 0, 2)), normals)
+    assert np.array_equal(read_normals(tmp_path / "n.bin"), normals)
 
 
 def test_chunks_share_out_the_photos(maps):
@@ -152,13 +164,16 @@ def test_fused_cloud_lies_on_the_surface_without_a_half_pixel_shift(workspace, m
     report = read_json(report_path)
     assert len(cloud) == value(report, "points") > 3000 and report["spacing"]["unit"] == "m"
     assert value(report, "fused_share") > 0.1 and value(report, "notes") == []
+    # The first photo sees what the others only see in part: depths at their rims are wrong.
+    assert 0.001 < value(report, "outvoted_share") < 0.1
     assert cloud.fields["views"].min() >= 3
     x, y, z = cloud.points.T
     signed = (z - surface(x, y)) / np.sqrt(1 + 0.3**2 + 0.2**2)
     # A pixel is 0.067 wide here; half of it on this slope would show as a bias of 0.003 (0.3 * 0.033 - 0.2 * 0.033).
     assert np.abs(np.median(signed)) < 0.0025
     assert np.median(np.abs(signed)) < 0.02
-    assert cloud.normals is not None and (cloud.normals[:, 2] < 0).mean() > 0.99
+    angle = np.degrees(np.arccos(np.clip(cloud.normals @ np.array([0.3, -0.2, -1]) / np.sqrt(1.13), -1, 1)))
+    assert np.quantile(angle, 0.9) < 3
 
 
 def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_path):
@@ -166,7 +181,7 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
         workspace=workspace,
         depth=[maps / "0", maps / "1"],
         depth_json=[maps / "0.json", maps / "1.json"],
-        settings=replace(FUSION, max_reprojection_px=0.3, max_depth_error=1e-3),
+        settings=replace(FUSION, max_reprojection_px=0.05, max_depth_error=1e-4),
         cloud=tmp_path / "dense.ply",
         report=tmp_path / "dense.json",
     )

@@ -63,7 +63,7 @@ def test_no_depth_moves_farther_than_its_reach():
         for k, found in enumerate(refined.depths):
             start, end, true = wrong[k][known[k]], found[known[k]], truth[k][known[k]]
             assert (np.abs(1 / end - 1 / start) < 1.1 * reach * worth[k]).all()
-            assert (np.median(np.abs(end / true - 1)) < 0.002) == repaired[k]
+            assert (np.median(np.abs(end / true - 1)) < 0.003) == repaired[k]
 
 
 def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent():
