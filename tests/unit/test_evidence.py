@@ -57,7 +57,8 @@ def test_the_sharper_side_stays_where_both_measured(near, far):
     assert (found.reason[inside] == REPLACED).mean() > 0.95 and (found.reason[outside] == KEPT).all()
     assert (found.scene.fields["evidence"][outside] == MEASURED).mean() > 0.9
     # The other way round the scene is the sharper one, and nothing comes in where it is.
-    found = weigh(Side(scene, far), Side(obj, near), nerf_only=False)
+    farther = pack(photographs(8, 9.0, radius=6.0))
+    found = weigh(Side(scene, farther), Side(obj, near), nerf_only=False)
     assert found.added[scene.points[:, 0] < 0.3].mean() < 0.05 and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
     assert (found.reason == KEPT).all()
 
