@@ -223,6 +223,7 @@ def _write(fused: Fused, crop_json: dict[str, Any], inputs: FusionInputs, output
 def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, unit: str) -> dict[str, Any]:
     """What was added and taken away, with units."""
     added, weighed = fused.added, fused.weighed
+    unconfirmed = None if weighed is None else int((weighed.obj.fields["evidence"] == NERF_ONLY).sum())
     return {
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
         "registration": quantity(value(registration, "status"), ""),
@@ -231,10 +232,11 @@ def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, un
         "checked_points": quantity(len(fused.rows), "points"),
         "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(added), "points"),
-        "nerf_only_points": quantity(int((added.fields["evidence"] == NERF_ONLY).sum()), "points"),
+        "nerf_only_points": quantity(unconfirmed, "points"),
         "scene_spacing": quantity(scene_spacing, unit),
         "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
         "settled_by": quantity(None if weighed is None else weighed.moved, "diagonals"),
+        "notes": quantity([] if weighed is None else list(weighed.notes), ""),
         "fill_distance": quantity(fused.same_distance, unit),
         "color_gain": quantity(fused.gain, "1"),
         "color_bias": quantity(fused.bias, "of 255"),

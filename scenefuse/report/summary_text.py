@@ -233,7 +233,9 @@ def _cell(item: Any) -> str:
 
 
 def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
-    return [(label, find(fusion, f"fusion.{key}"), "") for label, key in (("points added", "added_points"),)]
+    """What fusion added and took away, and the points of the object that no photo confirms."""
+    counts = {"points added": "added", "taken from the scene": "removed", "confirmed by no photo": "nerf_only"}
+    return [(label, find(fusion, f"fusion.{key}_points"), "") for label, key in counts.items()]
 
 
 def _short(unit: str | None) -> str:

@@ -92,7 +92,10 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
     "changes, sentence",
     [
         ({"scene": {"matches": {"max_rati": 0.8}}}, "config, scene.matches: unknown key 'max_rati'; did you mean"),
-        ({"fusion": {"mode": "fil"}}, r"config, fusion.mode: 'fil' is not one of \['fill', 'append', 'replace'\]"),
+        (
+            {"fusion": {"mode": "fil"}},
+            r"config, fusion.mode: 'fil' is not one of \['evidence', 'fill', 'append', 'replace'\]",
+        ),
         ({"gpu": "many"}, "config, gpu: 'many' does not match"),
         ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
         ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
