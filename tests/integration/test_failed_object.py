@@ -14,6 +14,8 @@ import pandas as pd
 import pytest
 import yaml
 
+from scenefuse.fusion.evidence import unchecked
+from scenefuse.fusion.fuse_object import FROM_OBJECT, with_source
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import quantity, write_json
 
@@ -31,15 +33,23 @@ def sheet(low, high):
     return Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
 
 
+def added_by(name):
+    """What an object adds, each beside the scene."""
+    low = {"shed": 5, "barn": 8}.get(name, 5)
+    return with_source(unchecked(sheet(low, low + 2)), FROM_OBJECT)
+
+
 def write_stages(folder: Path, files: list[str], date: float) -> None:
     """Outputs of the stages before the last ones: real where these read them, else empty."""
     content = {"fine.json": STATUS, "dense.json": {"points": quantity(1000, "points")}}
     content["georeference.json"] = {"length_unit": quantity("m", "")}
     content["crop.json"] = {"diagonal": quantity(5.0, "m")}
+    content["fusion.json"] = {"status": quantity("fused", ""), "checked_points": quantity(0, "points")}
     for path in (folder / file for file in files):
         path.parent.mkdir(parents=True, exist_ok=True)
         if path.suffix == ".ply":
-            write_cloud(path, sheet(5, 7) if path.name == "object.ply" else sheet(0, 5))
+            clouds = {"object.ply": sheet(5, 7), "fused.ply": added_by(path.parent.name)}
+            write_cloud(path, clouds.get(path.name, sheet(0, 5)))
         elif path.suffix == ".png":
             cv2.imwrite(str(path), np.zeros((4, 4), dtype=np.uint8))
         elif path.suffix:
