@@ -218,22 +218,6 @@ def _compare(
         other = theirs[on_scene][partner]
         better[on_obj] = same(distance, mine, other) & (mine > CLEARLY * other)
     return worse, better
-    mine = _smooth(obj[on_obj], of_obj.deviation[on_obj])
-    theirs = np.full(len(scene), np.inf)
-    theirs[on_scene] = _smooth(scene[on_scene], of_scene.deviation[on_scene])
-    # What the scene did not measure lies as far off as what it measured, at least.
-    typical = float(np.median(theirs[on_scene])) if on_scene.any() else 0.0
-    step = SAME_SPACINGS * max(spacing(obj[on_obj]), spacing(scene) if len(scene) > 1 else 0.0)
-    distance, partner = cKDTree(obj[on_obj]).query(scene, workers=threads())
-    common = np.hypot(mine[partner], np.where(np.isfinite(theirs), theirs, typical))
-    same = distance <= np.clip(SAME_DEVIATIONS * common, step, SAME_MOST * diagonal)
-    worse = same & (mine[partner] <= theirs)
-    if on_scene.any():
-        distance, partner = cKDTree(scene[on_scene]).query(obj, workers=threads())
-        ours = np.full(len(obj), np.inf)
-        ours[on_obj] = mine
-        better = (ours > theirs[on_scene][partner]) & (distance <= step)
-    return worse, better
 
 
 def _supported(points: Array, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -1,8 +1,8 @@
 """Points checked in photos: where windows around a point match, it is measured, and how exactly is known.
 
 Sources: Furukawa and Ponce 2010 (patches in the tangent plane, photo-consistency from the best photos); Goesele et al.
-2006 (of several views the best count); Yoon and Kweon 2006 (weights that keep a window on one surface); Foerstner and
-Gruelich 1987 (variance of a match from the gradients and the noise).
+2006 (of several views the best count); Yoon and Kweon 2006 (weights that keep a window on one surface); Foerstner
+1982 (variance of a match from the gradients and the noise).
 """
 
 from dataclasses import dataclass, replace
@@ -129,7 +129,7 @@ class Matches:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(N,) points that enough photos confirm, where a match says where they are: to a pixel."""
+        """(N,) points that enough photos confirm, where a match says where they are: to MOST_DEVIATION."""
         return (self.photos >= LEAST_PHOTOS) & (self.deviation <= MOST_DEVIATION * self.step)
 
 
