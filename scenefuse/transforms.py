@@ -140,3 +140,14 @@ def rotation_between(a: Array, b: Array) -> Array:
         return 2.0 * np.outer(axis, axis) - np.eye(3)
     k = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     return np.eye(3) + k + k @ k / (1.0 + cosine)
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
+    """(3, 3) cam_from_world rotation of a camera at `eye` that looks at `target` with `up` upwards in the image."""
+    forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, np.asarray(up, dtype=np.float64))
+    if np.linalg.norm(right) < 1e-9:
+        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
+    right /= np.linalg.norm(right)
+    return np.stack([right, np.cross(forward, right), forward])

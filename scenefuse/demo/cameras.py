@@ -50,15 +50,6 @@ def pinhole(focal_px: float, width: int, height: int) -> NDArray[np.float64]:
     return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
 
 
-def look_at(centre: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
-    """cam_from_world rotation of a camera at `centre` that looks at `target`; `up` shows upwards in the photo."""
-    forward = target - centre
-    forward = forward / np.linalg.norm(forward)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
-
-
 def visible(
     scene: o3d.t.geometry.RaycastingScene, cameras: Cameras, points: NDArray[np.float64], tolerance: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from scenefuse.demo import textures
-from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
+from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
+from scenefuse.transforms import look_at
 
 
 @dataclass(frozen=True)

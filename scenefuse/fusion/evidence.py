@@ -95,7 +95,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
         scene: the scene's points around it.
         nerf_only: whether points of the object that no photo confirms are added where the scene has none.
     """
-    obj, scene = replace(obj, cloud=_with_normals(obj.cloud)), replace(scene, cloud=_with_normals(scene.cloud))
+    obj, scene = replace(obj, cloud=with_normals(obj.cloud)), replace(scene, cloud=with_normals(scene.cloud))
     diagonal = obj.cloud.diagonal
     of_obj, of_scene = _own(obj, scene), _own(scene, obj)
     on_obj = _supported(obj.cloud.points, of_obj.measured)
@@ -166,7 +166,7 @@ def unchecked(cloud: Cloud) -> Cloud:
     return with_evidence(cloud, Matches(nothing, none, none, *[nothing] * 3), none > 0, UNCHECKED)
 
 
-def _with_normals(cloud: Cloud) -> Cloud:
+def with_normals(cloud: Cloud) -> Cloud:
     """The cloud, with normals of local planes where it has none; their side is unknown then."""
     if cloud.normals is not None or len(cloud) < 3:
         return cloud

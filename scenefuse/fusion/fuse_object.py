@@ -141,7 +141,10 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
         if settings.mode == "evidence":
             placed = obj.transformed(pose)
-            photos = _photos(inputs.object_workspace, obj.points, pose), _photos(inputs.scene_workspace, placed.points)
+            photos = (
+                photos_of(inputs.object_workspace, obj.points, pose),
+                photos_of(inputs.scene_workspace, placed.points),
+            )
             fused = fuse_by_evidence(placed, scene, *photos, settings)
         else:
             fused = fuse_by_distance(obj, scene, part, pose, settings)
@@ -202,7 +205,7 @@ def _unchanged(obj: Cloud, scene: Cloud) -> Fused:
     return Fused(unchecked(scene), none, none.astype(np.uint8), nothing, np.ones(3), np.zeros(3), 0.0)
 
 
-def _photos(workspace: Path | None, points: Array, frame: Sim3 | None = None) -> Photos:
+def photos_of(workspace: Path | None, points: Array, frame: Sim3 | None = None) -> Photos:
     """The photos that see points (N, 3; the workspace's frame), moved by `frame`; none without a workspace."""
     if workspace is None:
         return pack([])

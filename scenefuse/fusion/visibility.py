@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.fusion.photo_kernel import MIN_COSINE
 from scenefuse.io.clouds import Cloud
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
@@ -57,17 +58,36 @@ def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin
     return Visibility(in_view, hidden, through)
 
 
-def _depth_buffer(surface: Cloud, view: View, spacing: float) -> View:
+def shown_in(
+    points: Array, normals: NDArray[np.float32], surface: Cloud, view: View, spacing: float, margin: float
+) -> NDArray[np.bool_]:
+    """Which of (N, 3) points with normals (N, 3) a photo shows: from their front, with no surface before them.
+
+    Here both sides of a surface hide: a camera behind a wall sees nothing. The other arguments are those of `see`; a
+    photo that looks along a surface, beyond 75 degrees, does not show it.
+    """
+    buffer = _depth_buffer(surface, view, spacing, both_sides=True)
+    _, farthest, known = _around(buffer.pixels)
+    rows, pixels, depth = buffer.visible(points)
+    at = pixels[:, 1], pixels[:, 0]
+    towards = view.centre - points[rows]
+    front = (normals[rows] * towards).sum(1) >= MIN_COSINE * np.linalg.norm(towards, axis=1)
+    found = np.zeros(len(points), dtype=bool)
+    found[rows] = front & ~((known[at] >= LEAST_KNOWN_HIDDEN) & (depth > farthest[at] + margin))
+    return found
+
+
+def _depth_buffer(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> View:
     """The photo in cells, `pixels` (H, W) the least depth of the surface's points in each; infinite without one."""
     points, normals = surface.points, surface.normals
     assert normals is not None
     towards = view.centre - points
-    facing = (normals * towards).sum(1) > FACING * np.linalg.norm(towards, axis=1)
+    hiding = both_sides | ((normals * towards).sum(1) > FACING * np.linalg.norm(towards, axis=1))
     _, depth = view.project(points)
     ahead = depth[depth > 0]
     cell = CELL_SPACINGS * spacing * view.intrinsics[0, 0] / (np.median(ahead) if len(ahead) else 1.0)
     small = view.at_most(max(4, round(max(view.width, view.height) / max(1.0, cell))))
-    rows, pixels, depth = small.visible(points[facing])
+    rows, pixels, depth = small.visible(points[hiding])
     nearest = np.full((small.height, small.width), np.inf)
     np.minimum.at(nearest, (pixels[:, 1], pixels[:, 0]), depth)
     return View(small.name, small.intrinsics, small.cam_from_world, small.width, small.height, nearest)

@@ -112,11 +112,11 @@ def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[n
     return np.stack([np.bincount(group, rows[:, k]) / counts for k in range(rows.shape[1])], axis=1)
 
 
-def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> float:
-    """Median distance from a point to its nearest neighbour, over a seeded sample, in the cloud's unit."""
+def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0, quantile: float = 0.5) -> float:
+    """Median (or other quantile) distance from a point to its nearest neighbour, over a seeded sample."""
     tree = cKDTree(points)
     chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
-    return float(np.median(tree.query(points[chosen], k=2)[0][:, 1]))
+    return float(np.quantile(tree.query(points[chosen], k=2)[0][:, 1], quantile))
 
 
 def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:

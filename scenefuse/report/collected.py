@@ -77,6 +77,8 @@ def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = ""
     if "fine.status" in per_variant[variants[0]]:
         there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
         fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
+        found, without = unbroken(folder, ("fusion.json", "missing.json"))
+        gap, fusion = gap or without, fusion | read_fields(folder, found[1:])
         per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])
     # A variant's own log, else one of the object as a whole.
     failed_variants = {variant: why_unfinished(jobs, f"{folder.name}-{variant}", folder.name) for variant in gaps}

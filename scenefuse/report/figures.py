@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
+from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.report.object_sheet import SIDES_DEG, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
@@ -19,6 +20,7 @@ from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
+MISSING_COLORS = {NEVER_SEEN: (214, 38, 31), UNTEXTURED: (52, 101, 196), CONTRADICTED: (150, 60, 170)}
 Discs = list[tuple[Cloud, NDArray[np.float32]]]
 """Clouds and the radii of their points' discs."""
 VIEW_POINTS = 150_000
@@ -30,7 +32,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
 
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
-    registration.png (object over crop, with the decision) and object.png (frames, masks, depth of the four stages,
+    missing.png (what is still missing, and from where photos would show it), registration.png (object over crop, with
+    the decision) and object.png (frames, masks, depth of the four stages,
     renders, the object's cloud); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
@@ -49,6 +52,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         "registration": _registration(inputs.name, join),
         **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
     }
+    if join.fused:
+        pictures["missing"] = _missing(inputs.name, join, clouds[1][1])
     cloud = join.object_cloud or upright(read_cloud(inputs.object_cloud), inputs.workspace)
     pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
     with atomic_directory(figures) as folder:
@@ -158,6 +163,49 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     note = f"grey: {(~added).sum():,} points of the scene; orange: {added.sum():,} points added from the object"
     columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG]
     return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
+
+
+def _missing(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
+    """What is still missing, coloured by why, from above with the stations, and from the best of these."""
+    tile, cells = (430, 350), join.missing
+    kinds = cells.fields["missing"] if len(cells) else np.zeros(0, np.uint8)
+    shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
+    colors = np.concatenate(
+        [SCENE_COLOR * shade, np.array([MISSING_COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)]
+    )
+    side = 1.2 * float(np.median(radii)) if len(cells) < 2 else 0.8 * spacing(cells.points)
+    cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
+    middle = (join.framed.min(0) + join.framed.max(0)) / 2
+    toward = join.stations[: len(SIDES_DEG) - 1] - middle
+    turns = np.degrees(np.arctan2(toward[:, 1], toward[:, 0])).tolist()
+    heights = np.degrees(np.arctan2(toward[:, 2], np.linalg.norm(toward[:, :2], axis=1))).tolist()
+    titles = [f"from station {k}" for k in range(1, len(turns) + 1)]
+    for azimuth in SIDES_DEG[len(turns) + 1 :]:
+        turns, heights, titles = [*turns, azimuth], [*heights, 22.0], [*titles, f"azimuth {azimuth:.0f}°"]
+    images: list[Image | None] = [_plan_view(join, cloud, sizes, colors.astype(np.uint8), tile)]
+    for turn, height in zip(turns, heights):
+        images.append(render(cloud, orbit_camera(join.framed, turn, height, tile), sizes, colors.astype(np.uint8)))
+    counts = ", ".join(f"{name.replace('_', ' ')} {(kinds == kind).sum()}" for kind, name in CLASSES.items())
+    note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}, see next_photos.csv"
+    columns = ["from above, with the stations", *titles]
+    return draw_sheet(Sheet(f"{name}: what is still missing", note, [images], [], columns, {}, tile))
+
+
+def _plan_view(join: Surroundings, cloud: Cloud, radii: Array, colors: Image, tile: tuple[int, int]) -> Image:
+    """The object from above, and the numbered stations around it."""
+    camera = orbit_camera(
+        np.concatenate([join.framed, join.stations]), -90.0, 90.0, tile, orthographic=True, margin=0.1
+    )
+    sheet = new_figure(tile)
+    axes = add_axes(sheet, (0, 0, *tile), tile)
+    axes.imshow(render(cloud, camera, radii, colors))
+    axes.set(xlim=(0, tile[0]), ylim=(tile[1], 0))
+    middle = camera.project(join.framed.mean(0, keepdims=True))[0][0]
+    for number, (x, y) in enumerate(camera.project(join.stations)[0], 1):
+        axes.annotate("", middle, (x, y), arrowprops={"arrowstyle": "->", "color": "#888888", "shrinkB": 40})
+        axes.scatter([x], [y], s=150, c="#d6261f", edgecolors="white", zorder=3)
+        axes.text(x, y, str(number), ha="center", va="center", fontsize=9, color="white", zorder=4)
+    return to_image(sheet)
 
 
 def _registration(name: str, join: Surroundings) -> Image:

@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud
 from scenefuse.stage import threads
+from scenefuse.transforms import look_at
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
@@ -58,17 +59,6 @@ class Camera:
         divisor = 1.0 if self.orthographic else np.where(depth > 0, depth, np.inf)[:, None]
         middle = np.array([self.width_px, self.height_px]) / 2.0
         return self.focal_px * x_in_cam[:, :2] / divisor + middle, depth
-
-
-def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike) -> Array:
-    """(3, 3) cam_from_world rotation of a camera at `eye` that looks at `target` with `up` upwards in the image."""
-    forward = np.asarray(target, dtype=np.float64) - np.asarray(eye, dtype=np.float64)
-    forward /= np.linalg.norm(forward)
-    right = np.cross(forward, np.asarray(up, dtype=np.float64))
-    if np.linalg.norm(right) < 1e-9:
-        right = np.cross(forward, np.eye(3)[np.argmin(np.abs(forward))])
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def orbit_camera(

@@ -6,6 +6,7 @@ from typing import Any
 
 import pandas as pd
 
+from scenefuse.fusion.missing import CLASSES
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.tables import (
@@ -118,6 +119,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
         _line("cloud", _pairs(cloud)) + _line("alignment", _alignment(item.stages)) + _variant_lines(item, variants)
     )
     lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
+    lines += _line("still missing", _still_missing(item.fusion))
     lines += _truth_table(item.stages)
     lines += _completion_lines([r for r in records(completion_table([item], variants[0])) if _is_measure(r)])
     return lines + _remarks(item.stages | fields | item.fusion)
@@ -236,6 +238,23 @@ def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
     """What fusion added and took away, and the points of the object that no photo confirms."""
     counts = {"points added": "added", "taken from the scene": "removed", "confirmed by no photo": "nerf_only"}
     return [(label, find(fusion, f"fusion.{key}_points"), "") for label, key in counts.items()]
+
+
+def _still_missing(fusion: Fields) -> str:
+    """Shares of the object's surface that no photo confirms, and what more photos would show."""
+    share = find(fusion, "missing.missing")
+    if share is None:
+        return ""
+    shares = [
+        f"{name.replace('_', ' ')} {_three(100 * find(fusion, f'missing.{name}'))} %" for name in CLASSES.values()
+    ]
+    text = f"{_three(100 * share)} % of its surface ({', '.join(shares)})"
+    stations, closes = find(fusion, "missing.stations"), find(fusion, "missing.stations_close")
+    if not stations:
+        return text
+    return (
+        f"{text}; photos from {stations} stations, next_photos.csv, show {_three(100 * closes)} % of what has texture"
+    )
 
 
 def _short(unit: str | None) -> str:

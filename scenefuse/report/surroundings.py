@@ -1,5 +1,6 @@
 """One object's part of the scene before and after fusion, turned upright: what figures and the 3D view show."""
 
+import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ class Surroundings:
         fused: whether the object was fused.
         decision: one line: status, reason, scores.
         unit: of the scene's lengths.
+    missing: cells of the object's surface that the completed scene lacks.
+    stations: (S, 3) places to photograph these from, best first.
     """
 
     before: Cloud
@@ -40,6 +43,8 @@ class Surroundings:
     fused: bool
     decision: str
     unit: str
+    missing: Cloud
+    stations: Array
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,10 @@ class FigureInputs:
     """The object's undistorted COLMAP workspace (images/, sparse/)."""
     masks: Path
     """Folder of the object's masks, {photo}.png."""
+    missing: Path
+    """Cells of the object's surface that are still missing (PLY, scene frame)."""
+    next_photos: Path
+    """CSV of the stations from where photos would show them."""
     stages: list[Path]
     """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
 
@@ -97,7 +106,18 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
         )
     unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
-    return Surroundings(before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit)
+    return Surroundings(
+        before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit,
+        read_cloud(inputs.missing).transformed(level) if fused else Cloud(np.zeros((0, 3))),
+        level.apply(read_stations(inputs.next_photos)),
+    )  # fmt: skip
+
+
+def read_stations(path: Path) -> Array:
+    """(S, 3) places of the stations in a table of photos, scene frame: the middle one of the photos of each."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["photo"] == "2"]
+    return np.array([[float(row[axis]) for axis in "xyz"] for row in rows]).reshape(-1, 3)
 
 
 def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:

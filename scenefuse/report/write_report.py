@@ -60,6 +60,8 @@ _TOLD_ABOVE = {"reason", "missing", "error"}
 _OBJECT_FIGURES = {
     "before_after": "The scene around the object before and after fusion, same cameras.",
     "provenance": "Grey: measured in the scene. Orange: added from the object.",
+    "missing": "Still missing: red never seen, blue seen but without texture, purple contradicted; numbers are the "
+    "stations of next_photos.csv.",
     "registration": "The object (orange) over the scene's crop (blue dots).",
     "object": "Frames, masks, depth of the four stages on one scale, renders beside their photos, the object's cloud.",
 }

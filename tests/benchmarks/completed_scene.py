@@ -1,7 +1,8 @@
 """The completed scene of a finished demo against truth, for every way to fuse, and the harm that a bad object does.
 
 make demo, then PYTHONPATH=. python tests/benchmarks/completed_scene.py --results results
-The same with --harm True: displaced and scaled objects, and a bad object in a perfect scene.
+The same with --harm True: displaced and scaled objects, and a bad object in a perfect scene; with --certificate True:
+whether what the run wrote about its added points, class and standard deviation, is true.
 
 A quarter of an object's masks wrong needs its stages to run again: spoil the masks in a copy of the results, run up to
 objects/NAME/object.ply there, and give that cloud with --objects NAME --object CLOUD.
@@ -18,9 +19,10 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.fusion.fuse_object import fuse_by_distance, fuse_by_evidence, together
+from scenefuse.fusion.evidence import MEASURED
+from scenefuse.fusion.fuse_object import FROM_OBJECT, fuse_by_distance, fuse_by_evidence, together
 from scenefuse.fusion.modes import FusionSettings
-from scenefuse.fusion.photo_check import moved_photos, read_photos
+from scenefuse.fusion.photo_check import LEAST_PHOTOS, moved_photos, read_photos
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
@@ -203,37 +205,82 @@ def harm_rows(case: Case) -> Iterator[dict[str, Any]]:
             yield {"wrong": wrong, "cloud": name, **{key: after[key] - before[key] for key in after}}
 
 
+def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """The row of the third table: what fused.ply says of the points it added, beside their true errors.
+
+    Errors are vectors to the true surface in the object's own frame, aligned to the truth by its cameras: the pose in
+    the scene has its own uncertainty.
+    """
+    folder = case.results / "objects" / case.name
+    evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
+    settled = Sim3.from_matrix(np.array(value(evidence, "settled_from_placed")))
+    truth_from_scene = case.known.fit.truth_from_model @ (settled @ case.pose).inverse()
+    added = fused[fused.fields["source"] == FROM_OBJECT]
+    measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= LEAST_PHOTOS)
+    errors = _to_surface(truth_from_scene.apply(added.points[measured]), case.known)
+    bounds = 2 * truth_from_scene.scale * added.fields["deviation"][measured]
+    axes = (np.abs(errors) <= bounds[:, None]).mean(0)
+    whole = case.known.fit.truth_from_model.apply(case.object.points)
+    total, nerf_only = (value(evidence, f"object_{name}") for name in ("points", "nerf_only"))
+    yield {
+        "added": len(added),
+        "measured": float(measured.mean()),
+        "nerf_only_of_object": nerf_only / total,
+        "deviation_median_over_diagonal": float(np.median(bounds)) / 2 / case.known.diagonal,
+        **{f"{axis}_within_2_sd": float(share) for axis, share in zip("xyz", axes)},
+        "distance_within_2_sd": float((np.linalg.norm(errors, axis=1) <= bounds).mean()),
+        "added_within_1pct": float((np.linalg.norm(errors, axis=1) <= 0.01 * case.known.diagonal).mean()),
+        "object_within_1pct": _share_near(whole, case.known),
+    }
+
+
+def _to_surface(points: Array, known: ObjectTruth) -> Array:
+    """(N, 3) vectors from the true surface to points in the truth's frame."""
+    query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
+    return points - known.mesh.caster().compute_closest_points(query, threads())["points"].numpy()
+
+
+def _share_near(points: Array, known: ObjectTruth) -> float:
+    """Share of the points within 1 % of the diagonal of the true surface."""
+    return float((np.linalg.norm(_to_surface(points, known), axis=1) <= 0.01 * known.diagonal).mean())
+
+
 def completed_scene(
     *,
     results: tuple[Path, ...] = (Path("results"),),
     objects: tuple[str, ...] = (),
     harm: bool = False,
+    certificate: bool = False,
     object: Path | None = None,
 ) -> None:
     """Print the scene's F-scores around each object against truth, before and after every kind of fusion.
 
-    All scores go to bench/completed_scene.tsv (`harm`: bench/completed_scene_harm.tsv) in the first results folder.
+    All scores go to bench/completed_scene.tsv (`harm`: completed_scene_harm.tsv, `certificate`:
+    completed_scene_certificate.tsv) in the first results folder.
 
     Args:
         results: folders of finished demos; several give mean and standard deviation.
         objects: which; all that the demo has without it.
         harm: print the second table instead: what a wrong pose or a bad object changes.
+        certificate: print the third table instead: whether the added points are as exact as they say.
         object: a cloud in the object's own frame that takes the place of the only one of `objects`.
 
     Raises:
         StageError: a folder holds no finished demo, or a cloud is given for several objects.
     """
     rows: list[dict[str, Any]] = []
+    kind = "_harm" if harm else "_certificate" if certificate else ""
+    rows_of = {"": completed_rows, "_harm": harm_rows, "_certificate": certificate_rows}[kind]
     for folder in results:
         for case in read_cases(folder, objects, object):
-            for row in harm_rows(case) if harm else completed_rows(case):
+            for row in rows_of(case):
                 rows.append({"run": str(folder), "object": case.name, "shift_over_diagonal": case.shift, **row})
-                print(f"{folder}, {case.name}: {row.get('wrong', '')} {row['cloud']}", flush=True)
+                print(f"{folder}, {case.name}: {row.get('wrong', '')} {row.get('cloud', kind[1:])}", flush=True)
     table = pd.DataFrame(rows)
-    out = results[0] / f"bench/completed_scene{'_harm' if harm else ''}.tsv"
+    out = results[0] / f"bench/completed_scene{kind}.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.5f")
-    print(harm_summary(table) if harm else summary(table))
+    print({"": summary, "_harm": harm_summary, "_certificate": certificate_summary}[kind](table))
 
 
 def read_cases(results: Path, objects: tuple[str, ...], cloud: Path | None) -> Iterator[Case]:
@@ -275,6 +322,12 @@ def harm_summary(table: pd.DataFrame) -> str:
         for cloud, changes in part.groupby("cloud", sort=False)[F_SCORES]:
             lines.append(f"  {cloud:46s}" + "".join(f"{change:+9.3f}" for change in changes.min()))
     return "\n".join(lines)
+
+
+def certificate_summary(table: pd.DataFrame) -> str:
+    """A column for each object, the mean over the runs."""
+    means = table.drop(columns=["run"]).groupby("object", sort=False).mean()
+    return "Added points, as fused.ply certifies them\n" + means.T.to_string(float_format=lambda x: f"{x:.5g}")
 
 
 def _mean(values: pd.Series) -> str:

@@ -9,15 +9,15 @@ from scenefuse.nerf.volume import cube_from_cameras, silhouettes, tight_cube, vi
 RADIUS, CENTER = 1.5, np.array([4.0, -2.0, 1.0])
 
 
-def sphere_views(count=12, size=48):
-    """Photos of `size` pixels of a sphere with smooth colours: images, masks, intrinsics, poses, true depths."""
+def sphere_views(count=12, size=48, arc=2 * np.pi, waves=5.0):
+    """Photos of `size` pixels of a painted sphere from an arc: images, masks, intrinsics, poses, true depths."""
     focal = float(size)
     k = np.array([[focal, 0, size / 2], [0, focal, size / 2], [0, 0, 1]])
     v, u = np.indices((size, size)) + 0.5
     rays = np.stack([(u - size / 2) / focal, (v - size / 2) / focal, np.ones_like(u)], -1)
     images, masks, poses, depths = [], [], [], []
     for i in range(count):
-        angle, height = 2 * np.pi * i / count, (-0.5, 0.6, 1.5)[i % 3]
+        angle, height = arc * i / count, (-0.5, 0.6, 1.5)[i % 3]
         position = CENTER + 5.0 * np.array([np.cos(angle), np.sin(angle), height]) / np.hypot(1, height)
         z = (CENTER - position) / np.linalg.norm(CENTER - position)
         x = np.cross(z, [0, 0, 1.0])
@@ -29,7 +29,7 @@ def sphere_views(count=12, size=48):
         root = b**2 - a * c
         depth = np.where(root > 0, (-b - np.sqrt(np.maximum(root, 0))) / a, 0)
         normal = (position + d * depth[..., None] - CENTER) / RADIUS
-        image = 0.5 + 0.4 * np.sin(normal * 5.0 + np.array([0.0, 1.0, 2.0]))
+        image = 0.5 + 0.4 * np.sin(normal * waves + np.array([0.0, 1.0, 2.0]))
         images.append((image * (root > 0)[..., None] * 255).astype(np.uint8))
         masks.append(root > 0)
         poses.append(np.vstack([np.column_stack([rotation, position]), [0, 0, 0, 1]]))

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from scenefuse.demo import capture, clicks, textures
-from scenefuse.demo.cameras import look_at, read_cameras, visible
+from scenefuse.demo.cameras import read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import StageError, manifest, read_json, value
@@ -163,12 +163,6 @@ def test_noise_fades_out_where_a_pixel_is_larger_than_it() -> None:
     coarse = np.array([textures.fractal_noise(*p, 1.0, 5, 1.0, 3.0, 1) for p in points])
     assert full.std() > 0.2 and np.all(coarse == 0)
     assert np.allclose(full, textures.noise_at(points, 5, 1.0, 1))
-
-
-def test_look_at_points_upright() -> None:
-    rotation = look_at(np.array([0, -10.0, 5]), np.zeros(3), np.array([0, 0, 1.0]))
-    assert np.allclose(rotation @ rotation.T, np.eye(3)) and np.linalg.det(rotation) > 0
-    assert (rotation @ [1, 0, 0])[0] == pytest.approx(1) and (rotation @ [0, 0, 1])[1] < 0
 
 
 @pytest.mark.parametrize(

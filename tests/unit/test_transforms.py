@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.transforms import Sim3, fit_sim3, fit_sim3_robust, rotation_angle_deg, rotation_between
+from scenefuse.transforms import Sim3, fit_sim3, fit_sim3_robust, look_at, rotation_angle_deg, rotation_between
 
 
 def random_sim3(seed: int) -> Sim3:
@@ -64,3 +64,12 @@ def test_rotation_angle_and_shortest_rotation():
     a, b = np.array([0.0, 0, 2]), np.array([1.0, 1, 0])
     assert np.allclose(rotation_between(a, b) @ [0, 0, 1], b / np.linalg.norm(b))
     assert np.allclose(rotation_between(a, -a) @ [0, 0, 1], [0, 0, -1])
+
+
+@pytest.mark.parametrize("eye", [[3.0, 1.0, 2.0], [0.0, -10.0, 5.0], [0.0, 0.0, 4.0]])
+def test_look_at_is_a_rotation_with_up_upwards(eye):
+    rotation = look_at(eye, [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    np.testing.assert_allclose(rotation @ eye, [0, 0, -np.linalg.norm(eye)], atol=1e-12)
+    assert (rotation @ [0, 0, 1])[1] < 0 or eye[:2] == [0, 0]

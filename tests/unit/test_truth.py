@@ -10,7 +10,7 @@ import open3d as o3d
 import pycolmap
 import pytest
 
-from scenefuse.demo.cameras import Cameras, cameras_json, look_at, pinhole
+from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.metrics import truth as tr
@@ -18,7 +18,7 @@ from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluation
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3, rotation_between
+from scenefuse.transforms import Sim3, look_at, rotation_between
 
 TRUTH_FROM_OBJECT = Sim3(
     2.5, rotation_between(np.array([0, 0, 1.0]), np.array([0.3, -0.5, 0.8])), np.array([3.0, 1, 2])

@@ -9,7 +9,7 @@ from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.io.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
-from scenefuse.report.render import Camera, look_at, orbit_camera, point_radii, render
+from scenefuse.report.render import Camera, orbit_camera, point_radii, render
 from scenefuse.report.view_file import read_view
 from scenefuse.report.view_points import AFTER, BOTH
 from scenefuse.report.view_scene import view_scene
@@ -40,13 +40,6 @@ def test_projection_of_an_orthographic_camera_ignores_depth():
     camera = Camera(np.eye(3), np.zeros(3), 10.0, 64, 48, orthographic=True)
     pixels, _ = camera.project([[1.0, 2.0, 1.0], [1.0, 2.0, 9.0]])
     np.testing.assert_allclose(pixels, [[42, 44], [42, 44]])
-
-
-def test_look_at_is_a_rotation_with_up_upwards():
-    rotation = look_at([3.0, 1.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
-    assert (rotation @ [0, 0, 1])[1] < 0
 
 
 @pytest.mark.parametrize("orthographic", [False, True])

@@ -6,6 +6,7 @@ def results_of(wildcards):
     ends = [
         "metrics.json",
         "fusion.json",
+        "missing.json",
         "frames.json",
         *(f"registration/{variant}/metrics.json" for variant in VARIANTS),
     ]

@@ -36,13 +36,13 @@ if workflow.is_main_process and workflow.global_resources["_nodes"].value is Non
     for name, limit in {"mem_mb": memory_mb(), "gpu": 1}.items():
         if name not in workflow.global_resources:
             workflow.register_resource(name, limit)
-    # Objects share the machine's cores: none of their jobs keeps several busy all the time, so two of one thread each are
-    # done sooner than one after the other with two.
-    OBJECT_THREADS = max(
-        1, min(8, (workflow.resource_settings.cores or 8) // max(1, len(OBJECTS)))
-    )
+    # A job that needs more cores than are free waits until no smaller one is ready, so every job takes its share only: half
+    # for the scene, which all objects wait for in the end (its rules have priority 1), and of the rest one for each object.
+    cores = workflow.resource_settings.cores or 8
+    SCENE_THREADS = max(1, min(8, cores // 2))
+    OBJECT_THREADS = max(1, min(8, cores // (len(SCENES) + len(OBJECTS))))
 else:
-    OBJECT_THREADS = 8
+    SCENE_THREADS = OBJECT_THREADS = 8
 
 
 wildcard_constraints:

@@ -18,9 +18,10 @@ rule render_scene:
         "results/logs/render_scene/{scene}.log",
     benchmark:
         "results/benchmarks/render_scene/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=4000,
         runtime=30,
@@ -49,7 +50,7 @@ rule render_object:
         object=DEMO_OBJECTS,
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: OBJECT_THREADS
     resources:
         mem_mb=4000,
         runtime=30,

@@ -3,6 +3,7 @@
 # INPUTS    results/objects/{object}/object.ply, undistorted/, registration/full/; results/scenes/{scene}/dense.ply, undistorted/;
 #           config: fusion
 # OUTPUTS   results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, checked.ply, evidence.json, fusion.json
+#           results/objects/{object}/missing.ply, missing.json, next_photos.csv, next_photos.geojson
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
 
 
@@ -46,6 +47,45 @@ rule fuse_object:
         " --fine-json {input.fine} --object-workspace {input.workspace} --scene-workspace {input.scene_workspace}"
         " --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
         " --fused-laz {output.laz} --checked {output.checked} --evidence {output.evidence} --report {output.report} {params.options} &> {log}"
+
+
+rule find_missing:
+    """Surface of the fused object that no photo confirms, and where to stand next (F5, F6)."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        fused_scene="results/objects/{object}/fused_scene.ply",
+        crop_json="results/objects/{object}/registration/full/crop.json",
+        fine="results/objects/{object}/registration/full/fine.json",
+        evidence="results/objects/{object}/evidence.json",
+        workspace=POSED,
+        scene_workspace=in_scene("undistorted"),
+        masks="results/objects/{object}/masks",
+        georeference=in_scene("georeference.json"),
+    output:
+        missing="results/objects/{object}/missing.ply",
+        photos="results/objects/{object}/next_photos.csv",
+        geojson="results/objects/{object}/next_photos.geojson",
+        report="results/objects/{object}/missing.json",
+    log:
+        "results/logs/find_missing/{object}.log",
+    benchmark:
+        "results/benchmarks/find_missing/{object}.tsv"
+    conda:
+        "../../envs/registration.yaml"
+    threads: OBJECT_THREADS
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 60 * attempt,
+    params:
+        script=script("fusion/find_missing.py"),
+        code=code("fusion/find_missing.py"),
+    message:
+        "{wildcards.object}: what is still missing"
+    shell:
+        "exec python {params.script} --object {input.cloud} --fused-scene {input.fused_scene} --crop-json {input.crop_json}"
+        " --fine-json {input.fine} --evidence-json {input.evidence} --object-workspace {input.workspace}"
+        " --scene-workspace {input.scene_workspace} --masks {input.masks} --georeference-json {input.georeference}"
+        " --missing {output.missing} --next-photos {output.photos} --geojson {output.geojson} --report {output.report} &> {log}"
 
 
 rule complete_scene:

@@ -20,6 +20,7 @@ rule estimate_depth_maps:
         "results/logs/estimate_depth_maps/{scene}-{chunk}.log",
     benchmark:
         "results/benchmarks/estimate_depth_maps/{scene}-{chunk}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
     threads: 1
@@ -60,9 +61,10 @@ rule fuse_depth_maps:
         "results/logs/fuse_depth_maps/{scene}.log",
     benchmark:
         "results/benchmarks/fuse_depth_maps/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,

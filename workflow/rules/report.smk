@@ -53,6 +53,8 @@ rule draw_object:
         cloud="results/objects/{object}/object.ply",
         fine="results/objects/{object}/registration/full/fine.json",
         metrics="results/objects/{object}/metrics.json",
+        missing="results/objects/{object}/missing.ply",
+        next_photos="results/objects/{object}/next_photos.csv",
         workspace="results/objects/{object}/undistorted",
         masks="results/objects/{object}/masks",
         stages=expand(
@@ -85,7 +87,8 @@ rule draw_object:
     shell:
         "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
-        " --metrics-json {input.metrics} --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
+        " --metrics-json {input.metrics} --missing {input.missing} --next-photos {input.next_photos}"
+        " --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
         " --figures {output} &> {log}"
 
 

@@ -23,6 +23,7 @@ rule list_photos:
         "results/logs/list_photos/{scene}.log",
     benchmark:
         "results/benchmarks/list_photos/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
     resources:
@@ -78,9 +79,10 @@ rule extract_scene_features:
         "results/logs/extract_scene_features/{scene}.log",
     benchmark:
         "results/benchmarks/extract_scene_features/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
@@ -104,6 +106,7 @@ use rule extract_scene_features as extract_object_features with:
         "results/logs/extract_object_features/{object}.log",
     benchmark:
         "results/benchmarks/extract_object_features/{object}.tsv"
+    priority: 0
     threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
@@ -128,9 +131,10 @@ rule match_scene_features:
         "results/logs/match_scene_features/{scene}.log",
     benchmark:
         "results/benchmarks/match_scene_features/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 240 * attempt,
@@ -157,6 +161,7 @@ use rule match_scene_features as match_object_features with:
         "results/logs/match_object_features/{object}.log",
     benchmark:
         "results/benchmarks/match_object_features/{object}.tsv"
+    priority: 0
     threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
@@ -183,9 +188,10 @@ rule map_scene_photos:
         "results/logs/map_scene_photos/{scene}.log",
     benchmark:
         "results/benchmarks/map_scene_photos/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
@@ -213,6 +219,7 @@ use rule map_scene_photos as map_object_photos with:
         "results/logs/map_object_photos/{object}.log",
     benchmark:
         "results/benchmarks/map_object_photos/{object}.tsv"
+    priority: 0
     threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
@@ -239,6 +246,7 @@ rule georegister:
         "results/logs/georegister/{scene}.log",
     benchmark:
         "results/benchmarks/georegister/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
     resources:
@@ -270,9 +278,10 @@ rule undistort_scene_photos:
         "results/logs/undistort_scene_photos/{scene}.log",
     benchmark:
         "results/benchmarks/undistort_scene_photos/{scene}.tsv"
+    priority: 1
     conda:
         "../../envs/reconstruction.yaml"
-    threads: 8
+    threads: SCENE_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
@@ -301,6 +310,7 @@ use rule undistort_scene_photos as undistort_object_photos with:
         "results/logs/undistort_object_photos/{object}.log",
     benchmark:
         "results/benchmarks/undistort_object_photos/{object}.tsv"
+    priority: 0
     threads: 1
     resources:
         mem_mb=lambda wildcards, attempt: 2000 * attempt,

@@ -1,0 +1,181 @@
+"""What an object still lacks after fusion, and the photos that would close most of it."""
+
+import csv
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cores import use_threads
+from scenefuse.fusion.evidence import around, with_normals
+from scenefuse.fusion.fuse_object import is_placed, photos_of
+from scenefuse.fusion.missing import CLASSES, Missing, find_missing_surface
+from scenefuse.fusion.next_photos import Plan, plan_stations
+from scenefuse.fusion.photo_check import Photos
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.pictures import read_mask
+from scenefuse.io.units import length_unit
+from scenefuse.sfm.geodesy import LocalFrame, scene_frame
+from scenefuse.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import View
+
+MASK_PX = 400
+"""Longer side of the masks that the hull is counted in: finer than its cells."""
+POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
+COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "heading_deg", "pitch_deg", "closes")
+"""Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
+
+
+@dataclass(frozen=True)
+class MissingInputs:
+    """What the search for missing surface reads."""
+
+    object: Path
+    """Object cloud (PLY) in its own frame."""
+    fused_scene: Path
+    """PLY, the whole scene with the object in it."""
+    crop_json: Path
+    """JSON of the crop stage, for the direction of gravity."""
+    fine_json: Path
+    """JSON of the fine registration."""
+    evidence_json: Path
+    """JSON of the fusion's evidence, for where the object settled."""
+    object_workspace: Path
+    """The object's undistorted COLMAP workspace."""
+    scene_workspace: Path
+    """The scene's, in the frame of its cloud."""
+    masks: Path
+    """Folder of the object's masks, {photo}.png."""
+    georeference_json: Path
+    """JSON with `crs` and the scene's origin, if it has one."""
+
+
+@dataclass(frozen=True)
+class MissingOutputs:
+    """What it writes."""
+
+    missing: Path
+    """PLY, scene frame: the middles of the missing cells, `missing` 1 never seen, 2 untextured, 3 contradicted."""
+    next_photos: Path
+    """CSV, a row for each photo that would help: where to stand and where to look."""
+    geojson: Path
+    """GeoJSON of the same, WGS84; without features where the scene is not georeferenced."""
+    report: Path
+    """JSON: shares of the object's surface, what the photos would close, notes."""
+
+
+def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
+    """Find the surface of a fused object that no photo confirms, and the camera positions that would show most of it
+    (method F5, F6); of an unregistered object nothing is written but the reason.
+
+    Args:
+        inputs: see MissingInputs.
+        outputs: see MissingOutputs.
+    """
+    start = time.perf_counter()
+    use_threads(threads())
+    registration = read_json(inputs.fine_json)
+    unit = length_unit(inputs.georeference_json)
+    if not is_placed(registration):
+        nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
+        write_cloud(outputs.missing, nothing)
+        _write_table(outputs.next_photos, [])
+        _write_geojson(outputs.geojson, [])
+        reason = {"status": quantity("unregistered", ""), "reason": quantity(value(registration, "reason"), "")}
+        write_json(outputs.report, reason)
+        return
+    obj, photos, masks = _in_scene(inputs, Sim3.from_matrix(np.array(value(registration, "scene_from_object"))))
+    completed = with_normals(read_cloud(inputs.fused_scene))
+    missing = find_missing_surface(obj, completed[around(completed, obj)], photos, masks)
+    level = np.array(value(read_json(inputs.crop_json), "level_from_scene"))
+    plan = plan_stations(missing, obj, completed, masks or photos[0].views, level[2])
+    write_cloud(outputs.missing, missing.cells)
+    frame = scene_frame(read_json(inputs.georeference_json))
+    rows = photo_rows(plan, level, frame)
+    _write_table(outputs.next_photos, rows)
+    _write_geojson(outputs.geojson, rows)
+    content = _report(missing, plan, unit) | {"seconds": quantity(time.perf_counter() - start, "s")}
+    write_json(outputs.report, content)
+
+
+def _in_scene(inputs: MissingInputs, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
+    """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
+    settled = read_json(inputs.evidence_json).get("settled_from_placed")
+    pose = Sim3.from_matrix(np.array(settled["value"])) @ pose if settled else pose
+    own = with_normals(read_cloud(inputs.object))
+    obj = own.transformed(pose)
+    photos = photos_of(inputs.object_workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
+    views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
+    return obj, photos, [_with_mask(view, path) for view, path in views if path.is_file()]
+
+
+def _with_mask(view: View, path: Path) -> View:
+    """The view, smaller, with its mask."""
+    mask = read_mask(path)
+    if mask.shape != (view.height, view.width):
+        raise StageError(
+            f"{path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its photo {view.width} x {view.height}; rerun the"
+            " masks"
+        )
+    small = replace(view, pixels=mask.astype(np.uint8) * 255).at_most(MASK_PX)
+    return replace(small, pixels=small.pixels > 127)
+
+
+def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
+    """Shares of the object's surface, and what the stations would close, with units."""
+    shares = {name: missing.share(kind) for kind, name in CLASSES.items()}
+    return {
+        "status": quantity("found", ""),
+        "surface_cells": quantity(missing.covered_cells + len(missing.cells), "cells"),
+        "cell_side": quantity(missing.side, unit),
+        "missing": quantity(sum(shares.values()), "of the object's surface"),
+        **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
+        "seen_through_points": quantity(missing.seen_through, "points"),
+        "stations": quantity(len(plan.stations), ""),
+        "stations_close": quantity(sum(station.closes for station in plan.stations), "of never seen and contradicted"),
+        "reachable": quantity(plan.reachable, "of never seen and contradicted"),
+        "notes": quantity(list(missing.notes), ""),
+    }
+
+
+def photo_rows(plan: Plan, level: Array, frame: LocalFrame | None) -> list[dict[str, Any]]:
+    """A row for each photo; level: (3, 3) level_from_scene."""
+    rows = []
+    for number, station in enumerate(plan.stations, 1):
+        for view in station.photos:
+            ahead = level @ view.cam_from_world[2, :3]
+            row = {"station": number, "photo": int(view.name), **dict(zip("xyz", np.round(view.centre, 4).tolist()))}
+            if frame is not None:
+                latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
+                row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
+                row["altitude_m"] = round(altitude, 3)
+            row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
+            row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
+            rows.append(row | {"closes": round(station.closes, 4)})
+    return rows
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """CSV of the photos; a heading alone where there are none."""
+    columns = [name for name in COLUMNS if not rows or name in rows[0]]
+    with atomic_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _write_geojson(path: Path, rows: list[dict[str, Any]]) -> None:
+    """RFC 7946: points with longitude, latitude, height; no features where the scene is not georeferenced."""
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [row[k] for k in POSITION]},
+            "properties": {k: v for k, v in row.items() if k not in (*POSITION, *"xyz")},
+        }
+        for row in rows
+        if POSITION[0] in row
+    ]
+    write_json(path, {"type": "FeatureCollection", "features": features})

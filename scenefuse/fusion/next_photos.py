@@ -1,0 +1,159 @@
+"""Where to stand next: camera positions whose photos would close most of what is missing (method F6).
+
+Sources: Nemhauser, Wolsey, Fisher 1978 and Minoux 1978 (choosing the best next one, again and again, comes near the
+best set of them, and most need not be looked at again); Hepp et al. 2018 and Smith et al. 2018 (views of a proxy
+surface, planned by what they add to it).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.fusion.missing import SPARSEST, UNTEXTURED, Missing
+from scenefuse.fusion.visibility import shown_in
+from scenefuse.io.clouds import Cloud, spacing, voxel_downsample
+from scenefuse.transforms import Array, look_at, rotation_between
+from scenefuse.workspace import View
+
+DIRECTIONS = 120
+"""Directions that are tried, spread evenly over a sphere around the object."""
+DISTANCES = (0.7, 1.0, 1.4)
+"""In distances of the close-ups that there are."""
+LOWEST_DEG = -25.0
+"""Cameras farther below the object's middle are left out."""
+CLEARANCE = 0.05
+"""Share of the object's diagonal that a camera stays away from the ground and everything else."""
+SIDESTEP_DEG = 10.0
+"""Between the three photos of a station, so that they locate what they show."""
+BESIDE = 0.6
+"""What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight."""
+MOST_STATIONS = 6
+UPWARDS = np.array([0.0, 0.0, 1.0])
+LEAST_GAIN = 0.05
+"""Share of what is missing that a station must add."""
+
+
+@dataclass(frozen=True)
+class Station:
+    """A place to take photos from.
+
+    Attributes:
+        photos: three cameras beside each other, in the scene's frame, that look at the object.
+        closes: share of the surface worth photographing that all three show, and no station before.
+    """
+
+    photos: list[View]
+    closes: float
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a few more photos would close.
+
+    Attributes:
+        stations: the best first.
+        reachable: share of the surface worth photographing that some place shows, chosen or not.
+    """
+
+    stations: list[Station]
+    reachable: float
+
+
+def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[View], up: Array) -> Plan:
+    """The stations that show most of the missing surface.
+
+    Untextured surface is left out, since photos from elsewhere do not measure it either.
+
+    Args:
+        missing: in the scene's frame.
+        obj: the object in it.
+        around: everything that stands in the way, with normals: the completed scene.
+        close_ups: the object's cameras in the scene's frame, for lens and distance.
+        up: (3,) unit vector opposite to gravity.
+    """
+    cells = missing.cells[missing.cells.fields["missing"] != UNTEXTURED]
+    if len(cells) == 0 or not close_ups:
+        return Plan([], 0.0)
+    middle = (obj.points.min(0) + obj.points.max(0)) / 2
+    distance = float(np.median([np.linalg.norm(view.centre - middle) for view in close_ups]))
+    apart = np.linalg.norm(around.points - middle, axis=1)
+    assert around.normals is not None
+    beside = apart < BESIDE * obj.diagonal
+    obstacles = voxel_downsample(Cloud(around.points[beside], around.normals[beside]), missing.side)
+    others = voxel_downsample(Cloud(around.points[apart < 2 * max(DISTANCES) * distance]), CLEARANCE * obj.diagonal / 2)
+    step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
+    lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
+    photos = [_photos_from(place, middle, lens, up) for place in _around(middle, distance, up)]
+    free = _Free(others.points, middle, obj.diagonal, up)
+    photos = [three for three in photos if free.ways(np.array([photo.centre for photo in three]))]
+    # What the middle photo shows is the most that all three do; these are asked only where it decides (Minoux 1978).
+    shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
+    shown = shown.reshape(len(photos), len(cells)).astype(bool)
+    exact, left, stations = np.zeros(len(photos), dtype=bool), np.ones(len(cells), dtype=bool), list[Station]()
+    while len(stations) < MOST_STATIONS and len(photos):
+        gains = (shown & left).sum(1)
+        best = int(gains.argmax())
+        if gains[best] < max(1.0, LEAST_GAIN * len(cells)):
+            break
+        if not exact[best]:
+            shown[best], exact[best] = _shown_in_all(photos[best], cells, obstacles, step, missing.side), True
+            continue
+        stations.append(Station(photos[best], float(gains[best]) / len(cells)))
+        left &= ~shown[best]
+    return Plan(stations, float(shown.any(0).mean()) if len(photos) else 0.0)
+
+
+def _around(middle: Array, distance: float, up: Array) -> Array:
+    """(P, 3) places around an object, not far below its middle, nearest first."""
+    number = np.arange(DIRECTIONS) + 0.5
+    height, turn = 1 - 2 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number
+    flat = np.sqrt(1 - height**2)
+    directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    directions = directions[height > np.sin(np.radians(LOWEST_DEG))] @ rotation_between(UPWARDS, up).T
+    return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
+
+
+class _Free:
+    """Where a camera can be: above the ground, and with nothing between it and the object."""
+
+    def __init__(self, obstacles: Array, middle: Array, diagonal: float, up: Array):
+        self.middle, self.diagonal, self.clearance = middle, diagonal, CLEARANCE * diagonal
+        self.level_from_scene = rotation_between(up, UPWARDS)
+        self.level = obstacles @ self.level_from_scene.T
+        self.near, self.below = cKDTree(obstacles), cKDTree(self.level[:, :2])
+
+    def ways(self, eyes: Array) -> bool:
+        """Whether all of (E, 3) places see the object over free space, up to what stands beside it."""
+        at = eyes @ self.level_from_scene.T
+        if (at[:, 2] < self.level[self.below.query(at[:, :2])[1], 2] + self.clearance).any():
+            return False
+        ahead = self.middle - eyes
+        ends = np.maximum(0, 1 - BESIDE * self.diagonal / np.linalg.norm(ahead, axis=1))
+        steps = np.linspace(0, 1, 60)[:, None, None] * ends[:, None]
+        return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
+
+
+def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[View]:
+    """Three cameras beside each other, the second at the place, that look at the middle."""
+    away = place - middle
+    axis = up - (up @ away) / (away @ away) * away
+    axis /= np.linalg.norm(axis)
+    photos = []
+    for number, angle in enumerate(np.radians(SIDESTEP_DEG) * np.array([-1, 0, 1]), 1):
+        eye = middle + np.cos(angle) * away + np.sin(angle) * np.cross(axis, away)
+        pose = np.eye(4)
+        pose[:3, :3] = look_at(eye, middle, up)
+        pose[:3, 3] = -pose[:3, :3] @ eye
+        photos.append(View(str(number), lens.intrinsics, pose, lens.width, lens.height))
+    return photos
+
+
+def _shown_in_all(photos: list[View], cells: Cloud, obstacles: Cloud, step: float, margin: float) -> NDArray[np.bool_]:
+    """(K,) cells that all the photos show."""
+    assert cells.normals is not None
+    shown = np.ones(len(cells), dtype=bool)
+    for photo in photos:
+        shown &= shown_in(cells.points, cells.normals, obstacles, photo, step, margin)
+    return shown

@@ -1,0 +1,201 @@
+"""What is still missing of a painted sphere, by class, and the photos that show it."""
+
+import csv
+import json
+
+import cv2
+import numpy as np
+import pytest
+from support.painted_sphere import CENTER, RADIUS, sphere_views
+
+from scenefuse.fusion.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
+from scenefuse.fusion.missing import CONTRADICTED, NEVER_SEEN, UNTEXTURED, find_missing_surface
+from scenefuse.fusion.next_photos import Plan, plan_stations
+from scenefuse.fusion.photo_check import pack
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3
+from scenefuse.workspace import View, write_model
+
+UP = np.array([0.0, 0.0, 1.0])
+NOBODY = pack([])
+
+
+def photographed(arc, count=24, waves=30.0):
+    """Photos of the sphere from an arc around it, for the check, and their masks."""
+    images, masks, intrinsics, poses, _ = sphere_views(count, 200, arc, waves)
+    views = [
+        View(f"{i}.png", k, np.linalg.inv(pose), 200, 200, cv2.cvtColor(image, cv2.COLOR_RGB2GRAY))
+        for i, (image, k, pose) in enumerate(zip(images, intrinsics, poses))
+    ]
+    silhouettes = [View(v.name, v.intrinsics, v.cam_from_world, 200, 200, mask) for v, mask in zip(views, masks)]
+    return pack(views), silhouettes
+
+
+def ball(count=20000):
+    """Points spread evenly over the sphere."""
+    k = np.arange(count) + 0.5
+    height, turn = 1 - 2 * k / count, np.pi * (1 + np.sqrt(5)) * k
+    flat = np.sqrt(1 - height**2)
+    normals = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+    return Cloud(CENTER + RADIUS * normals, normals.astype(np.float32))
+
+
+def shown(cloud, views, least=3):
+    """The points that several photos show from their front."""
+    count = np.zeros(len(cloud))
+    for view in views:
+        towards = view.centre - cloud.points
+        count += (towards * cloud.normals).sum(1) > 0.3 * np.linalg.norm(towards, axis=1)
+    return cloud[count >= least]
+
+
+@pytest.fixture(scope="module")
+def half():
+    """Photos from one side, and the part of the sphere that they measure."""
+    photos, masks = photographed(np.pi)
+    return photos, masks, shown(ball(), photos.views)
+
+
+def test_a_sphere_photographed_from_all_sides_lacks_nothing_but_its_foot():
+    photos, masks = photographed(2 * np.pi)
+    cloud = shown(ball(), photos.views)
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    assert missing.covered_cells > 1000
+    assert (missing.cells.points[:, 2] < CENTER[2] - 0.6 * RADIUS).all()
+    assert missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.002
+
+
+def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(half):
+    photos, masks, cloud = half
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    assert missing.share(NEVER_SEEN) > 0.15 and missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.02
+    plan = plan_stations(missing, cloud, cloud, photos.views, UP)
+    # The photos are from y > 0.
+    assert all(station.photos[1].centre[1] < CENTER[1] for station in plan.stations)
+    assert plan.stations[0].closes > 0.3 and plan.reachable > 0.5
+    assert sum(station.closes for station in plan.stations) <= plan.reachable <= 1
+    # What the stations show is no longer missing, where they said so.
+    more = pack([View(v.name, v.intrinsics, v.cam_from_world, 200, 200, np.full((200, 200), 128, np.uint8))
+                 for station in plan.stations for v in station.photos])  # fmt: skip
+    grown = shown(ball(), photos.views + more.views)
+    left = find_missing_surface(grown, grown, (photos, more), masks)
+    assert len(left.cells) < (1.3 - sum(s.closes for s in plan.stations)) * len(missing.cells)
+
+
+@pytest.mark.parametrize(("waves", "kind"), [(0.0, UNTEXTURED), (30.0, CONTRADICTED)])
+def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
+    photos, masks = photographed(2 * np.pi, waves=waves)
+    obj = shown(ball(), photos.views)
+    gone = np.linalg.norm(obj.points - CENTER - [0, 0, RADIUS], axis=1) < 0.5 * RADIUS
+    missing = find_missing_surface(obj, obj[~gone], (photos, NOBODY), masks)
+    top = missing.cells[missing.cells.points[:, 2] > CENTER[2]]
+    assert len(top) > 100 and (top.fields["missing"] == kind).mean() > 0.9
+    stations = plan_stations(missing, obj, obj, photos.views, UP).stations
+    assert (len(stations) > 0 and stations[0].photos[1].centre[2] > CENTER[2]) == (kind == CONTRADICTED)
+
+
+def test_what_photos_see_through_is_not_missing(half):
+    photos, masks, cloud = half
+    floating = Cloud(CENTER + [0, RADIUS + 0.4, 0] + 0.2 * (ball(500).points - CENTER), ball(500).normals)
+    alone = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    both = find_missing_surface(concatenate([cloud, floating]), cloud, (photos, NOBODY), masks)
+    assert both.seen_through > 200 and abs(both.share(NEVER_SEEN) - alone.share(NEVER_SEEN)) < 0.05
+    assert not (both.cells.points[:, 1] > CENTER[1] + RADIUS).any()
+
+
+def test_without_masks_only_the_own_points_count_and_a_note_says_so(half):
+    photos, _, cloud = half
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), [])
+    assert len(missing.cells) == 0 and "no masks" in missing.notes[0]
+    assert plan_stations(missing, cloud, cloud, photos.views, UP) == Plan([], 0.0)
+
+
+def test_no_station_lies_below_the_ground_or_in_a_wall(half):
+    photos, masks, cloud = half
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-12, 12, 0.1), np.arange(-12, 12, 0.1)))
+    ground = Cloud(CENTER + np.stack([x, y, np.full_like(x, -RADIUS)], 1), np.tile(np.float32([0, 0, 1]), (len(x), 1)))
+    # A wall right behind the sphere: from beyond it nothing is seen.
+    wall = Cloud(CENTER + np.stack([x, np.full_like(x, -4.0), y], 1), np.tile(np.float32([0, 1, 0]), (len(x), 1)))
+    plan = plan_stations(missing, cloud, concatenate([cloud, ground, wall]), photos.views, UP)
+    eyes = np.array([view.centre for station in plan.stations for view in station.photos]) - CENTER
+    assert len(eyes) and (eyes[:, 2] > -RADIUS).all() and (eyes[:, 1] > -4.0).all()
+
+
+def test_rows_say_where_to_stand_and_where_to_look(half):
+    photos, masks, cloud = half
+    missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
+    plan = plan_stations(missing, cloud, cloud, photos.views, UP)
+    frame = LocalFrame(47.4, 8.5, 400.0)
+    rows = photo_rows(plan, np.eye(3), frame)
+    assert len(rows) == 3 * len(plan.stations) and set(rows[0]) == set(COLUMNS)
+    for row in rows:
+        eye = np.array([row[axis] for axis in "xyz"])
+        back = frame.apply(np.array([[row[k] for k in ("latitude_deg", "longitude_deg", "altitude_m")]]))[0]
+        np.testing.assert_allclose(back, eye, atol=0.01)
+        ahead, heading, pitch = CENTER - eye, np.radians(row["heading_deg"]), np.radians(row["pitch_deg"])
+        looks = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
+        assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
+    assert "longitude_deg" not in photo_rows(plan, np.eye(3), None)[0]
+
+
+@pytest.fixture
+def files(tmp_path, half):
+    """What the stage reads: the half sphere, registered where it is, in a scene with one photo of its own."""
+    photos, masks, cloud = half
+    for name, views in (("object", masks), ("scene", masks[:4])):
+        (tmp_path / name / "sparse").mkdir(parents=True), (tmp_path / name / "images").mkdir()
+        write_model(tmp_path / name / "sparse", views)
+        for view in views:
+            cv2.imwrite(str(tmp_path / name / "images" / view.name), view.pixels.astype(np.uint8) * 200)
+    (tmp_path / "masks").mkdir()
+    for view in masks:
+        cv2.imwrite(str(tmp_path / "masks" / view.name), view.pixels.astype(np.uint8) * 255)
+    write_cloud(tmp_path / "object.ply", cloud)
+    write_cloud(tmp_path / "fused.ply", cloud)
+    fine = {"status": "registered", "reason": "", "scene_from_object": Sim3.identity().matrix}
+    write_json(tmp_path / "fine.json", {k: quantity(v, "") for k, v in fine.items()})
+    write_json(tmp_path / "crop.json", {"level_from_scene": quantity(np.eye(3), "")})
+    write_json(tmp_path / "evidence.json", {"settled_from_placed": quantity(Sim3.identity().matrix, "1")})
+    write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", ""), **{
+        f"origin_{k}": quantity(v, "") for k, v in (("latitude_deg", 47.4), ("longitude_deg", 8.5), ("altitude_m", 400))
+    }})  # fmt: skip
+    inputs = MissingInputs(tmp_path / "object.ply", tmp_path / "fused.ply", tmp_path / "crop.json",
+                           tmp_path / "fine.json", tmp_path / "evidence.json", tmp_path / "object", tmp_path / "scene",
+                           tmp_path / "masks", tmp_path / "georeference.json")  # fmt: skip
+    outputs = MissingOutputs(*(tmp_path / name for name in ("missing.ply", "next.csv", "next.geojson", "missing.json")))
+    return inputs, outputs
+
+
+def test_the_stage_writes_cells_photos_and_shares(files):
+    inputs, outputs = files
+    find_missing(inputs=inputs, outputs=outputs)
+    report, cells = read_json(outputs.report), read_cloud(outputs.missing)
+    share = sum(value(report, name) for name in ("never_seen", "untextured", "contradicted"))
+    assert value(report, "missing") == pytest.approx(share) and value(report, "missing") > 0.1
+    assert value(report, "surface_cells") > len(cells) > 100
+    with open(outputs.next_photos, newline="") as file:
+        rows = list(csv.DictReader(file))
+    features = json.loads(outputs.geojson.read_text())["features"]
+    assert len(rows) == len(features) == 3 * value(report, "stations") > 0
+    assert features[0]["geometry"]["coordinates"] == [float(rows[0][k]) for k in COLUMNS[5:8]]
+
+
+def test_of_an_unregistered_object_the_stage_writes_the_reason(files):
+    inputs, outputs = files
+    fine = {"status": "unregistered", "reason": "too few points", "scene_from_object": None}
+    write_json(inputs.fine_json, {k: quantity(v, "") for k, v in fine.items()})
+    find_missing(inputs=inputs, outputs=outputs)
+    assert value(read_json(outputs.report), "reason") == "too few points"
+    assert json.loads(outputs.geojson.read_text())["features"] == []
+    assert outputs.next_photos.read_text().strip() == ",".join(COLUMNS) and outputs.missing.is_file()
+
+
+def test_a_mask_of_another_size_is_one_sentence(files):
+    inputs, outputs = files
+    cv2.imwrite(str(inputs.masks / "3.png"), np.zeros((50, 60), np.uint8))
+    with pytest.raises(StageError, match="3.png is 60 x 50 pixels, but its photo 200 x 200"):
+        find_missing(inputs=inputs, outputs=outputs)
+    assert not outputs.missing.exists()
