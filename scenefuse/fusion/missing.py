@@ -36,6 +36,8 @@ LEAST_THROUGH = 2
 """Photos that must see through a place for it to be empty."""
 OFF_MASK = 0.1
 """Share of the photos that may have a place of the hull outside their mask: masks err."""
+IN_SIGHT = 0.2
+"""Share of the photos with a place in their picture that must see it for it to be empty off the masks."""
 LEAST_CELLS = 12
 """Cells beside each other that count: smaller spots are between points, not missing."""
 LEAST_TEXTURE = 4.0
@@ -152,8 +154,9 @@ def _frontier(
     centres = grid.centres
     in_hull = _in_hull(centres, masks)
     seen = see(centres, surface, views, step, margin)
-    # Off the masks nothing of the object is, where a photo can see the place at all: below the ground none can.
-    empty = (seen.through >= LEAST_THROUGH) | (~in_hull & (seen.in_view - seen.hidden >= LEAST_THROUGH))
+    # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
+    in_sight = seen.in_view - seen.hidden >= np.maximum(LEAST_THROUGH, IN_SIGHT * seen.in_view)
+    empty = (seen.through >= LEAST_THROUGH) | (~in_hull & in_sight)
     reach = COVERED * grid.side
     covered = np.isfinite(cKDTree(surface.points).query(centres, distance_upper_bound=reach, workers=threads())[0])
     free = (empty & ~covered).reshape(grid.shape)

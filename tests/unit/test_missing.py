@@ -70,7 +70,7 @@ def test_a_sphere_photographed_from_all_sides_lacks_nothing_but_its_foot():
 def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
-    assert missing.share(NEVER_SEEN) > 0.15 and missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.02
+    assert missing.share(NEVER_SEEN) > 0.1 and missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.02
     plan = plan_stations(missing, cloud, cloud, photos.views, UP)
     # The photos are from y > 0.
     assert all(station.photos[1].centre[1] < CENTER[1] for station in plan.stations)
@@ -81,7 +81,8 @@ def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(hal
                  for station in plan.stations for v in station.photos])  # fmt: skip
     grown = shown(ball(), photos.views + more.views)
     left = find_missing_surface(grown, grown, (photos, more), masks)
-    assert len(left.cells) < (1.3 - sum(s.closes for s in plan.stations)) * len(missing.cells)
+    before, after = ((found.cells.points[:, 2] > CENTER[2] - 0.4 * RADIUS).sum() for found in (missing, left))
+    assert after < 0.5 * before
 
 
 @pytest.mark.parametrize(("waves", "kind"), [(0.0, UNTEXTURED), (30.0, CONTRADICTED)])
