@@ -42,9 +42,14 @@ CLEARLY = 1.5
 denser ones, and equals would alternate."""
 SMOOTH_POINTS = 8
 """Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
-SUPPORT = 0.5
+ROUGH_SIDE, ROUGH_SPACINGS, ROUGH_POINTS = 0.02, 4.0, 6
+"""Side of the cells in which both sides' scatter is compared, over the diagonal, and in spacings of the sparser side
+where that is more; points that a plane needs. Photos may confirm a point that is off, by chance; that a whole surface
+is rough shows beside the other side's."""
+SUPPORT, SUPPORT_RADIUS, SUPPORT_MOST = 0.5, 0.01, 64
 """Share of a point and its neighbours that photos must confirm for it to be measured: here and there a point matches by
-chance."""
+chance. These are as many as a plane has within this share of the diagonal, at least SMOOTH_POINTS and at most so many.
+"""
 NORMAL_POINTS = 16
 """Neighbours that a missing normal is fitted to."""
 
@@ -87,8 +92,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface that
-    hides and is seen: what photos see through, and what no photo can see, is not there. Where both sides measured a
-    place, the object's points stay unless the scene's standard deviation is clearly smaller.
+    hides and is seen: what photos see through, and no fewer than confirm it, and what no photo can see, is not there.
+    Where both sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller.
 
     Args:
         obj: the object in the scene's frame, registered.
@@ -98,26 +103,26 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
     obj, scene = replace(obj, cloud=with_normals(obj.cloud)), replace(scene, cloud=with_normals(scene.cloud))
     diagonal = obj.cloud.diagonal
     of_obj, of_scene = _own(obj, scene), _own(scene, obj)
-    on_obj = _supported(obj.cloud.points, of_obj.measured)
-    on_scene = _supported(scene.cloud.points, of_scene.measured)
+    on_obj = _supported(obj.cloud.points, of_obj.measured, diagonal)
+    on_scene = _supported(scene.cloud.points, of_scene.measured, diagonal)
     found = settle(obj.cloud[on_obj], scene.cloud[on_scene], diagonal)
     settled, moved = found or (Sim3.identity(), None)
     obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
     across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
-    on_scene = _supported(scene.cloud.points, of_scene.measured | across.measured)
+    on_scene = _supported(scene.cloud.points, of_scene.measured | across.measured, diagonal)
+    sure = replace(of_scene, photos=np.maximum(of_scene.photos, across.photos),
+                   match=np.maximum(of_scene.match, across.match),
+                   deviation=np.minimum(of_scene.deviation, across.deviation))  # fmt: skip
     surface = obj.cloud[on_obj]
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
-    reason[seen.through >= LEAST_THROUGH] = SEEN_THROUGH
+    reason[seen.through >= np.maximum(LEAST_THROUGH, np.where(on_scene, sure.photos, 0))] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
     added = on_obj & ~contradicted
-    sure = replace(of_scene, photos=np.maximum(of_scene.photos, across.photos),
-                   match=np.maximum(of_scene.match, across.match),
-                   deviation=np.minimum(of_scene.deviation, across.deviation))  # fmt: skip
-    worse, better = _compare(obj.cloud.points, of_obj, added, scene.cloud.points, sure, left, diagonal)
+    worse, better = _compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal)
     reason[(reason == KEPT) & worse] = REPLACED
     added &= ~better
     if nerf_only:
@@ -190,41 +195,86 @@ def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float
 
 
 def _compare(
-    obj: Array, of_obj: Matches, on_obj: NDArray[np.bool_], scene: Array, of_scene: Matches,
-    on_scene: NDArray[np.bool_], diagonal: float,
+    obj: Cloud, of_obj: Array, on_obj: NDArray[np.bool_], scene: Cloud, of_scene: Array, on_scene: NDArray[np.bool_],
+    diagonal: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
     """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
 
-    obj, scene: points (N, 3), (M, 3); on_obj (N,), on_scene (M,): those that are measured and stay.
+    of_obj (N,), of_scene (M,): standard deviations; on_obj (N,), on_scene (M,): points that are measured and stay.
     """
     worse, better = np.zeros(len(scene), dtype=bool), np.zeros(len(obj), dtype=bool)
     if not on_obj.any() or len(scene) == 0:
         return worse, better
-    mine = _smooth(obj[on_obj], of_obj.deviation[on_obj])
+    first, second = obj[on_obj], scene[on_scene]
+    mine, other = _smooth(first.points, of_obj[on_obj]), _smooth(second.points, of_scene[on_scene])
+    fine = spacing(first.points)
+    coarse = max(fine, spacing(scene.points) if len(scene) > 1 else 0.0)
+    if len(second):
+        rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
+        mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
     theirs = np.full(len(scene), np.inf)
-    theirs[on_scene] = _smooth(scene[on_scene], of_scene.deviation[on_scene])
+    theirs[on_scene] = other
     # What the scene did not measure lies as far off as what it measured, at least.
-    typical = float(np.median(theirs[on_scene])) if on_scene.any() else 0.0
-    step = SAME_SPACINGS * max(spacing(obj[on_obj]), spacing(scene) if len(scene) > 1 else 0.0)
+    typical = float(np.median(other)) if len(second) else 0.0
 
-    def same(distance: Array, first: Array, second: Array) -> NDArray[np.bool_]:
-        common = np.hypot(first, np.where(np.isfinite(second), second, typical))
-        return np.asarray(distance <= np.clip(SAME_DEVIATIONS * common, step, SAME_MOST * diagonal))
+    def same(distance: Array, one: Array, two: Array, least: Array | float) -> NDArray[np.bool_]:
+        common = np.hypot(one, np.where(np.isfinite(two), two, typical))
+        return np.asarray(distance <= np.clip(SAME_DEVIATIONS * common, least, SAME_MOST * diagonal))
 
-    distance, partner = cKDTree(obj[on_obj]).query(scene, workers=threads())
-    worse = same(distance, mine[partner], theirs) & (mine[partner] <= CLEARLY * theirs)
-    if on_scene.any():
-        distance, partner = cKDTree(scene[on_scene]).query(obj[on_obj], workers=threads())
-        other = theirs[on_scene][partner]
-        better[on_obj] = same(distance, mine, other) & (mine > CLEARLY * other)
+    distance, partner = cKDTree(first.points).query(scene.points, workers=threads())
+    # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
+    worse = same(distance, mine[partner], theirs, SAME_SPACINGS * np.where(on_scene, fine, coarse)) & (
+        mine[partner] <= CLEARLY * theirs
+    )
+    if len(second):
+        distance, partner = cKDTree(second.points).query(first.points, workers=threads())
+        better[on_obj] = same(distance, mine, other[partner], SAME_SPACINGS * coarse) & (
+            mine > CLEARLY * other[partner]
+        )
     return worse, better
 
 
-def _supported(points: Array, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
+    """How much more each of two clouds scatters about planes than the other does there, for its points (N,), (M,).
+
+    A standard deviation, by cells of a side, those of points that face the same way apart from the others. What is bent
+    or has an edge scatters in both alike.
+    """
+    keys = [_cells_by_side(cloud, one.points.min(0), side) for cloud in (one, two)]
+    group = np.unique(np.concatenate(keys), axis=0, return_inverse=True)[1].reshape(-1)
+    count, groups = int(group.max()) + 1, (group[: len(one)], group[len(one) :])
+    first, second = (_scatter(cloud.points, of, count) for cloud, of in zip((one, two), groups))
+    known = np.isfinite(first + second)
+    more = [np.sqrt(np.where(known, np.maximum(a**2 - b**2, 0), 0)) for a, b in ((first, second), (second, first))]
+    return more[0][groups[0]], more[1][groups[1]]
+
+
+def _cells_by_side(cloud: Cloud, low: Array, side: float) -> NDArray[np.int64]:
+    """(N, 4) cell of each point, and which of six ways it faces."""
+    assert cloud.normals is not None
+    axis = np.abs(cloud.normals).argmax(1)
+    backwards = cloud.normals[np.arange(len(cloud)), axis] < 0
+    cells = np.floor((cloud.points - low) / side).astype(np.int64)
+    return np.column_stack([cells, axis + 3 * backwards])
+
+
+def _scatter(points: Array, group: NDArray[np.int64], count: int) -> Array:
+    """RMS distance (count,) of the points in each group from the plane through them; NaN where there are too few."""
+    sizes = np.maximum(np.bincount(group, minlength=count), 1)
+    means = np.stack([np.bincount(group, points[:, k], count) / sizes for k in range(3)], axis=1)
+    away = points - means[group]
+    pairs = [np.bincount(group, away[:, i] * away[:, j], count) / sizes for i in range(3) for j in range(3)]
+    least = np.linalg.eigvalsh(np.stack(pairs, axis=1).reshape(-1, 3, 3))[:, 0]
+    return np.where(sizes >= ROUGH_POINTS, np.sqrt(np.maximum(least, 0)), np.nan)
+
+
+def _supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> NDArray[np.bool_]:
     """(N,) points that photos confirm with most of their neighbours."""
     if not measured.any():
         return measured
-    near = cKDTree(points).query(points[measured], k=min(SMOOTH_POINTS + 1, len(points)), workers=threads())[1]
+    around = np.pi * (SUPPORT_RADIUS * diagonal / spacing(points)) ** 2
+    count = int(np.clip(around, SMOOTH_POINTS, SUPPORT_MOST)) + 1
+    near = cKDTree(points).query(points[measured], k=min(count, len(points)), workers=threads())[1]
     found = measured.copy()
     found[measured] = measured[near.reshape(int(measured.sum()), -1)].mean(1) >= SUPPORT
     return found

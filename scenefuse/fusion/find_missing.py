@@ -10,7 +10,7 @@ import numpy as np
 
 from scenefuse.cores import use_threads
 from scenefuse.fusion.evidence import around, with_normals
-from scenefuse.fusion.fuse_object import is_placed, photos_of
+from scenefuse.fusion.fuse_object import photos_of
 from scenefuse.fusion.missing import CLASSES, Missing, find_missing_surface
 from scenefuse.fusion.next_photos import Plan, plan_stations
 from scenefuse.fusion.photo_check import Photos
@@ -37,12 +37,10 @@ class MissingInputs:
     """Object cloud (PLY) in its own frame."""
     fused_scene: Path
     """PLY, the whole scene with the object in it."""
+    fusion_json: Path
+    """JSON of the fusion: where the object settled in the scene."""
     crop_json: Path
     """JSON of the crop stage, for the direction of gravity."""
-    fine_json: Path
-    """JSON of the fine registration."""
-    evidence_json: Path
-    """JSON of the fusion's evidence, for where the object settled."""
     object_workspace: Path
     """The object's undistorted COLMAP workspace."""
     scene_workspace: Path
@@ -77,17 +75,16 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     """
     start = time.perf_counter()
     use_threads(threads())
-    registration = read_json(inputs.fine_json)
-    unit = length_unit(inputs.georeference_json)
-    if not is_placed(registration):
+    fusion, unit = read_json(inputs.fusion_json), length_unit(inputs.georeference_json)
+    if value(fusion, "status") != "fused":
         nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
         write_cloud(outputs.missing, nothing)
         _write_table(outputs.next_photos, [])
         _write_geojson(outputs.geojson, [])
-        reason = {"status": quantity("unregistered", ""), "reason": quantity(value(registration, "reason"), "")}
+        reason = {"status": quantity("unregistered", ""), "reason": quantity(value(fusion, "reason"), "")}
         write_json(outputs.report, reason)
         return
-    obj, photos, masks = _in_scene(inputs, Sim3.from_matrix(np.array(value(registration, "scene_from_object"))))
+    obj, photos, masks = _in_scene(inputs, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
     completed = with_normals(read_cloud(inputs.fused_scene))
     missing = find_missing_surface(obj, completed[around(completed, obj)], photos, masks)
     level = np.array(value(read_json(inputs.crop_json), "level_from_scene"))
@@ -103,8 +100,6 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
 
 def _in_scene(inputs: MissingInputs, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
     """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
-    settled = read_json(inputs.evidence_json).get("settled_from_placed")
-    pose = Sim3.from_matrix(np.array(settled["value"])) @ pose if settled else pose
     own = with_normals(read_cloud(inputs.object))
     obj = own.transformed(pose)
     photos = photos_of(inputs.object_workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)

@@ -136,7 +136,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     registration = read_json(inputs.fine_json)
     if not is_placed(registration):
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
-        fused = _unchanged(obj, scene)
+        pose, fused = None, _unchanged(obj, scene)
     else:
         pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
         if settings.mode == "evidence":
@@ -151,7 +151,10 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     _write(fused, read_json(inputs.crop_json), inputs, outputs)
     unit = length_unit(inputs.georeference_json)
     write_json(outputs.evidence, evidence_report(fused, unit))
+    if pose is not None and fused.weighed is not None:
+        pose = fused.weighed.settled @ pose
     content = _report(fused, registration, spacing(part.points), unit) | {
+        "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
         "mode": quantity(settings.mode, ""),
         "object_points": quantity(len(obj), "points"),
         "seconds": quantity(time.perf_counter() - start, "s"),
@@ -267,7 +270,6 @@ def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
         "scene_checked": quantity(len(left), "points"),
         "scene_measured": quantity(int((left & (weighed.scene.fields["evidence"] == MEASURED)).sum()), "points"),
         "scene_stereo_only": quantity(int((left & (weighed.scene.fields["evidence"] == STEREO_ONLY)).sum()), "points"),
-        "settled_from_placed": quantity(weighed.settled.matrix, "1"),
         "settled_by": quantity(weighed.moved, "diagonals"),
         "notes": quantity(list(weighed.notes), ""),
     }

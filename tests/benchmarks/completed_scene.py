@@ -2,12 +2,14 @@
 
 make demo, then PYTHONPATH=. python tests/benchmarks/completed_scene.py --results results
 The same with --harm True: displaced and scaled objects, and a bad object in a perfect scene; with --certificate True:
-whether what the run wrote about its added points, class and standard deviation, is true.
+whether what the run wrote about its added points, class and standard deviation, is true; with --cost True: seconds and
+memory of the fusion where a million points of the scene lie near the object.
 
-A quarter of an object's masks wrong needs its stages to run again: spoil the masks in a copy of the results, run up to
-objects/NAME/object.ply there, and give that cloud with --objects NAME --object CLOUD.
+A quarter of an object's masks wrong needs its stages to run again: see spoil_masks.py.
 """
 
+import resource
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,11 +21,11 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.fusion.evidence import MEASURED
+from scenefuse.fusion.evidence import MEASURED, around
 from scenefuse.fusion.fuse_object import FROM_OBJECT, fuse_by_distance, fuse_by_evidence, together
 from scenefuse.fusion.modes import FusionSettings
 from scenefuse.fusion.photo_check import LEAST_PHOTOS, moved_photos, read_photos
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
@@ -36,6 +38,8 @@ SAMPLES = 60000
 # Harm, over the diagonal: the object's shift, its noise, how far a third of a bad one is moved; and its wrong scales.
 SHIFT, NOISE, MOVED = 0.02, 0.01, 0.1
 SCALES = (1.03, 1 / 1.03)
+# Of the scene near the object, to time the fusion.
+COST_POINTS = 1_000_000
 # The modes that are shown at the scene's spacing and at the object's own; any other has its own density.
 THINNED = ("fill", "append", "replace")
 # Rows that are no fusion.
@@ -213,8 +217,8 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     """
     folder = case.results / "objects" / case.name
     evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
-    settled = Sim3.from_matrix(np.array(value(evidence, "settled_from_placed")))
-    truth_from_scene = case.known.fit.truth_from_model @ (settled @ case.pose).inverse()
+    settled = Sim3.from_matrix(np.array(value(read_json(folder / "fusion.json"), "scene_from_object")))
+    truth_from_scene = case.known.fit.truth_from_model @ settled.inverse()
     added = fused[fused.fields["source"] == FROM_OBJECT]
     measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= LEAST_PHOTOS)
     errors = _to_surface(truth_from_scene.apply(added.points[measured]), case.known)
@@ -234,6 +238,23 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     }
 
 
+def cost_rows(case: Case) -> Iterator[dict[str, Any]]:
+    """The rows of the fourth table: the fusion with the scene near the object as it is, and with COST_POINTS."""
+    near = around(case.scene, case.object.transformed(case.pose))
+    own, step, rng = case.scene[near], spacing(case.scene.points[near]), np.random.default_rng(0)
+    dense = own[rng.integers(0, len(own), COST_POINTS)]
+    dense = replace(dense, points=dense.points + rng.normal(0, 0.3 * step, dense.points.shape))
+    for scene in (case.scene, concatenate([case.scene[~near], dense])):
+        start = time.perf_counter()
+        fuse(replace(case, scene=scene), FusionSettings())
+        yield {
+            "scene_points_near": int(around(scene, case.object.transformed(case.pose)).sum()),
+            "object_points": len(case.object),
+            "seconds": time.perf_counter() - start,
+            "peak_gb_so_far": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+        }
+
+
 def _to_surface(points: Array, known: ObjectTruth) -> Array:
     """(N, 3) vectors from the true surface to points in the truth's frame."""
     query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
@@ -251,26 +272,27 @@ def completed_scene(
     objects: tuple[str, ...] = (),
     harm: bool = False,
     certificate: bool = False,
+    cost: bool = False,
     object: Path | None = None,
 ) -> None:
     """Print the scene's F-scores around each object against truth, before and after every kind of fusion.
 
-    All scores go to bench/completed_scene.tsv (`harm`: completed_scene_harm.tsv, `certificate`:
-    completed_scene_certificate.tsv) in the first results folder.
+    All numbers go to bench/completed_scene.tsv (or completed_scene_harm.tsv, ...) in the first results folder.
 
     Args:
         results: folders of finished demos; several give mean and standard deviation.
         objects: which; all that the demo has without it.
         harm: print the second table instead: what a wrong pose or a bad object changes.
         certificate: print the third table instead: whether the added points are as exact as they say.
+        cost: print the fourth table instead: seconds and memory of the fusion.
         object: a cloud in the object's own frame that takes the place of the only one of `objects`.
 
     Raises:
         StageError: a folder holds no finished demo, or a cloud is given for several objects.
     """
     rows: list[dict[str, Any]] = []
-    kind = "_harm" if harm else "_certificate" if certificate else ""
-    rows_of = {"": completed_rows, "_harm": harm_rows, "_certificate": certificate_rows}[kind]
+    kind = "_harm" if harm else "_certificate" if certificate else "_cost" if cost else ""
+    rows_of = {"": completed_rows, "_harm": harm_rows, "_certificate": certificate_rows, "_cost": cost_rows}[kind]
     for folder in results:
         for case in read_cases(folder, objects, object):
             for row in rows_of(case):
@@ -280,7 +302,7 @@ def completed_scene(
     out = results[0] / f"bench/completed_scene{kind}.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.5f")
-    print({"": summary, "_harm": harm_summary, "_certificate": certificate_summary}[kind](table))
+    print({"": summary, "_harm": harm_summary, "_certificate": certificate_summary}.get(kind, cost_summary)(table))
 
 
 def read_cases(results: Path, objects: tuple[str, ...], cloud: Path | None) -> Iterator[Case]:
@@ -328,6 +350,11 @@ def certificate_summary(table: pd.DataFrame) -> str:
     """A column for each object, the mean over the runs."""
     means = table.drop(columns=["run"]).groupby("object", sort=False).mean()
     return "Added points, as fused.ply certifies them\n" + means.T.to_string(float_format=lambda x: f"{x:.5g}")
+
+
+def cost_summary(table: pd.DataFrame) -> str:
+    """All rows."""
+    return table.drop(columns=["run", "shift_over_diagonal"]).to_string(index=False, float_format=lambda x: f"{x:.3g}")
 
 
 def _mean(values: pd.Series) -> str:

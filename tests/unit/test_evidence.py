@@ -63,6 +63,24 @@ def test_the_sharper_side_stays_where_both_measured(near, far):
     assert (found.reason == KEPT).all()
 
 
+def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
+    rough, smooth = sheet(-0.8, 0.8, 0.015, noise=0.012), sheet(-0.8, 0.8, 0.02)
+    found = weigh(Side(rough, near), Side(smooth, far), nerf_only=False)
+    inside = np.abs(smooth.points[:, 0]) < 0.6
+    assert (found.reason[inside] == KEPT).mean() > 0.95 and found.added[np.abs(rough.points[:, 0]) < 0.6].mean() < 0.02
+    # A rough scene gives way to a smooth object.
+    found = weigh(Side(smooth, near), Side(rough, far), nerf_only=False)
+    assert (found.reason[np.abs(rough.points[:, 0]) < 0.6] != KEPT).mean() > 0.95 and found.added.mean() > 0.95
+
+
+def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):
+    # The scene's points are six times as far apart as the object's, whose rim they touch.
+    obj, scene = sheet(-0.8, 0.0, 0.02), sheet(-0.8, 0.8, 0.12)
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    beside = (scene.points[:, 0] > 0.03) & (scene.points[:, 0] < 0.17) & (np.abs(scene.points[:, 1]) < 0.9)
+    assert beside.any() and (found.reason[beside] == KEPT).all()
+
+
 def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_object(near, far):
     floating, under = sheet(-0.2, 0.2, 0.06, z=0.3), sheet(-0.2, 0.2, 0.06, z=-0.3)
     scene = concatenate([sheet(-0.8, 0.8, 0.06), floating, under])

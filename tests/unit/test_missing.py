@@ -156,16 +156,14 @@ def files(tmp_path, half):
         cv2.imwrite(str(tmp_path / "masks" / view.name), view.pixels.astype(np.uint8) * 255)
     write_cloud(tmp_path / "object.ply", cloud)
     write_cloud(tmp_path / "fused.ply", cloud)
-    fine = {"status": "registered", "reason": "", "scene_from_object": Sim3.identity().matrix}
-    write_json(tmp_path / "fine.json", {k: quantity(v, "") for k, v in fine.items()})
+    fusion = {"status": "fused", "reason": "", "scene_from_object": Sim3.identity().matrix}
+    write_json(tmp_path / "fusion.json", {k: quantity(v, "") for k, v in fusion.items()})
     write_json(tmp_path / "crop.json", {"level_from_scene": quantity(np.eye(3), "")})
-    write_json(tmp_path / "evidence.json", {"settled_from_placed": quantity(Sim3.identity().matrix, "1")})
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", ""), **{
         f"origin_{k}": quantity(v, "") for k, v in (("latitude_deg", 47.4), ("longitude_deg", 8.5), ("altitude_m", 400))
     }})  # fmt: skip
-    inputs = MissingInputs(tmp_path / "object.ply", tmp_path / "fused.ply", tmp_path / "crop.json",
-                           tmp_path / "fine.json", tmp_path / "evidence.json", tmp_path / "object", tmp_path / "scene",
-                           tmp_path / "masks", tmp_path / "georeference.json")  # fmt: skip
+    names = ("object.ply", "fused.ply", "fusion.json", "crop.json", "object", "scene", "masks", "georeference.json")
+    inputs = MissingInputs(*(tmp_path / name for name in names))
     outputs = MissingOutputs(*(tmp_path / name for name in ("missing.ply", "next.csv", "next.geojson", "missing.json")))
     return inputs, outputs
 
@@ -186,8 +184,8 @@ def test_the_stage_writes_cells_photos_and_shares(files):
 
 def test_of_an_unregistered_object_the_stage_writes_the_reason(files):
     inputs, outputs = files
-    fine = {"status": "unregistered", "reason": "too few points", "scene_from_object": None}
-    write_json(inputs.fine_json, {k: quantity(v, "") for k, v in fine.items()})
+    fusion = {"status": "unregistered", "reason": "too few points", "scene_from_object": None}
+    write_json(inputs.fusion_json, {k: quantity(v, "") for k, v in fusion.items()})
     find_missing(inputs=inputs, outputs=outputs)
     assert value(read_json(outputs.report), "reason") == "too few points"
     assert json.loads(outputs.geojson.read_text())["features"] == []

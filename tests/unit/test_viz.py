@@ -167,8 +167,9 @@ def capture(tmp_path_factory):
     write_cloud(folder / "fused_scene.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
     write_cloud(folder / "box/registration/full/crop.ply", half)
     write_cloud(folder / "object.ply", whole.transformed(pose.inverse()))
-    top = np.stack([np.linspace(-0.5, 0.5, 40), np.zeros(40), np.ones(40)], axis=1)
-    write_cloud(folder / "missing.ply", Cloud(top, None, None, {"missing": np.repeat(np.uint8([1, 2]), 20)}))
+    top = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 20), [-0.1, 0, 0.1])), np.ones(60)], axis=1)
+    kinds = np.where(top[:, 0] < 0, 1, 2).astype(np.uint8)
+    write_cloud(folder / "missing.ply", Cloud(top, None, None, {"missing": kinds}))
     (folder / "next_photos.csv").write_text("station,photo,x,y,z\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n")
     write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], ""), "diagonal": quantity(2.4, "m")})
     write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
@@ -219,7 +220,15 @@ def test_figures_show_what_was_added(capture, tmp_path):
     pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
     fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
     draw(capture, fine, tmp_path / "figures")
-    names = {"missing.png", "before_after.png", "provenance.png", "registration.png", "object.png", "before.png", "after.png"}
+    names = {
+        "missing.png",
+        "before_after.png",
+        "provenance.png",
+        "registration.png",
+        "object.png",
+        "before.png",
+        "after.png",
+    }
     assert {p.name for p in (tmp_path / "figures").iterdir()} == names | {"view.ply", "view.json"}
     assert all(p.stat().st_size < 1_000_000 for p in (tmp_path / "figures").iterdir())
     before, after = (cv2.imread(str(tmp_path / f"figures/{n}.png")).astype(float) for n in ("before", "after"))

@@ -36,11 +36,11 @@ if workflow.is_main_process and workflow.global_resources["_nodes"].value is Non
     for name, limit in {"mem_mb": memory_mb(), "gpu": 1}.items():
         if name not in workflow.global_resources:
             workflow.register_resource(name, limit)
-    # A job that needs more cores than are free waits until no smaller one is ready, so every job takes its share only: half
-    # for the scene, which all objects wait for in the end (its rules have priority 1), and of the rest one for each object.
+    # A job that needs more cores than are free waits until no smaller one is ready, so every job takes its share only:
+    # objects share the cores; a scene, which all of them wait for in the end, has at least half and goes first (priority 1).
     cores = workflow.resource_settings.cores or 8
-    SCENE_THREADS = max(1, min(8, cores // 2))
-    OBJECT_THREADS = max(1, min(8, cores // (len(SCENES) + len(OBJECTS))))
+    OBJECT_THREADS = max(1, min(8, cores // max(1, len(OBJECTS))))
+    SCENE_THREADS = min(8, max(OBJECT_THREADS, cores // 2))
 else:
     SCENE_THREADS = OBJECT_THREADS = 8
 

@@ -54,9 +54,8 @@ rule find_missing:
     input:
         cloud="results/objects/{object}/object.ply",
         fused_scene="results/objects/{object}/fused_scene.ply",
+        fusion="results/objects/{object}/fusion.json",
         crop_json="results/objects/{object}/registration/full/crop.json",
-        fine="results/objects/{object}/registration/full/fine.json",
-        evidence="results/objects/{object}/evidence.json",
         workspace=POSED,
         scene_workspace=in_scene("undistorted"),
         masks="results/objects/{object}/masks",
@@ -82,8 +81,8 @@ rule find_missing:
     message:
         "{wildcards.object}: what is still missing"
     shell:
-        "exec python {params.script} --object {input.cloud} --fused-scene {input.fused_scene} --crop-json {input.crop_json}"
-        " --fine-json {input.fine} --evidence-json {input.evidence} --object-workspace {input.workspace}"
+        "exec python {params.script} --object {input.cloud} --fused-scene {input.fused_scene} --fusion-json {input.fusion}"
+        " --crop-json {input.crop_json} --object-workspace {input.workspace}"
         " --scene-workspace {input.scene_workspace} --masks {input.masks} --georeference-json {input.georeference}"
         " --missing {output.missing} --next-photos {output.photos} --geojson {output.geojson} --report {output.report} &> {log}"
 
