@@ -91,9 +91,10 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
     """Check the points of an object and of the scene around it in the photos of both.
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
-    where three of the object's do. A side without photos is judged by the other's. Measured points are the surface that
-    hides and is seen: what photos see through, and no fewer than confirm it, and what no photo can see, is not there.
-    Where both sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller.
+    where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
+    that hides and is seen: what no fewer photos see through than confirm it, and what no photo can see, is not there.
+    Where both sides measured a place, the object's points stay unless the scene's standard deviation is clearly
+    smaller.
 
     Args:
         obj: the object in the scene's frame, registered.
