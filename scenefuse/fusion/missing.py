@@ -44,6 +44,9 @@ LEAST_TEXTURE = 4.0
 """Standard deviation of a patch, in grey levels, below which its matches say nothing."""
 SPARSEST = 0.9
 """Quantile of the distances between a surface's points that depth buffers go by: sparse parts have no holes then."""
+REACH = 0.2
+"""Share of the diagonal within which a missing cell has a point of the object: what is seen past a wall without points
+is not its back."""
 BORDER = 3
 """Cells around the object's points that are looked at too."""
 
@@ -102,6 +105,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     towards = np.zeros((*grid.shape, 3), np.float32)
     if masks:
         edge, towards = _frontier(grid, surface, views, masks, step, margin)
+        edge &= grid.within(obj.points, REACH * obj.diagonal)
     found = _in_spots(supposed | edge)
     centres, normals = grid.middle(found), towards[found]
     own = supposed[found]
@@ -142,6 +146,11 @@ class _Cells:
         grid[self.place(points)] = True
         return grid
 
+    def within(self, points: Array, distance: float) -> Grid:
+        """The cells no farther than that from one of (N, 3) points."""
+        away = cKDTree(points).query(self.centres, distance_upper_bound=distance, workers=threads())[0]
+        return np.isfinite(away).reshape(self.shape)
+
     def middle(self, chosen: Grid) -> Array:
         """(K, 3) centres of the chosen cells."""
         return np.asarray(self.low + (np.argwhere(chosen) + 0.5) * self.side)
@@ -157,10 +166,9 @@ def _frontier(
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
     in_sight = seen.in_view - seen.hidden >= np.maximum(LEAST_THROUGH, IN_SIGHT * seen.in_view)
     empty = (seen.through >= LEAST_THROUGH) | (~in_hull & in_sight)
-    reach = COVERED * grid.side
-    covered = np.isfinite(cKDTree(surface.points).query(centres, distance_upper_bound=reach, workers=threads())[0])
-    free = (empty & ~covered).reshape(grid.shape)
-    unknown = (in_hull & ~empty & ~covered).reshape(grid.shape)
+    bare = ~grid.within(surface.points, COVERED * grid.side)
+    free = empty.reshape(grid.shape) & bare
+    unknown = (in_hull & ~empty).reshape(grid.shape) & bare
     edge = unknown & ndimage.binary_dilation(free)
     towards = np.stack(np.gradient(ndimage.gaussian_filter(free.astype(np.float32), 1.5)), axis=-1)
     return edge, towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), np.float32(1e-12))

@@ -117,6 +117,18 @@ def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
 
 
+def test_one_wrong_camera_changes_little(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
+    views = photographs(8, 3.0)
+    pose = views[0].cam_from_world.copy()
+    pose[:3, 3] += 0.4
+    views[0] = replace(views[0], cam_from_world=pose)
+    found = weigh(Side(obj, pack(views)), Side(scene, far), nerf_only=False)
+    good = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    assert good.added.mean() > 0.97 and found.added.mean() > 0.9
+    assert np.abs(found.obj.points[found.added][:, 2]).max() < 0.01
+
+
 @pytest.mark.parametrize("without", ["object", "scene", "both"])
 def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
