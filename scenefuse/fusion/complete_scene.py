@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.fusion.evidence import FIELDS, KEPT, unchecked
+from scenefuse.fusion.evidence import FIELDS, KEPT, MEASURED, unchecked
 from scenefuse.fusion.fuse_object import FROM_OBJECT, FROM_SCENE, together, with_source, write_scene
 from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.job_records import JobRecords, why_unfinished
@@ -81,8 +81,10 @@ def _take_away(scene: Cloud, kept: NDArray[np.bool_], checked: Cloud) -> None:
     """Mark in `kept` what an object took away, and put what photos know of the checked points into the scene's."""
     rows = checked.fields["row"].astype(np.int64)
     kept[rows[checked.fields["reason"] != KEPT]] = False
+    # What another object's photos measured stays known.
+    new = (checked.fields["evidence"] == MEASURED) | (scene.fields["evidence"][rows] != MEASURED)
     for name in FIELDS:
-        scene.fields[name][rows] = checked.fields[name]
+        scene.fields[name][rows[new]] = checked.fields[name][new]
 
 
 def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:

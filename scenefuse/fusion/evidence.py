@@ -92,9 +92,9 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
-    that hides and is seen: what no fewer photos see through than confirm it, and what no photo can see, is not there.
-    Where both sides measured a place, the object's points stay unless the scene's standard deviation is clearly
-    smaller.
+    that hides and is seen. What photos see through is not there (a measured point of the scene where as many see
+    through as confirm it), nor what no photo can see. Where both sides measured a place, the object's points stay
+    unless the scene's standard deviation is clearly smaller.
 
     Args:
         obj: the object in the scene's frame, registered.
@@ -174,8 +174,10 @@ def unchecked(cloud: Cloud) -> Cloud:
 
 def with_normals(cloud: Cloud) -> Cloud:
     """The cloud, with normals of local planes where it has none; their side is unknown then."""
-    if cloud.normals is not None or len(cloud) < 3:
+    if cloud.normals is not None:
         return cloud
+    if len(cloud) < 3:
+        return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
     index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_POINTS, len(cloud)), workers=threads())[1]
     return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
 
@@ -273,8 +275,8 @@ def _supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> N
     """(N,) points that photos confirm with most of their neighbours."""
     if not measured.any():
         return measured
-    around = np.pi * (SUPPORT_RADIUS * diagonal / spacing(points)) ** 2
-    count = int(np.clip(around, SMOOTH_POINTS, SUPPORT_MOST)) + 1
+    reach, step = SUPPORT_RADIUS * diagonal, spacing(points)
+    count = int(np.clip(np.pi * (reach / step) ** 2, SMOOTH_POINTS, SUPPORT_MOST)) + 1 if step > 0 else SUPPORT_MOST
     near = cKDTree(points).query(points[measured], k=min(count, len(points)), workers=threads())[1]
     found = measured.copy()
     found[measured] = measured[near.reshape(int(measured.sum()), -1)].mean(1) >= SUPPORT

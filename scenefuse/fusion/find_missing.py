@@ -12,20 +12,20 @@ from scenefuse.cores import use_threads
 from scenefuse.fusion.evidence import around, with_normals
 from scenefuse.fusion.fuse_object import photos_of
 from scenefuse.fusion.missing import CLASSES, Missing, find_missing_surface
-from scenefuse.fusion.next_photos import Plan, plan_stations
+from scenefuse.fusion.next_photos import UPWARDS, Plan, plan_stations
 from scenefuse.fusion.photo_check import Photos
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.pictures import read_mask
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import LocalFrame, scene_frame
 from scenefuse.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.workspace import View
 
 MASK_PX = 400
 """Longer side of the masks that the hull is counted in: finer than its cells."""
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
-COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "heading_deg", "pitch_deg", "closes")
+COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "heading_deg", "pitch_deg", "shows")
 """Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
 
 
@@ -87,11 +87,11 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     obj, photos, masks = _in_scene(inputs, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
     completed = with_normals(read_cloud(inputs.fused_scene))
     missing = find_missing_surface(obj, completed[around(completed, obj)], photos, masks)
-    level = np.array(value(read_json(inputs.crop_json), "level_from_scene"))
-    plan = plan_stations(missing, obj, completed, masks or photos[0].views, level[2])
+    up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
+    plan = plan_stations(missing, obj, completed, masks or photos[0].views, up)
     write_cloud(outputs.missing, missing.cells)
     frame = scene_frame(read_json(inputs.georeference_json))
-    rows = photo_rows(plan, level, frame)
+    rows = photo_rows(plan, up, frame)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
     content = _report(missing, plan, unit) | {"seconds": quantity(time.perf_counter() - start, "s")}
@@ -130,26 +130,30 @@ def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
         **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
         "seen_through_points": quantity(missing.seen_through, "points"),
         "stations": quantity(len(plan.stations), ""),
-        "stations_close": quantity(sum(station.closes for station in plan.stations), "of never seen and contradicted"),
+        "stations_show": quantity(sum(station.shows for station in plan.stations), "of never seen and contradicted"),
         "reachable": quantity(plan.reachable, "of never seen and contradicted"),
         "notes": quantity(list(missing.notes), ""),
     }
 
 
-def photo_rows(plan: Plan, level: Array, frame: LocalFrame | None) -> list[dict[str, Any]]:
-    """A row for each photo; level: (3, 3) level_from_scene."""
-    rows = []
+def photo_rows(plan: Plan, up: Array, frame: LocalFrame | None) -> list[dict[str, Any]]:
+    """A row for each photo; up: (3,) direction opposite to gravity, scene frame."""
+    rows, level = [], rotation_between(up, UPWARDS)
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
             ahead = level @ view.cam_from_world[2, :3]
-            row = {"station": number, "photo": int(view.name), **dict(zip("xyz", np.round(view.centre, 4).tolist()))}
+            row = {
+                "station": number,
+                "photo": int(view.name),
+                **{axis: float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)},
+            }
             if frame is not None:
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude, 3)
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
-            rows.append(row | {"closes": round(station.closes, 4)})
+            rows.append(row | {"shows": round(station.shows, 4)})
     return rows
 
 

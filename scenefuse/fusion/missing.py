@@ -96,7 +96,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > COVERED * side
     loose = _plain(obj[apart])
     through = see(loose.points, surface, views, step, margin).through >= LEAST_THROUGH
-    through |= ~_in_hull(loose.points, masks) if masks else False
+    through |= _off_masks(loose.points, masks)
     loose = loose[~through]
     if len(loose):
         surface = concatenate([surface, voxel_downsample(loose, side / 2)])
@@ -114,7 +114,8 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
         normals[own] = loose.normals[cKDTree(loose.points).query(centres[own], workers=threads())[1]]
     cells = Cloud(centres, normals)
     cells.fields["missing"] = _classes(cells, surface, photos, step, margin)
-    notes = () if masks else ("no masks: only places where the object's own cloud has points are looked at",)
+    few = f"{len(masks)} masks: what they do not frame is unknown, only points of the object's own cloud are looked at"
+    notes = (few,) if len(masks) < LEAST_PHOTOS else ()
     return Missing(cells, side, int(grid.hold(obj.points[~apart]).sum()), int(through.sum()), notes)
 
 
@@ -161,7 +162,8 @@ def _frontier(
 ) -> tuple[Grid, NDArray[np.float32]]:
     """Cells of unknown space that border on empty space, and for every cell the direction towards empty space."""
     centres = grid.centres
-    in_hull = _in_hull(centres, masks)
+    shown, off = count_silhouettes(centres, masks)
+    in_hull = (shown >= LEAST_PHOTOS) & (off <= OFF_MASK * shown)
     seen = see(centres, surface, views, step, margin)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
     in_sight = seen.in_view - seen.hidden >= np.maximum(LEAST_THROUGH, IN_SIGHT * seen.in_view)
@@ -174,10 +176,10 @@ def _frontier(
     return edge, towards / np.maximum(np.linalg.norm(towards, axis=-1, keepdims=True), np.float32(1e-12))
 
 
-def _in_hull(points: Array, masks: list[View]) -> NDArray[np.bool_]:
-    """(N,) points that three photos show, and nearly all of these inside the mask."""
+def _off_masks(points: Array, masks: list[View]) -> NDArray[np.bool_]:
+    """(N,) points that three photos have in their frame, and too many of these outside the mask."""
     shown, off = count_silhouettes(points, masks)
-    return np.asarray((shown >= LEAST_PHOTOS) & (off <= OFF_MASK * shown))
+    return np.asarray((shown >= LEAST_PHOTOS) & (off > OFF_MASK * shown))
 
 
 def _in_spots(missing: Grid) -> Grid:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.fusion.missing import SPARSEST, UNTEXTURED, Missing
+from scenefuse.fusion.missing import CONTRADICTED, SPARSEST, UNTEXTURED, Missing
 from scenefuse.fusion.visibility import shown_in
 from scenefuse.io.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.transforms import Array, look_at, rotation_between
@@ -29,6 +29,8 @@ SIDESTEP_DEG = 10.0
 """Between the three photos of a station, so that they locate what they show."""
 BESIDE = 0.6
 """What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight."""
+SAME_DEG = 15.0
+"""A photo from nearer to the direction of one that there is shows contradicted surface no better."""
 MOST_STATIONS = 6
 UPWARDS = np.array([0.0, 0.0, 1.0])
 LEAST_GAIN = 0.05
@@ -41,11 +43,11 @@ class Station:
 
     Attributes:
         photos: three cameras beside each other, in the scene's frame, that look at the object.
-        closes: share of the surface worth photographing that all three show, and no station before.
+        shows: share of the surface worth photographing that all three show, and no station before.
     """
 
     photos: list[View]
-    closes: float
+    shows: float
 
 
 @dataclass(frozen=True)
@@ -64,7 +66,8 @@ class Plan:
 def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[View], up: Array) -> Plan:
     """The stations that show most of the missing surface.
 
-    Untextured surface is left out, since photos from elsewhere do not measure it either.
+    Untextured surface is left out, since photos from elsewhere do not measure it either; so is contradicted surface for
+    stations from where a close-up shows it already.
 
     Args:
         missing: in the scene's frame.
@@ -79,10 +82,14 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     middle = (obj.points.min(0) + obj.points.max(0)) / 2
     distance = float(np.median([np.linalg.norm(view.centre - middle) for view in close_ups]))
     apart = np.linalg.norm(around.points - middle, axis=1)
-    assert around.normals is not None
     beside = apart < BESIDE * obj.diagonal
+    if not beside.any():
+        return Plan([], 0.0)
+    assert around.normals is not None
     obstacles = voxel_downsample(Cloud(around.points[beside], around.normals[beside]), missing.side)
-    others = voxel_downsample(Cloud(around.points[apart < 2 * max(DISTANCES) * distance]), CLEARANCE * obj.diagonal / 2)
+    others = voxel_downsample(
+        Cloud(around.points[beside | (apart < 2 * max(DISTANCES) * distance)]), CLEARANCE * obj.diagonal / 2
+    )
     step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
     lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
     photos = [_photos_from(place, middle, lens, up) for place in _around(middle, distance, up)]
@@ -91,6 +98,8 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     # What the middle photo shows is the most that all three do; these are asked only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
     shown = shown.reshape(len(photos), len(cells)).astype(bool)
+    tried = _tried(photos, cells, close_ups, obstacles, step, missing.side)
+    shown &= ~tried
     exact, left, stations = np.zeros(len(photos), dtype=bool), np.ones(len(cells), dtype=bool), list[Station]()
     while len(stations) < MOST_STATIONS and len(photos):
         gains = (shown & left).sum(1)
@@ -98,7 +107,8 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         if gains[best] < max(1.0, LEAST_GAIN * len(cells)):
             break
         if not exact[best]:
-            shown[best], exact[best] = _shown_in_all(photos[best], cells, obstacles, step, missing.side), True
+            shown[best] &= _shown_in_all(photos[best], cells, obstacles, step, missing.side)
+            exact[best] = True
             continue
         stations.append(Station(photos[best], float(gains[best]) / len(cells)))
         left &= ~shown[best]
@@ -148,6 +158,30 @@ def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[Vie
         pose[:3, 3] = -pose[:3, :3] @ eye
         photos.append(View(str(number), lens.intrinsics, pose, lens.width, lens.height))
     return photos
+
+
+def _tried(
+    photos: list[list[View]], cells: Cloud, close_ups: list[View], obstacles: Cloud, step: float, margin: float
+) -> NDArray[np.bool_]:
+    """(P, K) contradicted cells that a close-up shows from nearly the same direction as the P stations would."""
+    tried = np.zeros((len(photos), len(cells)), dtype=bool)
+    rows = np.flatnonzero(cells.fields["missing"] == CONTRADICTED)
+    if len(rows) == 0:
+        return tried
+    part = cells[rows]
+    assert part.normals is not None
+    toward = np.array([_directions(part.points, three[1].centre) for three in photos]).reshape(-1, len(rows), 3)
+    for view in close_ups:
+        known = shown_in(part.points, part.normals, obstacles, view, step, margin)
+        beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(np.radians(SAME_DEG))
+        tried[:, rows] |= beside & known
+    return tried
+
+
+def _directions(points: Array, eye: Array) -> Array:
+    """(N, 3) unit vectors from points (N, 3) to a place."""
+    away = eye - points
+    return np.asarray(away / np.linalg.norm(away, axis=1, keepdims=True))
 
 
 def _shown_in_all(photos: list[View], cells: Cloud, obstacles: Cloud, step: float, margin: float) -> NDArray[np.bool_]:

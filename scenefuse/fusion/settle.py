@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.icp import COLOR_WEIGHT, ScaleRange, refine_planes
 from scenefuse.registration.surface import Surface, with_queries
+from scenefuse.registration.uncertainty import half_sampling
 from scenefuse.transforms import Sim3
 
 REACHES = (0.04, 0.02, 0.01)
@@ -20,6 +21,9 @@ MOST, QUERIES = 20000, 5000
 """Points at most of each side, drawn evenly, and of these those that look for a partner. They are not averaged, which
 would round corners off."""
 ROUNDS = 10
+HALVES, STEADY = 6, 0.003
+"""Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale
+to be settled too: a roof alone does not say how large a house is."""
 
 
 def settle(obj: Cloud, scene: Cloud, diagonal: float, seed: int = 0) -> tuple[Sim3, float] | None:
@@ -27,7 +31,7 @@ def settle(obj: Cloud, scene: Cloud, diagonal: float, seed: int = 0) -> tuple[Si
 
     The registration worked on whole clouds, with what stereo made up at edges and the NeRF where nothing was seen; here
     both sides are what their photos confirmed, so the same refinement (method R8: planes, points and colours both ways)
-    is more exact.
+    is more exact. The scale stays what it is where the surfaces do not determine it.
 
     Args:
         obj: measured points in the scene's frame, with normals, and colours if both have them.
@@ -42,11 +46,20 @@ def settle(obj: Cloud, scene: Cloud, diagonal: float, seed: int = 0) -> tuple[Si
     if min(len(obj), len(scene)) < LEAST_POINTS:
         return None
     mine, theirs = _surface(obj, seed), _surface(scene, seed)
-    pose = Sim3.identity()
-    for reach in REACHES:
-        pose = refine_planes(mine, theirs, pose, ScaleRange(1.0, SCALE_WIDTH), reach * diagonal, ROUNDS, COLOR_WEIGHT)
+    pose, scales = _refined(mine, theirs, SCALE_WIDTH, diagonal), ScaleRange(1.0, SCALE_WIDTH)
+    spread = half_sampling([(mine, theirs)], pose, scales, REACHES[1] * diagonal, HALVES, seed)
+    if spread is None or spread.size(diagonal) > STEADY:
+        pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
     return (pose, moved) if moved <= MOST_SETTLED else None
+
+
+def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float) -> Sim3:
+    """The pose after refinement with pairs that come nearer and nearer."""
+    pose = Sim3.identity()
+    for reach in REACHES:
+        pose = refine_planes(mine, theirs, pose, ScaleRange(1.0, scale_width), reach * diagonal, ROUNDS, COLOR_WEIGHT)
+    return pose
 
 
 def _surface(cloud: Cloud, seed: int) -> Surface:

@@ -3,7 +3,7 @@
 Source: Merrell et al. 2007 (visibility constraints between depth maps), here between measured points and photos.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +86,7 @@ def _depth_buffer(surface: Cloud, view: View, spacing: float, both_sides: bool =
     _, depth = view.project(points)
     ahead = depth[depth > 0]
     cell = CELL_SPACINGS * spacing * view.intrinsics[0, 0] / (np.median(ahead) if len(ahead) else 1.0)
-    small = view.at_most(max(4, round(max(view.width, view.height) / max(1.0, cell))))
+    small = replace(view, pixels=None).at_most(max(4, round(max(view.width, view.height) / max(1.0, cell))))
     rows, pixels, depth = small.visible(points[hiding])
     nearest = np.full((small.height, small.width), np.inf)
     np.minimum.at(nearest, (pixels[:, 1], pixels[:, 0]), depth)

@@ -69,6 +69,8 @@ def concatenate(clouds: list[Cloud]) -> Cloud:
 
 def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
     """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value."""
+    if len(cloud) == 0:
+        return cloud
     group, counts = _voxels(cloud.points, voxel)
     means = _group_means(cloud.points, group, counts)
     distance = ((cloud.points - means[group]) ** 2).sum(1)
@@ -113,7 +115,9 @@ def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[n
 
 
 def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0, quantile: float = 0.5) -> float:
-    """Median (or other quantile) distance from a point to its nearest neighbour, over a seeded sample."""
+    """Median (or other quantile) distance from a point to its nearest neighbour, by a seeded sample; 0 for one."""
+    if len(points) < 2:
+        return 0.0
     tree = cKDTree(points)
     chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
     return float(np.quantile(tree.query(points[chosen], k=2)[0][:, 1], quantile))

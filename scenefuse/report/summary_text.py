@@ -249,12 +249,11 @@ def _still_missing(fusion: Fields) -> str:
         f"{name.replace('_', ' ')} {_three(100 * find(fusion, f'missing.{name}'))} %" for name in CLASSES.values()
     ]
     text = f"{_three(100 * share)} % of its surface ({', '.join(shares)})"
-    stations, closes = find(fusion, "missing.stations"), find(fusion, "missing.stations_close")
+    stations, shows = find(fusion, "missing.stations"), find(fusion, "missing.stations_show")
     if not stations:
         return text
-    return (
-        f"{text}; photos from {stations} stations, next_photos.csv, show {_three(100 * closes)} % of what has texture"
-    )
+    shown = f"{_three(100 * shows)} % of it, blank parts apart"
+    return f"{text}; photos from {stations} stations (next_photos.csv) would show {shown}"
 
 
 def _short(unit: str | None) -> str:

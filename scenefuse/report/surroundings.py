@@ -73,6 +73,8 @@ class FigureInputs:
     """Folder of the object's masks, {photo}.png."""
     missing: Path
     """Cells of the object's surface that are still missing (PLY, scene frame)."""
+    missing_json: Path
+    """JSON of the same."""
     next_photos: Path
     """CSV of the stations from where photos would show them."""
     stages: list[Path]
@@ -108,9 +110,15 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
     return Surroundings(
         before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit,
-        read_cloud(inputs.missing).transformed(level) if fused else Cloud(np.zeros((0, 3))),
+        _missing(inputs).transformed(level),
         level.apply(read_stations(inputs.next_photos)),
     )  # fmt: skip
+
+
+def _missing(inputs: FigureInputs) -> Cloud:
+    """The cells; none where nothing is missing, or the object has no pose."""
+    share = read_json(inputs.missing_json).get("missing", {}).get("value")
+    return read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
 
 
 def read_stations(path: Path) -> Array:

@@ -21,6 +21,7 @@ from scenefuse.fusion.evidence import (
 from scenefuse.fusion.fuse_object import evidence_report, fuse_by_evidence
 from scenefuse.fusion.modes import FusionSettings
 from scenefuse.fusion.photo_check import moved_photos, pack
+from scenefuse.fusion.settle import settle
 from scenefuse.io.clouds import Cloud, concatenate
 from scenefuse.stage import value
 from scenefuse.transforms import Sim3
@@ -115,6 +116,21 @@ def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     far_off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.3]))
     found = weigh(Side(obj.transformed(far_off), moved_photos(near, far_off)), Side(scene, far), nerf_only=False)
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
+
+
+def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
+    rng = np.random.default_rng(1)
+    sheets = [sheet(-0.8, 0.8, step, noise=noise) for step, noise in ((0.02, 0.003), (0.03, 0.008))]
+    plain = [Cloud(cloud.points + rng.normal(0, 0.002, cloud.points.shape), cloud.normals) for cloud in sheets]
+    pose, moved = settle(*plain, plain[0].diagonal)
+    assert pose.scale == pytest.approx(1.0, abs=1e-9) and moved < 0.01
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_hardly_any_point_of_the_scene_is_no_error(near, far, count):
+    obj = sheet(-0.8, 0.8, 0.03)
+    scene = Cloud(obj.points[:count].copy() if count else np.zeros((0, 3)))
+    assert len(fuse_by_evidence(obj, scene, near, far, FusionSettings()).added) > 500
 
 
 def test_one_wrong_camera_changes_little(near, far):

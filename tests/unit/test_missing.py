@@ -74,8 +74,8 @@ def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(hal
     plan = plan_stations(missing, cloud, cloud, photos.views, UP)
     # The photos are from y > 0.
     assert all(station.photos[1].centre[1] < CENTER[1] for station in plan.stations)
-    assert plan.stations[0].closes > 0.3 and plan.reachable > 0.5
-    assert sum(station.closes for station in plan.stations) <= plan.reachable <= 1
+    assert plan.stations[0].shows > 0.3 and plan.reachable > 0.5
+    assert sum(station.shows for station in plan.stations) <= plan.reachable <= 1
     # What the stations show is no longer missing, where they said so.
     more = pack([View(v.name, v.intrinsics, v.cam_from_world, 200, 200, np.full((200, 200), 128, np.uint8))
                  for station in plan.stations for v in station.photos])  # fmt: skip
@@ -109,7 +109,7 @@ def test_what_photos_see_through_is_not_missing(half):
 def test_without_masks_only_the_own_points_count_and_a_note_says_so(half):
     photos, _, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), [])
-    assert len(missing.cells) == 0 and "no masks" in missing.notes[0]
+    assert len(missing.cells) == 0 and "0 masks" in missing.notes[0]
     assert plan_stations(missing, cloud, cloud, photos.views, UP) == Plan([], 0.0)
 
 
@@ -130,7 +130,7 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     plan = plan_stations(missing, cloud, cloud, photos.views, UP)
     frame = LocalFrame(47.4, 8.5, 400.0)
-    rows = photo_rows(plan, np.eye(3), frame)
+    rows = photo_rows(plan, UP, frame)
     assert len(rows) == 3 * len(plan.stations) and set(rows[0]) == set(COLUMNS)
     for row in rows:
         eye = np.array([row[axis] for axis in "xyz"])
@@ -139,7 +139,15 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
         ahead, heading, pitch = CENTER - eye, np.radians(row["heading_deg"]), np.radians(row["pitch_deg"])
         looks = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
         assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
-    assert "longitude_deg" not in photo_rows(plan, np.eye(3), None)[0]
+    assert "longitude_deg" not in photo_rows(plan, UP, None)[0]
+
+
+def test_an_object_of_which_nothing_came_into_the_scene_is_missing_as_a_whole(half):
+    photos, masks, cloud = half
+    nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32))
+    missing = find_missing_surface(cloud, nothing, (photos, NOBODY), masks)
+    assert missing.covered_cells == 0 and len(missing.cells) > 1000
+    assert plan_stations(missing, cloud, nothing, photos.views, UP) == Plan([], 0.0)
 
 
 @pytest.fixture

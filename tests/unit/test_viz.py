@@ -170,6 +170,7 @@ def capture(tmp_path_factory):
     top = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 20), [-0.1, 0, 0.1])), np.ones(60)], axis=1)
     kinds = np.where(top[:, 0] < 0, 1, 2).astype(np.uint8)
     write_cloud(folder / "missing.ply", Cloud(top, None, None, {"missing": kinds}))
+    write_json(folder / "missing.json", {"missing": quantity(0.1, "")})
     (folder / "next_photos.csv").write_text("station,photo,x,y,z\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n")
     write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], ""), "diagonal": quantity(2.4, "m")})
     write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
@@ -208,6 +209,7 @@ def draw(capture, fine, figures):
         fine_json=capture / "fine.json",
         metrics_json=capture / "metrics.json",
         missing=capture / "missing.ply",
+        missing_json=capture / "missing.json",
         next_photos=capture / "next_photos.csv",
         workspace=capture / "undistorted",
         masks=capture / "masks",
@@ -238,6 +240,19 @@ def test_figures_show_what_was_added(capture, tmp_path):
     colors = cv2.cvtColor(cv2.imread(str(tmp_path / "figures/missing.png")), cv2.COLOR_BGR2RGB).astype(int)
     for first, last in ((0, 2), (2, 0)):
         assert (colors[..., first] - colors[..., last] > 70).sum() > 50
+
+
+def test_an_object_that_lacks_nothing_is_drawn(capture, tmp_path):
+    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
+    kept = {name: (capture / name).read_bytes() for name in ("missing.ply", "missing.json", "next_photos.csv")}
+    write_cloud(capture / "missing.ply", Cloud(np.zeros((0, 3)), None, None, {"missing": np.zeros(0, np.uint8)}))
+    write_json(capture / "missing.json", {"missing": quantity(0.0, "")})
+    (capture / "next_photos.csv").write_text("station,photo,x,y,z\n")
+    draw(capture, fine, tmp_path / "figures")
+    assert (tmp_path / "figures/missing.png").is_file()
+    for name, content in kept.items():
+        (capture / name).write_bytes(content)
 
 
 def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path):

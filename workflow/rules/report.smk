@@ -54,6 +54,7 @@ rule draw_object:
         fine="results/objects/{object}/registration/full/fine.json",
         metrics="results/objects/{object}/metrics.json",
         missing="results/objects/{object}/missing.ply",
+        missing_json="results/objects/{object}/missing.json",
         next_photos="results/objects/{object}/next_photos.csv",
         workspace="results/objects/{object}/undistorted",
         masks="results/objects/{object}/masks",
@@ -87,7 +88,7 @@ rule draw_object:
     shell:
         "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
-        " --metrics-json {input.metrics} --missing {input.missing} --next-photos {input.next_photos}"
+        " --metrics-json {input.metrics} --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
         " --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
         " --figures {output} &> {log}"
 
