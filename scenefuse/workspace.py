@@ -132,6 +132,21 @@ class Workspace:
         return replace(view, pixels=pixels)
 
 
+def with_mask(view: View, path: Path) -> View:
+    """A view with the grey values of its mask, (H, W) uint8, as pixels.
+
+    Raises:
+        StageError: the mask is missing, no picture, or not of its photo's size.
+    """
+    mask = read_gray(path)
+    if mask.shape != (view.height, view.width):
+        raise StageError(
+            f"{path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its photo {view.width} x {view.height}; rerun the"
+            " masks"
+        )
+    return replace(view, pixels=mask)
+
+
 def read_workspace(folder: Path) -> Workspace:
     """Read a COLMAP workspace.
 

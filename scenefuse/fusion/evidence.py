@@ -211,7 +211,7 @@ def _compare(
     first, second = obj[on_obj], scene[on_scene]
     mine, other = _smooth(first.points, of_obj[on_obj]), _smooth(second.points, of_scene[on_scene])
     fine = spacing(first.points)
-    coarse = max(fine, spacing(scene.points) if len(scene) > 1 else 0.0)
+    coarse = max(fine, spacing(scene.points))
     if len(second):
         rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)

@@ -15,12 +15,11 @@ from scenefuse.fusion.missing import CLASSES, Missing, find_missing_surface
 from scenefuse.fusion.next_photos import UPWARDS, Plan, plan_stations
 from scenefuse.fusion.photo_check import Photos
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.io.pictures import read_mask
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import LocalFrame, scene_frame
-from scenefuse.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_between
-from scenefuse.workspace import View
+from scenefuse.workspace import View, with_mask
 
 MASK_PX = 400
 """Longer side of the masks that the hull is counted in: finer than its cells."""
@@ -104,18 +103,12 @@ def _in_scene(inputs: MissingInputs, pose: Sim3) -> tuple[Cloud, tuple[Photos, P
     obj = own.transformed(pose)
     photos = photos_of(inputs.object_workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
     views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
-    return obj, photos, [_with_mask(view, path) for view, path in views if path.is_file()]
+    return obj, photos, [_silhouette(view, path) for view, path in views if path.is_file()]
 
 
-def _with_mask(view: View, path: Path) -> View:
+def _silhouette(view: View, path: Path) -> View:
     """The view, smaller, with its mask."""
-    mask = read_mask(path)
-    if mask.shape != (view.height, view.width):
-        raise StageError(
-            f"{path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its photo {view.width} x {view.height}; rerun the"
-            " masks"
-        )
-    small = replace(view, pixels=mask.astype(np.uint8) * 255).at_most(MASK_PX)
+    small = with_mask(view, path).at_most(MASK_PX)
     return replace(small, pixels=small.pixels > 127)
 
 

@@ -180,7 +180,7 @@ def fuse_by_evidence(obj: Cloud, scene: Cloud, of_obj: Photos, of_scene: Photos,
     rows = np.flatnonzero(around(scene, obj))
     near = scene[rows]
     weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only)
-    step = spacing(near.points) if len(near) > 1 else 0.0
+    step = spacing(near.points)
     moved, gain, bias = with_colors_of(weighed.obj, near, FILL_SPACINGS * step, settings.match_colors)
     added = thinned(moved[weighed.added], settings.density * step)
     if len(near):

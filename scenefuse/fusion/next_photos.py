@@ -98,8 +98,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     # What the middle photo shows is the most that all three do; these are asked only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
     shown = shown.reshape(len(photos), len(cells)).astype(bool)
-    tried = _tried(photos, cells, close_ups, obstacles, step, missing.side)
-    shown &= ~tried
+    shown &= ~_tried(photos, cells, close_ups, obstacles, step, missing.side)
     exact, left, stations = np.zeros(len(photos), dtype=bool), np.ones(len(cells), dtype=bool), list[Station]()
     while len(stations) < MOST_STATIONS and len(photos):
         gains = (shown & left).sum(1)

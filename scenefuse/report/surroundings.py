@@ -31,8 +31,8 @@ class Surroundings:
         fused: whether the object was fused.
         decision: one line: status, reason, scores.
         unit: of the scene's lengths.
-    missing: cells of the object's surface that the completed scene lacks.
-    stations: (S, 3) places to photograph these from, best first.
+        missing: cells of the object's surface that the completed scene lacks.
+        stations: (S, 3) places to photograph these from, best first.
     """
 
     before: Cloud

@@ -9,10 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import spacing
-from scenefuse.io.pictures import read_gray
 from scenefuse.stage import StageError, threads
 from scenefuse.transforms import Array, Sim3
-from scenefuse.workspace import View, read_workspace
+from scenefuse.workspace import View, read_workspace, with_mask
 
 Columns = tuple[NDArray[np.float32], ...]
 
@@ -115,14 +114,8 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> tuple[l
 
 def _with_grown_mask(view: View, path: Path) -> View:
     """The view with its mask, grown on all sides."""
-    mask = read_gray(path)
-    if mask.shape != (view.height, view.width):
-        raise StageError(
-            f"{path} is {mask.shape[1]} x {mask.shape[0]} pixels, but its photo {view.width} x {view.height}; rerun the"
-            " masks"
-        )
     extent = 2 * int(np.ceil(SLACK * view.width)) + 1
-    grown = cv2.dilate(mask, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
+    grown = cv2.dilate(with_mask(view, path).pixels, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
     return replace(view, pixels=grown > 0)
 
 
