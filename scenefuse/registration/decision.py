@@ -83,7 +83,8 @@ def decide(
 
     A rival that maps the object onto itself, in shape and colour, is no rival: fused, both give the same points.
     Shared photos settle which pose is meant, so that rivals, colours and scores no longer matter: the scene may lack
-    nearly all of the object, or show much beside it. Free space and gravity still count.
+    nearly all of the object, or show much beside it. Free space, gravity and the pose's own uncertainty still count:
+    `registered` means the same tolerances whatever decided.
 
     Args:
         ranked: refined hypotheses, best first; the alignment's own pose first where it replaced the clouds'.
@@ -98,8 +99,9 @@ def decide(
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    of_clouds = _reasons_of_clouds(best, margin, free_axis, uncertainty, problem, settings)
-    reason = next(_reasons(best, of_clouds if decided_by == "geometry" else (), problem), None)
+    of_clouds = _reasons_of_clouds(best, margin, problem, settings) if decided_by == "geometry" else ()
+    of_spread = _reasons_of_spread(free_axis, uncertainty, problem.scene.diagonal, settings)
+    reason = next(_reasons(best, (*of_clouds, *of_spread), problem), None)
     words = {
         "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
         "both": f"alignment and clouds agree, F-score {best.score.f_score:.2f}",
@@ -137,14 +139,7 @@ def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> It
         yield f"the object would lean by {tilt:.1f} degrees, more than {MAX_TILT_DEG:.1f}"
 
 
-def _reasons_of_clouds(
-    best: Hypothesis,
-    margin: float,
-    free_axis: Array | None,
-    uncertainty: Uncertainty | None,
-    problem: Problem,
-    settings: FineSettings,
-) -> Iterator[str]:
+def _reasons_of_clouds(best: Hypothesis, margin: float, problem: Problem, settings: FineSettings) -> Iterator[str]:
     """Why a pose that no photos support may not be used."""
     found, scales = best.score, problem.scales
     if found.f_score < settings.min_f_score:
@@ -160,6 +155,12 @@ def _reasons_of_clouds(
             f"the scale {best.pose.scale:.4g} lies at the edge of its prior, {scales.centre:.4g} times or over"
             f" {np.exp(scales.width):.2f}; widen the prior"
         )
+
+
+def _reasons_of_spread(
+    free_axis: Array | None, uncertainty: Uncertainty | None, diagonal: float, settings: FineSettings
+) -> Iterator[str]:
+    """Why a pose is too uncertain to be used; `diagonal` of the scene crop, in its unit."""
     if uncertainty is None:
         yield "too little of the object meets the scene to tell how certain the pose is"
         return
@@ -170,7 +171,7 @@ def _reasons_of_clouds(
     angle, most = uncertainty.rotation_sd_deg, settings.max_rotation_sd_deg
     if angle > most and not turns_freely:
         yield f"the rotation is uncertain by {angle:.1f} degrees, more than {most:.1f}"
-    shift, most = uncertainty.translation_sd / problem.scene.diagonal, settings.max_translation_sd_fraction
+    shift, most = uncertainty.translation_sd / diagonal, settings.max_translation_sd_fraction
     if shift > most:
         yield f"the position is uncertain by {shift:.1%} of the diagonal, more than {most:.1%}"
 

@@ -15,9 +15,10 @@ from scenefuse.registration.free_space import FreeSpace, read_free_space
 from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem, read_alignment, read_scales
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.score import Hypothesis
-from scenefuse.registration.uncertainty import Uncertainty, uncertainty_quantities
+from scenefuse.registration.uncertainty import Uncertainty, uncertainty_quantities, with_bending
+from scenefuse.sfm.bundle.spread import read_spread
 from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.transforms import Array, Sim3
 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12
@@ -35,6 +36,16 @@ class EvidenceFiles:
     """Undistorted COLMAP workspace of the scene; with `depth` it gives the free space."""
     depth: tuple[Path, ...] = ()
     """Folders of the scene's depth maps."""
+    object_spread: Path | None = None
+    """NPZ: how far the object's sparse model may be bent."""
+    scene_spread: Path | None = None
+    """The same of the scene's."""
+
+    def bending(self, pose: Sim3, centre: Array) -> tuple[Array | None, Array | None]:
+        """(7, 7) covariances of both models around the object's centre (3,), None where they are not known."""
+        places = ((self.object_spread, centre), (self.scene_spread, pose.apply(centre)))
+        of_object, of_scene = (None if path is None else read_spread(path).covariance_at(at) for path, at in places)
+        return of_object, of_scene
 
     def free_space(self, scene: Cloud) -> FreeSpace | None:
         """The free space around a scene crop, or None without depth maps."""
@@ -80,7 +91,8 @@ def register_finely(
     seconds = time.perf_counter() - start
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
-    write_json(report, _report(outcome, problem, prior, inputs.length_unit(), settings, seconds))
+    content = _report(outcome, problem, prior, inputs.length_unit(), settings, seconds)
+    write_json(report, content | _stated(outcome, evidence, obj.points.mean(0), inputs.length_unit()))
 
 
 def read_candidates(coarse_json: Path) -> list[Candidate]:
@@ -106,13 +118,26 @@ def _report(
         "margin": quantity(decision.margin, "1"),
         "free_axis": quantity(decision.free_axis, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
-        **uncertainty_quantities(outcome.uncertainty, length),
         "scale_ledger": quantity(ledger, ""),
         "score_tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
         "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
         "seconds": quantity(seconds, "s"),
+    }
+
+
+def _stated(outcome: Outcome, evidence: EvidenceFiles, centre: Array, length: str) -> dict[str, Any]:
+    """The standard deviations of the pose: against the world, with what either model may be bent; and on the scene as
+    it is, which the gate counts; `centre` (3,) of the object in its frame."""
+    on_scene, pose = outcome.uncertainty, outcome.ranked[0].pose
+    bending = evidence.bending(pose, centre)
+    total = None if on_scene is None else with_bending(on_scene, pose, *bending)
+    known = [name for name, of in zip(("object", "scene"), bending) if of is not None]
+    return {
+        **uncertainty_quantities(total, length),
+        "on_scene": quantity(uncertainty_quantities(on_scene, length), ""),
+        "bending_known_of": quantity(known, ""),
     }
 
 

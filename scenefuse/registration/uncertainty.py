@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.icp import COLOR_WEIGHT, ScaleRange, refine_planes
@@ -38,6 +39,18 @@ class Uncertainty:
     covariance: Array
 
     @classmethod
+    def of(cls, covariance: Array) -> "Uncertainty":
+        """Of a (7, 7) covariance."""
+        turn, axes = np.linalg.eigh(covariance[:3, :3])
+        return cls(
+            float(np.sqrt(max(covariance[6, 6], 0))),
+            float(np.degrees(np.sqrt(max(turn[-1], 0)))),
+            axes[:, -1],
+            float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1], 0))),
+            covariance,
+        )
+
+    @classmethod
     def even(cls, scale_sd_log: float, rotation_sd_deg: float, translation_sd: float) -> "Uncertainty":
         """The same in all directions."""
         variances = np.array([np.radians(rotation_sd_deg)] * 3 + [translation_sd] * 3 + [scale_sd_log]) ** 2
@@ -55,6 +68,24 @@ class Uncertainty:
             float(np.hypot(self.rotation_sd_deg, rotation_angle_deg(other.rotation @ pose.rotation.T))),
             float(np.hypot(self.translation_sd, np.linalg.norm(other.apply(at) - pose.apply(at)))),
         )
+
+
+def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_scene: Array | None) -> Uncertainty:
+    """A pose's uncertainty against the world, where both models may be bent (method M10).
+
+    Args:
+        local: of the pose between the models as they are, about the object's centre.
+        pose: scene_from_object.
+        of_object: (7, 7) covariance of the object's model around that centre, in its own frame; None where unknown.
+        of_scene: (7, 7) of the scene's model around the same place, in the scene's frame.
+    """
+    total = local.covariance.copy()
+    if of_object is not None:
+        into_scene = block_diag(pose.rotation, pose.scale * pose.rotation, 1.0)
+        total += into_scene @ of_object @ into_scene.T
+    if of_scene is not None:
+        total += of_scene
+    return Uncertainty.of(total)
 
 
 def uncertainty_quantities(uncertainty: Uncertainty | None, length: str) -> dict[str, Any]:
@@ -111,14 +142,7 @@ def half_sampling(
         deviations[k, 3:6] = other.apply(centre) - pose.apply(centre)
         deviations[k, 6] = np.log(other.scale / pose.scale)
     covariance = deviations.T @ deviations / resamplings
-    turn, axes = np.linalg.eigh(covariance[:3, :3])
-    return Uncertainty(
-        float(np.sqrt(covariance[6, 6])),
-        float(np.degrees(np.sqrt(max(turn[-1], 0)))),
-        axes[:, -1],
-        float(np.sqrt(max(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1], 0))),
-        covariance,
-    )
+    return Uncertainty.of(covariance)
 
 
 def _half(

@@ -12,6 +12,8 @@ from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import Photo, check_unchanged, read_photos
 from scenefuse.stage import StageError, atomic_file, setting, threads
 
+# A calibration and its photos differ in shape by no more than what rounding to whole pixels does.
+SHAPE_TOLERANCE = 0.01
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
 FEW_FEATURES = 100
 
@@ -32,13 +34,16 @@ class FeatureSettings:
     """Which photos share one camera; auto: those with one size, EXIF camera and focal length."""
 
 
-def extract_features(*, folder: Path, photos: Path, features: Path, settings: FeatureSettings) -> None:
+def extract_features(
+    *, folder: Path, photos: Path, features: Path, calibration: Path | None = None, settings: FeatureSettings
+) -> None:
     """Find SIFT features in every photo and write them, with cameras and GPS priors, to a COLMAP database.
 
     Args:
         folder: folder of photos.
         photos: JSON list of them.
         features: output, COLMAP database.
+        calibration: a known camera, in the form of COLMAP's cameras.txt, for all photos; it is held from here on.
         settings: SIFT and camera settings.
 
     Raises:
@@ -48,15 +53,16 @@ def extract_features(*, folder: Path, photos: Path, features: Path, settings: Fe
     listed = read_photos(photos)
     check_unchanged(folder, listed)
     groups = camera_groups(listed, settings.camera_mode)
+    known = None if calibration is None else read_calibration(calibration)
     options = pycolmap.FeatureExtractionOptions()
     options.max_image_size = settings.max_image_size_px
     options.num_threads = threads()
     options.use_gpu = False
     options.sift.max_num_features = settings.max_features
     options.sift.first_octave = settings.first_octave
-    reader = pycolmap.ImageReaderOptions(camera_model=settings.camera_model)
     with atomic_file(features) as temporary:
         for names in groups:
+            reader = _reader_options(settings, known, next(p for p in listed if p.name == names[0]))
             cancellable(
                 pycolmap.extract_features,
                 temporary,
@@ -99,6 +105,48 @@ def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
         sizes = ", ".join(f"{w}x{h} ({names[0]})" for (w, h), names in groups.items())
         raise StageError(f"camera_mode is single but the photos differ in size: {sizes}; set it to auto")
     return list(groups.values())
+
+
+def read_calibration(path: Path) -> pycolmap.Camera:
+    """The camera of a file in the form of COLMAP's cameras.txt: one line `id MODEL width height parameters`.
+
+    Raises:
+        StageError: no camera, more than one, an unknown model, or a wrong number of parameters.
+    """
+    try:
+        lines = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
+    except (OSError, UnicodeDecodeError) as error:
+        raise StageError(f"the calibration {path} cannot be read: {error}") from error
+    form = "write one line like '1 OPENCV 4000 3000 fx fy cx cy k1 k2 p1 p2', as in COLMAP's cameras.txt"
+    if len(lines) != 1:
+        raise StageError(f"the calibration {path} holds {len(lines)} cameras; {form}")
+    try:
+        _, model, width, height, *numbers = lines[0]
+        parameters = [float(number) for number in numbers]
+        camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=parameters)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise StageError(f"the calibration {path} is no camera of COLMAP ({error}); {form}") from error
+    if not camera.verify_params():
+        wanted = camera.params_info
+        raise StageError(f"the calibration {path} has {len(numbers)} parameters, but {model} has {wanted}; {form}")
+    return camera
+
+
+def _reader_options(
+    settings: FeatureSettings, known: pycolmap.Camera | None, photo: Photo
+) -> pycolmap.ImageReaderOptions:
+    """The camera that photos like this one begin with: the known one at their size, or a guess by EXIF."""
+    if known is None:
+        return pycolmap.ImageReaderOptions(camera_model=settings.camera_model)
+    if abs(known.width * photo.height / (known.height * photo.width) - 1) > SHAPE_TOLERANCE:
+        raise StageError(
+            f"the calibration is of photos of {known.width} x {known.height} pixels, but {photo.name} has"
+            f" {photo.width} x {photo.height}; give the calibration of these photos, upright as they are used"
+        )
+    camera = pycolmap.Camera(known.todict())
+    camera.rescale(photo.width, photo.height)
+    numbers = ",".join(repr(float(number)) for number in camera.params)
+    return pycolmap.ImageReaderOptions(camera_model=camera.model_name, camera_params=numbers)
 
 
 def _feature_counts(database: Path) -> dict[str, int]:

@@ -9,18 +9,19 @@ from typing import Any
 
 import pycolmap
 
+from scenefuse.sfm.bundle.adjustment import (
+    ITERATIONS,
+    MAX_REPROJECTION_ERROR_PX,
+    ROUGH_TOLERANCE,
+    TOLERANCE,
+    adjust,
+    drop_outliers,
+)
+from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, choose_lens, describe_lens
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import read_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, scratch_directory, setting, threads, write_json
 
-# He et al. 2026: iterations of a global bundle adjustment, and of the linear solver within one.
-BA_ITERATIONS, BA_LINEAR_SOLVER_ITERATIONS = 100, 200
-# Function, gradient and parameter tolerance of the last bundle adjustment: 0 runs all iterations (the paper's).
-BA_TOLERANCE = 0.0
-# Observations with a larger error are dropped; COLMAP's own.
-MAX_REPROJECTION_ERROR_PX = 4.0
-# Points whose rays meet at a smaller angle are dropped; COLMAP's own.
-MIN_TRIANGULATION_ANGLE_DEG = 1.5
 # Fewest matches of the first pair of photos; COLMAP's own.
 INIT_MIN_INLIERS = 100
 # The smallest model that has a shape.
@@ -36,16 +37,25 @@ class MappingSettings:
 
 
 def map_photos(
-    *, folder: Path, photos: Path, database: Path, sparse: Path, report: Path, settings: MappingSettings, seed: int
+    *,
+    folder: Path,
+    photos: Path,
+    database: Path,
+    sparse: Path,
+    report: Path,
+    calibrated: bool = False,
+    settings: MappingSettings,
+    seed: int,
 ) -> None:
-    """Recover cameras and sparse points by incremental mapping, then a last bundle adjustment.
+    """Recover cameras and sparse points by incremental mapping, choose the lens, then a last bundle adjustment.
 
     Args:
         folder: folder of photos (for the points' colours).
         photos: JSON list of them.
         database: COLMAP database with verified matches.
         sparse: output, COLMAP model, the one with most photos.
-        report: output, JSON: photos registered, errors, models left out.
+        report: output, JSON: photos registered, errors, the lens and why, models left out.
+        calibrated: whether the database holds a known calibration; it is held then.
         settings: mapping settings.
         seed: of RANSAC and of the choice of the first pair.
 
@@ -56,17 +66,23 @@ def map_photos(
     pycolmap.set_random_seed(seed)
     with scratch_directory(sparse.with_name(f"{sparse.name}-models")) as work:
         models = cancellable(
-            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(len(names), seed)
+            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(len(names), calibrated, seed)
         )
     ranked = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     _check_registered(ranked, names, settings.min_registered_share)
     model = ranked[0]
     before_px = model.compute_mean_reprojection_error()
-    adjust(model)
-    summary = _describe(model, names)
+    first = KNOWN if calibrated else HELD
+    adjust(model, first.freedom, ROUGH_TOLERANCE)
+    drop_outliers(model)
+    choice = choose_lens(model, (KNOWN,) if calibrated else DISTORTED)
+    model = choice.lens.fit(model, TOLERANCE)
+    drop_outliers(model)
+    summary = _describe(model, names) | describe_lens(choice, model)
     print(
         f"{summary['registered']['value']} of {len(names)} photos registered, "
-        f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points",
+        f"{summary['mean_reprojection_error_px']['value']:.3f} px, {summary['points']['value']} points, "
+        f"{choice.lens.words}",
         flush=True,
     )
     left_out = [
@@ -89,24 +105,6 @@ def map_photos(
     write_json(report, content)
 
 
-def adjust(model: pycolmap.Reconstruction) -> None:
-    """Bundle-adjust a model in place, then drop observations with large errors."""
-    options = pycolmap.BundleAdjustmentOptions()
-    solver = options.ceres.solver_options
-    solver.max_num_iterations = BA_ITERATIONS
-    solver.max_linear_solver_iterations = BA_LINEAR_SOLVER_ITERATIONS
-    solver.function_tolerance = BA_TOLERANCE
-    solver.gradient_tolerance = BA_TOLERANCE
-    solver.parameter_tolerance = BA_TOLERANCE
-    solver.num_threads = threads()
-    options.print_summary = False
-    cancellable(pycolmap.bundle_adjustment, model, options)
-    observations = pycolmap.ObservationManager(model)
-    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG)
-    observations.filter_observations_with_negative_depth()
-    model.update_point_3d_errors()
-
-
 def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
     """What a model holds, as quantities: photos registered, errors, points, cameras, photos left out."""
     registered = _registered_names(model)
@@ -126,13 +124,14 @@ def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any
     }
 
 
-def _mapper_options(photos: int, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _mapper_options(photos: int, calibrated: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
+    options.ba_refine_focal_length = options.ba_refine_extra_params = not calibrated
     options.num_threads = threads()
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
-    options.ba_global_max_num_iterations = BA_ITERATIONS
+    options.ba_global_max_num_iterations = ITERATIONS
     options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
     options.mapper.filter_max_reproj_error = MAX_REPROJECTION_ERROR_PX
     options.min_model_size = MIN_PHOTOS

@@ -25,3 +25,25 @@ def object_photos(wildcards):
 def object_source(wildcards):
     """Their folder, or the video, for a command line."""
     return shlex.quote(object_row(wildcards.object)["photos"])
+
+
+def calibration_of(row, kind):
+    """Input function: the known calibration of a scene's or an object's camera, where the table has one."""
+
+    def files(wildcards):
+        given = row(wildcards[kind]).get("calibration")
+        return [given] if given else []
+
+    return files
+
+
+def calibration_flag(row, kind):
+    """The same as a command-line option."""
+    return lambda wildcards: flags(
+        dict(zip(["calibration"], calibration_of(row, kind)(wildcards)))
+    )
+
+
+def calibrated(row, kind):
+    """Params function: whether there is one."""
+    return lambda wildcards: bool(calibration_of(row, kind)(wildcards))

@@ -152,6 +152,8 @@ rule register_finely:
         scale="results/objects/{object}/registration/{variant}/scale.json",
         coarse="results/objects/{object}/registration/{variant}/coarse.json",
         alignment="results/objects/{object}/alignment.json",
+        object_spread="results/objects/{object}/spread.npz",
+        scene_spread=in_scene("spread.npz"),
         workspace=in_scene("undistorted"),
         depth=in_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
         depth_json=in_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
@@ -183,6 +185,7 @@ rule register_finely:
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
         " --workspace-json {input.workspace_json} --scale-json {input.scale} --coarse-json {input.coarse} --alignment-json {input.alignment}"
+        " --object-spread {input.object_spread} --scene-spread {input.scene_spread}"
         " --workspace {input.workspace} --depth {input.depth} --report {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
 

@@ -1,11 +1,12 @@
 # Structure from motion: from photos to cameras, the same steps for a scene and for an object.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: photos; config: scene, object, seed
+# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration; config: scene, object, seed
 # OUTPUTS   results/scenes/{scene}/photos/, photos.json                     the photos, checked and upright, with GPS
 #           results/objects/{object}/frames/, photos.json                   the same, at most a given width
 #           .../features.db, database.db, matches.json                      COLMAP databases
 #           .../sparse/, sparse.json                                        cameras and sparse points
 #           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
+#           .../spread.npz, spread.json                                     how far the model may be bent
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
 
@@ -71,6 +72,7 @@ rule extract_frames:
 rule extract_scene_features:
     """SIFT features (paper 3.1)."""
     input:
+        calibration_of(scene_row, "scene"),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
@@ -88,16 +90,20 @@ rule extract_scene_features:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=flags(config["scene"]["features"]),
+        calibration=calibration_flag(scene_row, "scene"),
+        files=state_of(calibration_of(scene_row, "scene")),
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
         "Scene {wildcards.scene}: features"
     shell:
-        "exec python {params.script} --folder {input.folder} --photos {input.photos} --features {output} {params.options} &> {log}"
+        "exec python {params.script} --folder {input.folder} --photos {input.photos} --features {output} {params.calibration}"
+        " {params.options} &> {log}"
 
 
 use rule extract_scene_features as extract_object_features with:
     input:
+        calibration_of(object_row, "object"),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
@@ -113,6 +119,8 @@ use rule extract_scene_features as extract_object_features with:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=flags(config["object"]["features"]),
+        calibration=calibration_flag(object_row, "object"),
+        files=state_of(calibration_of(object_row, "object")),
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
@@ -197,6 +205,7 @@ rule map_scene_photos:
         runtime=lambda wildcards, attempt: 480 * attempt,
     params:
         options=flags(config["scene"]["sparse"]),
+        calibrated=calibrated(scene_row, "scene"),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
@@ -204,7 +213,7 @@ rule map_scene_photos:
         "Scene {wildcards.scene}: cameras and sparse points"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --database {input.database}"
-        " --sparse {output.model} --report {output.report} --seed {params.seed} {params.options} &> {log}"
+        " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} --seed {params.seed} {params.options} &> {log}"
 
 
 use rule map_scene_photos as map_object_photos with:
@@ -226,6 +235,7 @@ use rule map_scene_photos as map_object_photos with:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=flags(config["object"]["sparse"]),
+        calibrated=calibrated(object_row, "object"),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
@@ -262,6 +272,49 @@ rule georegister:
     shell:
         "exec python {params.script} --sparse {input.model} --photos {input.photos} --georeferenced {output.model}"
         " --report {output.report} --seed {params.seed} {params.options} &> {log}"
+
+
+rule estimate_scene_spread:
+    """How far the model may be bent, by adjusting it again without some of its photos and with another lens (M10)."""
+    input:
+        model="results/scenes/{scene}/georeferenced",
+        report="results/scenes/{scene}/sparse.json",
+    output:
+        spread="results/scenes/{scene}/spread.npz",
+        report="results/scenes/{scene}/spread.json",
+    log:
+        "results/logs/estimate_scene_spread/{scene}.log",
+    benchmark:
+        "results/benchmarks/estimate_scene_spread/{scene}.tsv"
+    conda:
+        "../../envs/reconstruction.yaml"
+    threads: OBJECT_THREADS
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 240 * attempt,
+    params:
+        script=script("sfm/estimate_spread.py"),
+        code=code("sfm/estimate_spread.py"),
+    message:
+        "Scene {wildcards.scene}: how far the model may be bent"
+    shell:
+        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --spread {output.spread} --report {output.report}"
+        " &> {log}"
+
+
+use rule estimate_scene_spread as estimate_object_spread with:
+    input:
+        model="results/objects/{object}/sparse",
+        report="results/objects/{object}/sparse.json",
+    output:
+        spread="results/objects/{object}/spread.npz",
+        report="results/objects/{object}/spread.json",
+    log:
+        "results/logs/estimate_object_spread/{object}.log",
+    benchmark:
+        "results/benchmarks/estimate_object_spread/{object}.tsv"
+    message:
+        "{wildcards.object}: how far the model may be bent"
 
 
 rule undistort_scene_photos:

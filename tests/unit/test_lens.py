@@ -1,0 +1,120 @@
+"""The lens that photos determine, a known calibration, and how far a model may be bent."""
+
+import copy
+
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.registration.uncertainty import Uncertainty, with_bending
+from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.bundle.lens import BROWN, CENTRED, HELD, choose_lens, enrich
+from scenefuse.sfm.bundle.spread import Spread, read_spread, spread_of, write_spread
+from scenefuse.sfm.features import read_calibration
+from scenefuse.stage import StageError
+from scenefuse.transforms import Sim3
+
+MIDDLE = [700.0, 500.0, 400.0, 0.0]
+
+
+def photographed(camera: list[float], noise_px: float = 0.3) -> pycolmap.Reconstruction:
+    """A model of 16 photos by an OPENCV camera of 1000 x 800 pixels, as a mapper would leave it: SIMPLE_RADIAL, the
+    principal point in the middle, adjusted."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1, num_cameras_per_rig=1, num_frames_per_rig=16, num_points3D=400, camera_width=1000, camera_height=800
+    )
+    options.camera_model_id, options.camera_params = pycolmap.CameraModelId.OPENCV, camera
+    model = pycolmap.synthesize_dataset(options)
+    pycolmap.synthesize_noise(pycolmap.SyntheticNoiseOptions(point2D_stddev=noise_px), model)
+    for found in model.cameras.values():
+        found.model, found.params = pycolmap.CameraModelId.SIMPLE_RADIAL, MIDDLE
+    adjust(model, HELD.freedom, ROUGH_TOLERANCE)
+    return model
+
+
+def test_a_principal_point_off_the_middle_is_refined_and_found():
+    model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
+    before = copy.deepcopy(model)
+    choice = choose_lens(model)
+    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    assert (choice.lens, choice.next) == (CENTRED, BROWN)
+    assert abs(camera.principal_point_x - 510) < 1 and abs(camera.principal_point_y - 388) < 1
+    assert list(model.cameras[1].params) == list(before.cameras[1].params), "the model itself was changed"
+
+
+def test_brown_distortion_is_refined_and_found():
+    true = [700, 700, 510, 388, -0.3, 0.5, 0.02, -0.015]
+    model = photographed(true)
+    choice = choose_lens(model)
+    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    assert choice.lens == BROWN
+    rays = np.array([[x, y, 1.0] for x in (-0.2, 0, 0.2) for y in (-0.2, 0, 0.2)])
+    expected = pycolmap.Camera(model="OPENCV", width=1000, height=800, params=true).img_from_cam(rays)
+    off = camera.img_from_cam(rays) - expected
+    assert np.linalg.norm(off - off.mean(0), axis=1).max() < 1  # a turned camera looks like a shifted photo
+
+
+def test_a_lens_in_the_middle_without_distortion_is_held():
+    choice = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
+    assert (choice.lens, choice.next) == (HELD, CENTRED)
+    assert [trial["lens"] for trial in choice.trials] == ["held", "centred", "brown"]
+
+
+def test_a_richer_model_is_the_same_lens():
+    poor = pycolmap.Camera(model="RADIAL", width=100, height=80, params=[90, 51, 39, -0.1, 0.02])
+    rich = pycolmap.Camera(poor.todict())
+    enrich(rich, "FULL_OPENCV")
+    rays = np.array([[0.1, 0.2, 1.0], [-0.4, 0.3, 1.0]])
+    np.testing.assert_allclose(rich.img_from_cam(rays), poor.img_from_cam(rays), atol=1e-9)
+    fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=100, height=80, params=[90, 90, 51, 39, 0, 0, 0, 0])
+    enrich(fisheye, "OPENCV")
+    assert fisheye.model_name == "OPENCV_FISHEYE"
+
+
+def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
+    model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
+    held, _ = spread_of(model, HELD, CENTRED)
+    refined, calibration = spread_of(CENTRED.fit(model, ROUGH_TOLERANCE), CENTRED, None)
+    place = np.median(held.points, axis=0)
+    assert np.trace(held.covariance_at(place)) > 10 * np.trace(refined.covariance_at(place))
+    assert 0 < calibration[0]["cx"] < 2
+    write_spread(tmp_path / "spread.npz", held)
+    again = read_spread(tmp_path / "spread.npz")
+    np.testing.assert_allclose(again.covariance_at(place), held.covariance_at(place), rtol=1e-3, atol=1e-12)
+    (tmp_path / "broken.npz").write_bytes(b"PK")
+    with pytest.raises(StageError, match="no spread"):
+        read_spread(tmp_path / "broken.npz")
+
+
+def test_the_spread_at_a_place_is_the_motion_there():
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(500, 3)) * [100, 100, 1]
+    bowl = points + 1e-4 * (points[:, :2] ** 2).sum(1)[:, None] * [0, 0, 1]
+    spread = Spread(points, bowl[None], np.array([True]))
+    assert np.sqrt(spread.covariance_at(np.array([150.0, 0, 0]))[5, 5]) > 1.5
+    assert np.sqrt(spread.covariance_at(np.zeros(3))[5, 5]) < 0.5
+
+
+def test_bending_adds_in_the_frame_of_the_scene():
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    pose = Sim3(2.0, quarter, np.zeros(3))
+    of_object = np.diag([0.01, 0, 0, 0.5, 0, 0, 0.02]) ** 2
+    total = with_bending(Uncertainty.even(0, 0, 0), pose, of_object, None)
+    sd = np.sqrt(np.diag(total.covariance))
+    np.testing.assert_allclose(sd, [0, 0.01, 0, 0, 1.0, 0, 0.02], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("# nothing\n", "holds 0 cameras"),
+        ("1 OPENCV 100 80 1 2\n", "has 2 parameters, but OPENCV has fx, fy"),
+        ("1 NONSENSE 100 80 1 2\n", "no camera of COLMAP"),
+        ("1 PINHOLE 100 80 90 90 50 forty\n", "no camera of COLMAP"),
+    ],
+)
+def test_a_broken_calibration_is_named(tmp_path, text, words):
+    (tmp_path / "cameras.txt").write_text(text)
+    with pytest.raises(StageError, match=words):
+        read_calibration(tmp_path / "cameras.txt")
