@@ -19,6 +19,7 @@ from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.bundle.lens import LENSES, Lens
 from scenefuse.stage import StageError, atomic_file, quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3, fit_sim3
+from scenefuse.workspace import read_model
 
 # Groups of photos, each left out once; fewest photos that a model keeps.
 GROUPS, MIN_PHOTOS = 8, 3
@@ -76,7 +77,7 @@ def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Pa
         report: output, JSON: the models, standard deviations of the calibration, photos left out of each.
     """
     known = read_json(sparse_json)
-    model = pycolmap.Reconstruction(sparse)
+    model = read_model(sparse)
     beyond = value(known, "next_lens")
     found, calibrations = spread_of(model, LENSES[value(known, "lens")], None if beyond is None else LENSES[beyond])
     write_spread(spread, found)
