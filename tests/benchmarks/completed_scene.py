@@ -213,7 +213,8 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     """The row of the third table: what fused.ply says of the points it added, beside their true errors.
 
     Errors are vectors to the true surface in the object's own frame, aligned to the truth by its cameras: the pose in
-    the scene has its own uncertainty.
+    the scene has its own uncertainty. A surface has no place along itself: an axis counts where the surface faces it
+    within 45 degrees.
     """
     folder = case.results / "objects" / case.name
     evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
@@ -221,9 +222,11 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     truth_from_scene = case.known.fit.truth_from_model @ settled.inverse()
     added = fused[fused.fields["source"] == FROM_OBJECT]
     measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= LEAST_PHOTOS)
-    errors = _to_surface(truth_from_scene.apply(added.points[measured]), case.known)
+    points = truth_from_scene.apply(added.points[measured])
+    errors, normals = _to_surface(points, case.known), _normals_there(points, case.known)
     bounds = 2 * truth_from_scene.scale * added.fields["deviation"][measured]
-    axes = (np.abs(errors) <= bounds[:, None]).mean(0)
+    within, faces = np.abs(errors) <= bounds[:, None], np.abs(normals) > np.sqrt(0.5)
+    axes = [within[faces[:, axis], axis].mean() for axis in range(3)]
     whole = case.known.fit.truth_from_model.apply(case.object.points)
     total, nerf_only = (value(evidence, f"object_{name}") for name in ("points", "nerf_only"))
     yield {
@@ -259,6 +262,12 @@ def _to_surface(points: Array, known: ObjectTruth) -> Array:
     """(N, 3) vectors from the true surface to points in the truth's frame."""
     query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
     return points - known.mesh.caster().compute_closest_points(query, threads())["points"].numpy()
+
+
+def _normals_there(points: Array, known: ObjectTruth) -> Array:
+    """(N, 3) unit normals of the true surface where it is nearest to points."""
+    query = o3d.core.Tensor.from_numpy(points.astype(np.float32))
+    return known.mesh.caster().compute_closest_points(query, threads())["primitive_normals"].numpy()
 
 
 def _share_near(points: Array, known: ObjectTruth) -> float:

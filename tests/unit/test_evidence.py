@@ -145,6 +145,14 @@ def test_one_wrong_camera_changes_little(near, far):
     assert np.abs(found.obj.points[found.added][:, 2]).max() < 0.01
 
 
+def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_and_is_said(near, far):
+    up = Sim3(1.0, np.eye(3), np.array([0, 0, 0.5]))
+    obj, scene = sheet(-0.5, 0.5, 0.03).transformed(up), sheet(-0.8, 0.8, 0.06)
+    fused = fuse_by_evidence(obj, scene, moved_photos(near, up), far, FusionSettings())
+    assert len(fused.removed) == 0
+    assert any("stays where the registration put it" in note for note in value(evidence_report(fused, "m"), "notes"))
+
+
 @pytest.mark.parametrize("without", ["object", "scene", "both"])
 def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
