@@ -12,8 +12,8 @@ from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, 
 from scenefuse.report.object_sheet import SIDES_DEG, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
-from scenefuse.report.view_file import View, write_view
-from scenefuse.report.view_points import REMOVED, merge, thin, within
+from scenefuse.report.view.view_file import View, write_view
+from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import atomic_directory
 from scenefuse.transforms import Array
 from scenefuse.workspace import read_views

@@ -11,10 +11,10 @@ from PIL import Image as Picture
 
 from scenefuse.report.page import SCRIPT, STYLE
 from scenefuse.report.values import number
-from scenefuse.report.view_file import View, read_view
-from scenefuse.report.view_page import view_library, view_section
-from scenefuse.report.view_points import thin
-from scenefuse.report.view_script import VIEW_SCRIPT, VIEW_STYLE
+from scenefuse.report.view.view_file import View, read_view
+from scenefuse.report.view.view_page import view_library, view_section
+from scenefuse.report.view.view_points import thin
+from scenefuse.report.view.view_script import VIEW_SCRIPT, VIEW_STYLE
 from scenefuse.stage import StageError, atomic_file
 
 PAGE_POINTS = 700_000

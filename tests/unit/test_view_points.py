@@ -7,8 +7,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, spacing
-from scenefuse.report.view_file import View, encode, read_view, write_view
-from scenefuse.report.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN, merge, thin, within
+from scenefuse.report.view.view_file import View, encode, read_view, write_view
+from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN, merge, thin, within
 from scenefuse.stage import StageError
 
 

@@ -10,9 +10,9 @@ from scenefuse.io.maps import write_depth
 from scenefuse.io.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
-from scenefuse.report.view_file import read_view
-from scenefuse.report.view_points import AFTER, BOTH
-from scenefuse.report.view_scene import view_scene
+from scenefuse.report.view.view_file import read_view
+from scenefuse.report.view.view_points import AFTER, BOTH
+from scenefuse.report.view.view_scene import view_scene
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Sim3
 

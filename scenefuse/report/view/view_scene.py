@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.units import length_unit
-from scenefuse.report.view_file import View, write_view
-from scenefuse.report.view_points import REMOVED, merge, thin, within
+from scenefuse.report.view.view_file import View, write_view
+from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import read_json, value
 
 VIEW_POINTS = 250_000

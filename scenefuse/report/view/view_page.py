@@ -12,8 +12,8 @@ import numpy as np
 from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
-from scenefuse.report.view_file import LEVELS, View, encode
-from scenefuse.report.view_points import AFTER, BEFORE, REMOVED, UNKNOWN
+from scenefuse.report.view.view_file import LEVELS, View, encode
+from scenefuse.report.view.view_points import AFTER, BEFORE, REMOVED, UNKNOWN
 
 Mode = dict[str, Any]
 

@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.report.render import point_radii
-from scenefuse.report.view_points import AFTER, BEFORE, BOTH
+from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array
 

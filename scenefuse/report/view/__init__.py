@@ -1,0 +1,1 @@
+"""The interactive view: what its page shows, and how it is drawn."""
