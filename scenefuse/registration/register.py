@@ -210,7 +210,7 @@ def cut_scene(
     origin = np.floor(marks.mean(0))
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
-    ground = "the ground removed" if cut.ground is not None else "no ground removed"
+    ground = "the ground removed" if cut.on_ground.any() else "no ground removed"
     return scene[cut.keep], f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}"
 
 
