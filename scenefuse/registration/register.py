@@ -211,7 +211,8 @@ def cut_scene(
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
     ground = "the ground removed" if cut.on_ground.any() else "no ground removed"
-    return scene[cut.keep], f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}"
+    said = "; ".join([f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}", *cut.notes])
+    return scene[cut.keep], said
 
 
 def register(

@@ -95,8 +95,7 @@ def crop_cloud(
         # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
         corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
         low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
-    in_box = ((points >= low) & (points <= high)).all(1)
-    shape = settings.shape
+    in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
     if shape == "hull":
         try:
             in_box[in_box] = in_wide_hull(points[in_box], marks, low[2], margin)
@@ -107,14 +106,12 @@ def crop_cloud(
     if ground is not None and in_box.any():
         away = on_ground(points, marks, ground, in_box)
         if away.sum() > (1 - LEAST_LEFT) * in_box.sum():
-            without = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
-            note = (
-                f"{away.sum()} of the {in_box.sum()} points in the box would be ground: nothing was removed as ground"
-            )
-            return replace(without, notes=[note, *without.notes])
-    keep = in_box & ~away
-    if other is not None:
-        keep &= ~other
+            cut = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
+            share = f"{away.sum()} of the {in_box.sum()} points in the box"
+            return replace(cut, notes=[f"{share} would be ground: nothing was removed as ground", *cut.notes])
+        if not away.any():
+            notes.append("the ground around the box does not continue into it: nothing was removed as ground")
+    keep = in_box & ~away if other is None else in_box & ~away & ~other
     keep, said = _without_loose_parts(points, keep, marks, diagonal)
     return Crop(keep, in_box, away, shape, level, low, high, ground, notes + said)
 

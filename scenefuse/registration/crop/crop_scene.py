@@ -43,7 +43,7 @@ class CropInputs:
 
 
 def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSettings) -> None:
-    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C3).
+    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C4).
 
     Args:
         inputs: the scene, and what marks the object in it.

@@ -71,11 +71,9 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     """
     foot, height = _foot(marks)
     diagonal = float(np.linalg.norm(np.ptp(marks, axis=0)))
-    low, high = (
-        points[in_box, :2].min(0) - RING_FRACTION * diagonal,
-        points[in_box, :2].max(0) + RING_FRACTION * diagonal,
-    )
-    rows = np.flatnonzero(((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
+    inside, ring = points[in_box, :2], RING_FRACTION * diagonal
+    near = (points[:, :2] >= inside.min(0) - ring) & (points[:, :2] <= inside.max(0) + ring)
+    rows = np.flatnonzero(near.all(1))
     xy, z = points[rows, :2], points[rows, 2]
     surface = ground.height(xy)
     under = ground.height(marks[:, :2])
