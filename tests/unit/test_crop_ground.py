@@ -232,3 +232,12 @@ def test_registering_two_clouds_says_what_was_not_removed(tmp_path):
     flat = Scene(*(lambda b: (b[0], STREET + [0, 6, 0], b[1]))(block((-2, -1.5, 0.0), (2, 1.5, 3))))
     np.savetxt(tmp_path / "marks.txt", flat.fiducials)
     assert "the ground removed" in cut_scene(flat.cloud, SETTINGS, Z, tmp_path / "marks.txt")[1]
+
+
+def test_parts_are_kept_where_those_near_a_fiducial_would_be_next_to_nothing():
+    own, _ = block((-2, -0.5, 0), (-1.9, 0.5, 3), 600)
+    _, marks = block((-2, -0.5, 0), (2, 0.5, 3))
+    scene = Scene(own, patch(2.35, (-0.5, 0.5), (0, 3), 20000, noise=0.003), marks)
+    cut, kept, rest = scene.crop(remove_ground=False)
+    assert kept.all() and rest.all()
+    assert cut.notes == ["parts near a fiducial have only 600 of 20600 points in the box: all were kept"]
