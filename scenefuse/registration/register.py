@@ -210,8 +210,9 @@ def cut_scene(
     origin = np.floor(marks.mean(0))
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
-    ground = "the ground removed" if cut.ground is not None else "no ground removed"
-    return scene[cut.keep], f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}"
+    ground = "the ground removed" if cut.on_ground.any() else "no ground removed"
+    said = "; ".join([f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}", *cut.notes])
+    return scene[cut.keep], said
 
 
 def register(

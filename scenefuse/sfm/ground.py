@@ -12,6 +12,8 @@ CELLS = 40
 MIN_POINTS, MIN_CELLS = 50, 20
 # Triples of cells drawn; the plane must hold this share of the cells, and rise by less than 45 degrees.
 TRIPLES, MIN_SHARE = 400, 0.3
+# Cells of a strip narrower than this share of its length, a ledge or the foot of a wall, fix no slope across it.
+MIN_BREADTH = 0.2
 # Rounds of Tukey weights for the plane and for the parabola, twice.
 ROUNDS = 10
 
@@ -34,6 +36,12 @@ class Ground:
         """Heights (N,) at (N, 2)."""
         return _terms(xy - self.centre) @ self.coefficients
 
+    def rise(self, xy: Array) -> Array:
+        """Slopes (N,) at (N, 2): the tangent of the angle with the horizontal."""
+        x, y = (xy - self.centre).T
+        _, b, c, d, e, f = self.coefficients
+        return np.hypot(b + 2 * d * x + e * y, c + e * x + 2 * f * y)
+
 
 def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: float, seed: int = 0) -> Ground | None:
     """Fit the ground on a ring around a box, never inside it, so that the object itself cannot pass for ground.
@@ -50,7 +58,8 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
         seed: of the triples.
 
     Returns:
-        The ground, or None when the ring is empty or no plane below 45 degrees fits at least 30 % of it.
+        The ground, or None when the ring is empty, no plane below 45 degrees fits at least 30 % of it, or what it fits
+        is a narrow strip.
     """
     xy = points[:, :2]
     near = ((xy >= low[:2] - ring) & (xy <= high[:2] + ring)).all(1)
@@ -63,7 +72,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
         return None
     centre = (low[:2] + high[:2]) / 2
     plane = _plane_by_triples(lowest[:, :2] - centre, lowest[:, 2], 2 * tolerance, seed)
-    if plane is None:
+    if plane is None or _breadth(lowest, centre, plane, 2 * tolerance) < MIN_BREADTH:
         return None
     coefficients = _height_field(lowest[:, :2] - centre, lowest[:, 2], plane, tolerance)
     # A noisy cloud's ground is thick: its own spread about the surface widens the tolerance.
@@ -73,6 +82,14 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
         coefficients[0] += float(np.median(off))
         tolerance = float(np.clip(2.5 * 1.4826 * np.median(np.abs(off - np.median(off))), tolerance, 3 * tolerance))
     return Ground(coefficients, centre, tolerance)
+
+
+def _breadth(cells: Array, centre: Array, plane: Array, tolerance: float) -> float:
+    """Breadth over length, as standard deviations seen from above, of the cells (M, 3) on a plane (3,)."""
+    xy = cells[:, :2] - centre
+    xy = xy[np.abs(_terms(xy)[:, :3] @ plane - cells[:, 2]) <= tolerance]
+    narrow, long = np.linalg.svd(xy - xy.mean(0), compute_uv=False)[[1, 0]]
+    return float(narrow / long)
 
 
 def _lowest(points: Array, corner: Array, edge: float) -> Array:

@@ -186,6 +186,14 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "1 of 3 objects registered" in text
 
 
+def test_the_text_says_that_ground_was_left_in(results):
+    note = "990 of the 1000 points in the box would be ground: nothing was removed as ground"
+    crop = {"diagonal": quantity(15.0, "m"), "notes": quantity([note], "")}
+    write_json(results / "objects/house/registration/full/crop.json", crop)
+    text = (summarise(results) / "summary.txt").read_text()
+    assert f"crop.notes: {note}" in " ".join(text.split())
+
+
 def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
     text = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
     assert "PSNR 27.5 dB on training photos" in text and "held-out" not in text

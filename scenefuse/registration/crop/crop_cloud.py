@@ -1,28 +1,25 @@
 """The points of a scene that belong to a marked object: a box or hull, without the ground and without loose parts."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import QhullError, cKDTree
 
 from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.registration.crop.level_ground import GROUND_FRACTION, ground_under, on_ground
+from scenefuse.registration.crop.parts import LINK_FRACTION, MIN_PART, parts
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
-from scenefuse.sfm.ground import Ground, fit_ground
+from scenefuse.sfm.ground import Ground
 from scenefuse.stage import setting, threads
 from scenefuse.transforms import Array, rotation_between
 
 # Shares of the diagonal of the fiducials' box.
 MARGIN_FRACTION = 0.04  # widening of the box beside `margin`: two pairing distances of the registration
-RING_FRACTION = 0.5  # width of the ring around the box in which the ground is looked for
-GROUND_FRACTION = 0.015  # points lower than this above the ground are ground
-LINK_FRACTION = 0.03  # points closer than this belong to one part
 REACH_FRACTION = 0.05  # a part this near to a fiducial belongs to the object
-# Parts with a smaller share of the points are left out.
-MIN_PART = 0.01
+# A step that would leave less than this share of the points in the box is left out: the object is there.
+LEAST_LEFT = 0.05
 
 
 @dataclass(frozen=True)
@@ -53,16 +50,18 @@ class Crop:
     Attributes:
         keep: (N,) bool over the scene's points, True on the object.
         in_box: (N,) bool, True for all points in the box or hull, ground included.
+        on_ground: (N,) bool, True for points in it that were removed as ground.
         shape: box, oriented or hull: what was cut out; None for the whole scene.
         level_from_scene: (3, 3) rotation that turns the scene's up into z, and the box's sides into x and y.
         low: (3,) least corner of the box (around the hull) in the level frame.
         high: (3,) greatest corner.
-        ground: the fitted ground, or None.
+        ground: the fitted ground on which the object stands, or None.
         notes: what was not done and why.
     """
 
     keep: NDArray[np.bool_]
     in_box: NDArray[np.bool_]
+    on_ground: NDArray[np.bool_]
     shape: str | None
     level_from_scene: Array
     low: Array
@@ -74,62 +73,65 @@ class Crop:
 def whole(scene: Cloud) -> Crop:
     """The whole scene as a crop."""
     everything = np.ones(len(scene), dtype=bool)
-    return Crop(everything, everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [])
+    return Crop(
+        everything, everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, []
+    )
 
 
 def crop_cloud(
     scene: Cloud, fiducials: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_] | None = None
 ) -> Crop:
     """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
-    level, shape = rotation_between(up, np.array([0.0, 0.0, 1.0])), settings.shape
-    notes: list[str] = []
-    if shape == "oriented":
+    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    if settings.shape == "oriented":
         level = least_footprint(fiducials @ level.T) @ level
     points, marks = scene.points @ level.T, fiducials @ level.T
     extent = np.ptp(marks, axis=0)
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + MARGIN_FRACTION * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
-    ground = None
-    if settings.remove_ground:
-        ground = fit_ground(points, low, high, RING_FRACTION * diagonal, GROUND_FRACTION * diagonal)
-        if ground is None:
-            notes.append("no ground was found around the box: nothing was removed as ground")
-        else:
-            # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
-            corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
-            low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
-    in_box = ((points >= low) & (points <= high)).all(1)
+    ground, notes = ground_under(points, marks, low, high) if settings.remove_ground else (None, [])
+    if ground is not None:
+        # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
+        corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+        low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
+    in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
     if shape == "hull":
         try:
             in_box[in_box] = in_wide_hull(points[in_box], marks, low[2], margin)
         except QhullError:
             shape = "box"
             notes.append("the fiducials lie in one vertical plane and span no hull: their box was cut out instead")
-    above = in_box.copy()
-    if ground is not None:
-        above &= points[:, 2] > ground.height(points[:, :2]) + ground.tolerance
-    if other is not None:
-        above &= ~other
-    keep = above.copy()
-    inside = np.flatnonzero(above)
-    if len(inside):
-        link = max(LINK_FRACTION * diagonal, 3 * spacing(points[inside]))
-        near = _parts_near(points[inside], marks, link, REACH_FRACTION * diagonal)
-        if near.any():
-            keep[inside] = near
-        else:
-            notes.append("no part in the box lies near a fiducial: all of them were kept")
-    return Crop(keep, in_box, shape, level, low, high, ground, notes)
+    away = np.zeros(len(points), dtype=bool)
+    if ground is not None and in_box.any():
+        away = on_ground(points, marks, ground, in_box)
+        if away.sum() > (1 - LEAST_LEFT) * in_box.sum():
+            cut = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
+            share = f"{away.sum()} of the {in_box.sum()} points in the box"
+            return replace(cut, notes=[f"{share} would be ground: nothing was removed as ground", *cut.notes])
+        if not away.any():
+            notes.append("the ground around the box does not continue into it: nothing was removed as ground")
+    keep = in_box & ~away if other is None else in_box & ~away & ~other
+    keep, said = _without_loose_parts(points, keep, marks, diagonal)
+    return Crop(keep, in_box, away, shape, level, low, high, ground, notes + said)
 
 
-def parts(points: Array, link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The connected part of each point, of points closer than about `link`, and how many points each part has."""
-    cells, cell_of = np.unique(np.floor(points / link).astype(np.int64), axis=0, return_inverse=True)
-    touching = cKDTree(cells).query_pairs(1.8, output_type="ndarray")
-    graph = coo_matrix((np.ones(len(touching)), touching.T), shape=(len(cells), len(cells)))
-    part_of = connected_components(graph, directed=False)[1][cell_of.ravel()]
-    return part_of, np.bincount(part_of)
+def _without_loose_parts(
+    points: Array, inside: NDArray[np.bool_], marks: Array, diagonal: float
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Those of the points `inside` in parts that belong to the object, and what was not done and why."""
+    rows = np.flatnonzero(inside)
+    if not len(rows):
+        return inside, []
+    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
+    near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
+    if not near.any():
+        return inside, ["no part in the box lies near a fiducial: all of them were kept"]
+    if near.mean() < LEAST_LEFT:
+        return inside, [f"parts near a fiducial have only {near.sum()} of {len(rows)} points in the box: all were kept"]
+    keep = np.zeros(len(points), dtype=bool)
+    keep[rows[near]] = True
+    return keep, []
 
 
 def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArray[np.bool_]:

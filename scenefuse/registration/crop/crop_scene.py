@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.io.units import length_unit
-from scenefuse.registration.crop.crop_cloud import MIN_PART, Crop, CropSettings, crop_cloud, parts, whole
+from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
+from scenefuse.registration.crop.parts import MIN_PART, parts
 from scenefuse.registration.crop.vote import Votes, vote
 from scenefuse.sfm.fiducials import locate
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
@@ -42,7 +43,7 @@ class CropInputs:
 
 
 def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSettings) -> None:
-    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C3).
+    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C4).
 
     Args:
         inputs: the scene, and what marks the object in it.
@@ -137,13 +138,13 @@ def crop_marked(
 
 def _announce(cut: Crop, source: str) -> None:
     """Print the notes; StageError when too little is left."""
+    for note in cut.notes:
+        print(note, flush=True)
     if cut.keep.sum() < MIN_POINTS:
         raise StageError(
             f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {MIN_POINTS} are"
             " needed: the scene may not show the object, or a fiducial or mask may not lie on it"
         )
-    for note in cut.notes:
-        print(note, flush=True)
 
 
 def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> None:
@@ -172,7 +173,8 @@ def _report(scene: Cloud, part: Cloud, cut: Crop, unit: str) -> dict[str, object
         "crop_points": quantity(len(part), "1"),
         "diagonal": quantity(part.diagonal, unit),
         "spacing": quantity(spacing(part.points), unit),
-        "ground_removed": quantity(ground is not None, ""),
+        "ground_removed": quantity(bool(cut.on_ground.any()), ""),
+        "ground_points": quantity(int(cut.on_ground.sum()), "1"),
         "ground_coefficients": quantity(None if ground is None else ground.coefficients, unit),
         "ground_centre": quantity(None if ground is None else ground.centre, unit),
         "ground_tolerance": quantity(None if ground is None else ground.tolerance, unit),
