@@ -161,6 +161,8 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
     evaluate_object(
         inputs=EvaluationInputs(
             workspace=planted / "undistorted",
+            sparse=planted / "undistorted/sparse",
+            undistorted=planted / "undistorted",
             masks=planted / "masks",
             stages=[planted / "stage1", planted / "stage2"],
             cloud=planted / "object.ply",
