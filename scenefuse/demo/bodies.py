@@ -116,7 +116,7 @@ def draw_exposure(body: Body, rng: np.random.Generator) -> Exposure:
     spread = body.exposure_sd * rng.normal() + body.balance_sd * rng.normal(size=3) * [1, 0, 1]
     blurred, angle = rng.random() < body.blurred, rng.uniform(0, np.pi)
     defocus, path = rng.uniform(*DEFOCUS_PX), rng.uniform(0, MOTION_PX) * np.array([np.cos(angle), np.sin(angle)])
-    return Exposure(body.gains * np.exp(spread), defocus * blurred, path * blurred)
+    return Exposure(np.array(body.gains) * np.exp(spread), defocus * blurred, path * blurred)
 
 
 def expose(
@@ -135,7 +135,9 @@ def expose(
         (H, W, 3) uint8 RGB.
     """
     if exposure.defocus_px > 0:
-        light = cv2.filter2D(light, -1, blur_kernel(exposure), borderType=cv2.BORDER_REPLICATE)
+        light = np.asarray(
+            cv2.filter2D(light, -1, blur_kernel(exposure), borderType=cv2.BORDER_REPLICATE), dtype=np.float64
+        )
     light = light * vignetting(cameras, body.corner)[..., None] * exposure.gains
     light += np.sqrt(body.shot * light + body.read**2) * rng.standard_normal(light.shape, dtype=np.float32)
     picture = np.empty(light.shape, dtype=np.uint8)

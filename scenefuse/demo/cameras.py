@@ -46,7 +46,7 @@ class Cameras:
     def reach(self) -> float:
         """Tangent of the largest angle off the optical axis that a photo shows, at one of its corners."""
         corners = np.array([[x, y] for x in (0, self.width) for y in (0, self.height)], dtype=np.float64)
-        return float(np.linalg.norm(self.camera.cam_from_img(corners), axis=1).max())
+        return float(np.linalg.norm(np.asarray(self.camera.cam_from_img(corners)), axis=1).max())
 
     def rays(self, side: int) -> NDArray[np.float64]:
         """(H * W * side**2, 2) x and y at z = 1 of the rays through a grid of `side` x `side` samples in each pixel.
@@ -68,7 +68,8 @@ class Cameras:
         ahead = (in_cam[:, 2] > 0) & (np.linalg.norm(in_cam[:, :2], axis=1) <= self.reach * in_cam[:, 2])
         pixels = np.full((len(points), 2), np.nan)
         pixels[ahead] = self.camera.img_from_cam(in_cam[ahead])
-        return pixels, (pixels >= 0).all(1) & (pixels < [self.width, self.height]).all(1)
+        inside = (pixels >= 0) & (pixels < [self.width, self.height])
+        return pixels, ahead & inside.all(1)
 
 
 def pinhole(focal_px: float, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
