@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from scenefuse.demo.bodies import Kind
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
@@ -43,7 +44,7 @@ from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 
-# Five groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
+# Six groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
 
 
 @dataclass(frozen=True)
@@ -59,6 +60,15 @@ class RunSettings:
     gpu: int | Literal["auto"] = setting("auto", least=0)
     """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
     NVIDIA card, else 0. On a cluster, say it."""
+
+
+@dataclass(frozen=True)
+class DemoSettings:
+    """What all photos of the demo share."""
+
+    camera: Kind = setting("real")
+    """Real: a drone's and a phone's camera, with distortion, a principal point off the middle, vignetting, noise and an
+    exposure of its own in every photo, under a white sky. Ideal: a pinhole without any of these, under a blue one."""
 
 
 @dataclass(frozen=True)
@@ -95,6 +105,7 @@ class VariantSettings:
 
 SECTIONS: dict[str, list[Any]] = {
     "": [RunSettings()],
+    "demo": [DemoSettings()],
     "demo.flight": [FlightSettings()],
     "demo.orbit": [OrbitSettings()],
     "demo.fiducials": [ClickSettings()],

@@ -1,20 +1,21 @@
 """Cameras of the demo: the mapping flight and the orbits, and their truth files."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import open3d as o3d
+import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError, quantity, read_json, threads, value
-from scenefuse.workspace import View
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """Photos of one capture: one pinhole camera at many poses.
+    """Photos of one capture: one camera, pinhole or with Brown's distortion, at many poses.
 
     Attributes:
         names: file names.
@@ -23,6 +24,7 @@ class Cameras:
         height: rows.
         cam_from_world: (N, 3, 3) rotations, OpenCV axes.
         centres: (N, 3) in the world, metres.
+        distortion: (4,) k1, k2, p1, p2 of Brown (1971), as in OpenCV and in COLMAP's OPENCV camera; zeros: a pinhole.
     """
 
     names: list[str]
@@ -31,23 +33,48 @@ class Cameras:
     height: int
     cam_from_world: NDArray[np.float64]
     centres: NDArray[np.float64]
+    distortion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(4))
 
-    def view(self, photo: int) -> View:
-        """One photo's camera."""
-        pose = np.eye(4)
-        pose[:3, :3] = self.cam_from_world[photo]
-        pose[:3, 3] = -self.cam_from_world[photo] @ self.centres[photo]
-        return View(self.names[photo], self.intrinsics, pose, self.width, self.height)
+    @cached_property
+    def camera(self) -> pycolmap.Camera:
+        """The same camera without a pose, as COLMAP's OPENCV."""
+        k = self.intrinsics
+        params = [k[0, 0], k[1, 1], k[0, 2], k[1, 2], *self.distortion]
+        return pycolmap.Camera(model="OPENCV", width=self.width, height=self.height, params=params)
+
+    @cached_property
+    def reach(self) -> float:
+        """Tangent of the largest angle off the optical axis that a photo shows, at one of its corners."""
+        corners = np.array([[x, y] for x in (0, self.width) for y in (0, self.height)], dtype=np.float64)
+        return float(np.linalg.norm(np.asarray(self.camera.cam_from_img(corners)), axis=1).max())
+
+    def rays(self, side: int) -> NDArray[np.float64]:
+        """(H * W * side**2, 2) x and y at z = 1 of the rays through a grid of `side` x `side` samples in each pixel.
+
+        Row by row; the samples of a pixel lie next to each other. The distortion is inverted exactly.
+        """
+        step = (np.arange(side) + 0.5) / side
+        row, column, y, x = np.ix_(np.arange(self.height), np.arange(self.width), step, step)
+        pixels = np.stack(np.broadcast_arrays(column + x, row + y), axis=-1)
+        return np.asarray(self.camera.cam_from_img(pixels.reshape(-1, 2)))
 
     def project(self, photo: int, points: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """(M, 2) pixels of (M, 3) points of the world in one photo, and which of them fall inside it."""
-        pixels, depth = self.view(photo).project(points)
-        return pixels, (depth > 0) & (pixels >= 0).all(1) & (pixels < [self.width, self.height]).all(1)
+        """(M, 2) pixels of (M, 3) points of the world in one photo, and which of them fall inside it.
+
+        Pixels are NaN behind the camera and beyond `reach`: far outside a photo Brown's polynomial turns back and would
+        put points into it that no ray comes from.
+        """
+        in_cam = (points - self.centres[photo]) @ self.cam_from_world[photo].T
+        ahead = (in_cam[:, 2] > 0) & (np.linalg.norm(in_cam[:, :2], axis=1) <= self.reach * in_cam[:, 2])
+        pixels = np.full((len(points), 2), np.nan)
+        pixels[ahead] = self.camera.img_from_cam(in_cam[ahead])
+        inside = (pixels >= 0) & (pixels < [self.width, self.height])
+        return pixels, ahead & inside.all(1)
 
 
-def pinhole(focal_px: float, width: int, height: int) -> NDArray[np.float64]:
-    """(3, 3) intrinsics with the principal point in the middle."""
-    return np.array([[focal_px, 0, width / 2], [0, focal_px, height / 2], [0, 0, 1.0]])
+def pinhole(focal_px: float, width: int, height: int, shift: tuple[float, float] = (0.0, 0.0)) -> NDArray[np.float64]:
+    """(3, 3) intrinsics with the principal point in the middle, or off it by shares of width and height."""
+    return np.array([[focal_px, 0, width * (0.5 + shift[0])], [0, focal_px, height * (0.5 + shift[1])], [0, 0, 1.0]])
 
 
 def visible(
@@ -55,6 +82,7 @@ def visible(
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Where each photo shows each of (M, 3) points: (N, M, 2) pixels, and (N, M) whether nothing hides it.
 
+    Pixels are those of the photo as taken, distorted if its lens does; NaN as in `Cameras.project`.
     A point counts as hidden when a ray towards it ends more than `tolerance` metres before it.
     """
     pixels = np.zeros((len(cameras.names), len(points), 2))
@@ -71,11 +99,12 @@ def visible(
 
 
 def cameras_json(cameras: Cameras) -> dict[str, Any]:
-    """The truth file of a capture."""
+    """The truth file of a capture; `distortion` is k1, k2, p1, p2 of COLMAP's camera model OPENCV."""
     return {
         "width": quantity(cameras.width, "px"),
         "height": quantity(cameras.height, "px"),
         "intrinsics": quantity(cameras.intrinsics, "px"),
+        "distortion": quantity(cameras.distortion, "1"),
         "photos": {
             name: {
                 "cam_from_world_rotation": quantity(rotation, "1"),
@@ -98,6 +127,7 @@ def read_cameras(path: Path) -> Cameras:
             value(content, "height"),
             np.array([value(p, "cam_from_world_rotation") for p in photos.values()]),
             np.array([value(p, "centre") for p in photos.values()]),
+            np.array(value(content, "distortion")),
         )
     except (KeyError, TypeError):
         raise StageError(f"{path} is not a truth file of the demo; render the capture again") from None

@@ -11,7 +11,8 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
-from scenefuse.demo import textures
+from scenefuse.demo import bodies, textures
+from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
 from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
@@ -64,34 +65,37 @@ class OrbitSettings:
     """Samples along each side of a pixel."""
 
 
-def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, seed: int) -> None:
+def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera: bodies.Kind, seed: int) -> None:
     """Render the mapping flight: JPEG photos with noisy GPS in their EXIF, and its truth.
 
-    The truth folder holds cameras.json (intrinsics in pixels, cam_from_world rotations, centres in metres in a local
-    east-north-up frame; its origin; each object's middle and diagonal) and meshes/: world.ply (terrain and clutter)
-    and one mesh for each object.
+    The truth folder holds cameras.json (intrinsics in pixels, distortion k1, k2, p1, p2 as in COLMAP's OPENCV,
+    cam_from_world rotations, centres in metres in a local east-north-up frame; its origin; each photo's exposure; each
+    object's middle and diagonal) and meshes/: world.ply (terrain and clutter) and one mesh for each object.
 
     Args:
         photos: output folder of JPEG photos.
         truth: output folder, for evaluation only.
         settings: the flight.
-        seed: of the world, the flight's jitter and the GPS noise; every job of one demo uses the same.
+        camera: a drone's, or an ideal one.
+        seed: of the world, the flight's jitter, the GPS and what differs from photo to photo; every job of one demo
+            uses the same.
 
     Raises:
         StageError: a flight without photos, or photos without pixels.
     """
     _check(settings.columns * settings.rows + settings.obliques, settings.width_px, settings.height_px)
     world = build_world(seed)
-    cameras = flight(world, settings, seed)
+    body = bodies.FLIGHT[camera]
+    cameras = flight(world, settings, body, seed)
     offsets = np.random.default_rng([seed, 2]).normal(size=cameras.centres.shape)
     offsets *= [settings.gps_noise_horizontal, settings.gps_noise_horizontal, settings.gps_noise_vertical]
     gps = pycolmap.GPSTransform().enu_to_ellipsoid(cameras.centres + offsets, *ORIGIN)
     with atomic_directory(photos) as folder:
-        _render_all(world, cameras, folder, settings.supersampling, seed, gps)
+        exposures, _ = _render_all(world, cameras, body, folder, settings.supersampling, seed, gps=gps)
     with atomic_directory(truth) as folder:
         for owner, name in enumerate(["world", *world.names]):
             _write_mesh(folder / "meshes" / f"{name}.ply", world, owner)
-        content = cameras_json(cameras)
+        content = cameras_json(cameras) | _exposures_json(cameras, exposures)
         content["origin"] = quantity(list(ORIGIN), "degrees north, degrees east, m")
         content["ground_sampling_distance"] = quantity(settings.altitude / settings.focal_px, "m")
         content["mapped_area"] = quantity([[-MAPPED[0], -MAPPED[1]], [MAPPED[0], MAPPED[1]]], "m")
@@ -99,17 +103,20 @@ def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, seed: i
         write_json(folder / "cameras.json", content)
 
 
-def render_object(*, name: str, photos: Path, truth: Path, settings: OrbitSettings, seed: int) -> None:
+def render_object(
+    *, name: str, photos: Path, truth: Path, settings: OrbitSettings, camera: bodies.Kind, seed: int
+) -> None:
     """Render the photos around one object: JPEG without GPS, and its truth.
 
     The truth folder holds cameras.json (as for the flight, and the object's middle and diagonal), mesh.ply (the
-    object's surface in the world) and masks/{photo}.png (255 where the object is seen).
+    object's surface in the world) and masks/{photo}.png (255 where the photo, distorted as it is, shows the object).
 
     Args:
         name: house, balloon or sculpture.
         photos: output folder of JPEG photos.
         truth: output folder, for evaluation only.
         settings: the orbit.
+        camera: a phone's, or an ideal one.
         seed: as for the flight.
 
     Raises:
@@ -122,17 +129,19 @@ def render_object(*, name: str, photos: Path, truth: Path, settings: OrbitSettin
         )
     world = build_world(seed)
     owner = world.owner(name)
-    cameras = orbit(world, name, settings, seed)
+    body = bodies.ORBIT[camera]
+    cameras = orbit(world, name, settings, body, seed)
     with atomic_directory(photos) as folder, atomic_directory(truth) as truth_folder:
         (truth_folder / "masks").mkdir()
-        masks = _render_all(world, cameras, folder, settings.supersampling, seed, None, owner)
+        exposures, masks = _render_all(world, cameras, body, folder, settings.supersampling, seed, owner=owner)
         for photo, mask in zip(cameras.names, masks):
             cv2.imwrite(str(truth_folder / "masks" / f"{Path(photo).stem}.png"), mask)
         _write_mesh(truth_folder / "mesh.ply", world, owner)
-        write_json(truth_folder / "cameras.json", cameras_json(cameras) | {"object": _extent(world, name)})
+        content = cameras_json(cameras) | _exposures_json(cameras, exposures)
+        write_json(truth_folder / "cameras.json", content | {"object": _extent(world, name)})
 
 
-def flight(world: World, settings: FlightSettings, seed: int) -> Cameras:
+def flight(world: World, settings: FlightSettings, body: Body, seed: int) -> Cameras:
     """A grid of photos that look down, then a strip from the south and one from the east that look obliquely."""
     rng = np.random.default_rng([seed, 1])
     footprint = np.array([settings.width_px, settings.height_px]) * settings.altitude / settings.focal_px
@@ -160,11 +169,10 @@ def flight(world: World, settings: FlightSettings, seed: int) -> Cameras:
         rotations.append(look_at(centre, target, np.array([0.0, 0.0, 1.0])))
         centres.append(centre)
     names = [f"flight_{k + 1:04d}.jpg" for k in range(len(centres))]
-    k_matrix = pinhole(settings.focal_px, settings.width_px, settings.height_px)
-    return Cameras(names, k_matrix, settings.width_px, settings.height_px, np.array(rotations), np.array(centres))
+    return _capture(names, settings, body, rotations, centres)
 
 
-def orbit(world: World, name: str, settings: OrbitSettings, seed: int) -> Cameras:
+def orbit(world: World, name: str, settings: OrbitSettings, body: Body, seed: int) -> Cameras:
     """Rings of photos around an object; a ring's photos stand between those of the ring below."""
     rng = np.random.default_rng([seed, 10 + world.owner(name)])
     low, high = world.bounds(name)
@@ -187,8 +195,20 @@ def orbit(world: World, name: str, settings: OrbitSettings, seed: int) -> Camera
             rotations.append(look_at(centre, target, np.array([0.03 * rng.normal(), 0.03 * rng.normal(), 1.0])))
             centres.append(centre)
     names = [f"{name}_{k + 1:04d}.jpg" for k in range(len(centres))]
-    k_matrix = pinhole(settings.focal_px, settings.width_px, settings.height_px)
-    return Cameras(names, k_matrix, settings.width_px, settings.height_px, np.array(rotations), np.array(centres))
+    return _capture(names, settings, body, rotations, centres)
+
+
+def _capture(
+    names: list[str],
+    settings: FlightSettings | OrbitSettings,
+    body: Body,
+    rotations: list[NDArray[np.float64]],
+    centres: list[NDArray[np.float64]],
+) -> Cameras:
+    """Photos of a body at many poses."""
+    width, height = settings.width_px, settings.height_px
+    k_matrix = pinhole(settings.focal_px, width, height, body.shift)
+    return Cameras(names, k_matrix, width, height, np.array(rotations), np.array(centres), np.array(body.distortion))
 
 
 def _distance(settings: OrbitSettings, tall: float, wide: float, elevation: float) -> float:
@@ -233,38 +253,62 @@ def _write_mesh(path: Path, world: World, owner: int) -> None:
 def _render_all(
     world: World,
     cameras: Cameras,
+    body: Body,
     folder: Path,
     supersampling: int,
     seed: int,
-    gps: NDArray[np.float64] | None,
-    owner: int | None = None,
-) -> list[NDArray[np.uint8]]:
-    """Write every photo; returns the masks of `owner`, none when it is None."""
+    *,
+    gps: NDArray[np.float64] | None = None,
+    owner: int = 0,
+) -> tuple[list[Exposure], list[NDArray[np.uint8]]]:
+    """Write every photo; returns its exposure and the mask of `owner`."""
     textures.set_threads(threads())
-    open_sky = openness(world, 24, seed)
-    masks = []
+    open_sky, in_cam = openness(world, 24, seed), cameras.rays(supersampling)
+    exposures, masks = [], []
     for k, name in enumerate(cameras.names):
-        picture, owners = render(world, cameras, k, supersampling, open_sky)
+        rng = np.random.default_rng([seed, 20 + owner, k])
+        light, owners = render(world, cameras, k, in_cam, open_sky, body.haze)
+        exposures.append(draw_exposure(body, rng))
+        picture = expose(light, body, exposures[-1], cameras, rng)
         exif = _exif(cameras, k, None if gps is None else gps[k])
-        Image.fromarray(picture).save(folder / name, quality=95, subsampling=0, exif=exif)
-        if owner is not None:
-            masks.append(((owners == owner).mean(-1) >= 0.5).astype(np.uint8) * 255)
+        file = folder / name
+        Image.fromarray(picture).save(file, quality=body.quality, subsampling=body.subsampling, exif=exif)
+        masks.append(((owners == owner).mean(-1) >= 0.5).astype(np.uint8) * 255)
         if (k + 1) % 10 == 0 or k + 1 == len(cameras.names):
             print(f"{k + 1} of {len(cameras.names)} photos", flush=True)
-    return masks
+    return exposures, masks
+
+
+def _exposures_json(cameras: Cameras, exposures: list[Exposure]) -> dict[str, object]:
+    return {"exposures": {name: exposure.as_json() for name, exposure in zip(cameras.names, exposures)}}
 
 
 def render(
-    world: World, cameras: Cameras, photo: int, supersampling: int, open_sky: NDArray[np.float32]
-) -> tuple[NDArray[np.uint8], NDArray[np.int32]]:
-    """One photo: (H, W, 3) uint8 RGB, and the owner each sample hit, (H, W, samples), -1 for the sky."""
-    height, width, samples = cameras.height, cameras.width, supersampling**2
-    k = cameras.intrinsics
-    rays = np.empty((height * width * samples, 6), dtype=np.float32)
+    world: World,
+    cameras: Cameras,
+    photo: int,
+    in_cam: NDArray[np.float64],
+    open_sky: NDArray[np.float32],
+    haze: float,
+) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
+    """The light that reaches one photo: (H, W, 3) linear RGB, and the owner each sample hit, -1 for the sky.
+
+    Args:
+        world: what is photographed.
+        cameras: from where.
+        photo: which of them.
+        in_cam: (H * W * S, 2) the rays of `Cameras.rays`, S samples for each pixel.
+        open_sky: (V,) of `scenefuse.demo.world.openness`.
+        haze: share of white in the sky.
+
+    Returns:
+        (H, W, 3) light and (H, W, S) owners.
+    """
+    height, width = cameras.height, cameras.width
+    samples = len(in_cam) // (height * width)
+    rays = np.empty((len(in_cam), 6), dtype=np.float32)
     world_from_cam = np.ascontiguousarray(cameras.cam_from_world[photo].T)
-    textures.pixel_rays(
-        rays, cameras.centres[photo], world_from_cam, k[0, 0], k[1, 1], k[0, 2], k[1, 2], width, supersampling
-    )
+    textures.world_rays(rays, cameras.centres[photo], world_from_cam, in_cam)
     hits = world.scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=threads())
     distance, normals, uv = (hits[key].numpy() for key in ("t_hit", "primitive_normals", "primitive_uvs"))
     triangle = hits["primitive_ids"].numpy().view(np.int32)
@@ -274,13 +318,13 @@ def render(
     chosen = np.flatnonzero(facing)
     shaded = world.scene.test_occlusions(o3d.core.Tensor.from_numpy(to_sun[chosen]), nthreads=threads())
     lit[chosen] = ~shaded.numpy()
-    picture = np.empty((height, width, 3), dtype=np.uint8)
+    light = np.empty((height, width, 3))
     textures.shade(
-        picture, rays, distance, normals, triangle, uv, lit, world.materials, world.owners, world.triangles,
-        open_sky, world.frames, SUN, 1.0 / k[0, 0],
+        light, rays, distance, normals, triangle, uv, lit, world.materials, world.owners, world.triangles,
+        open_sky, world.frames, SUN, 1.0 / cameras.intrinsics[0, 0], haze,
     )  # fmt: skip
     owners = np.where(triangle >= 0, world.owners[np.maximum(triangle, 0)], -1)
-    return picture, owners.reshape(height, width, samples)
+    return light, owners.reshape(height, width, samples)
 
 
 def _sun_disc(samples: int) -> NDArray[np.float64]:

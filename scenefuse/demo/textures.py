@@ -276,20 +276,15 @@ def _albedo(material, x, y, z, u, v, fp):
 
 
 @njit(parallel=True, cache=True, fastmath=True)
-def pixel_rays(rays, centre, world_from_cam, fx, fy, cx, cy, width, side):
-    """Fill (H * W * side**2, 6) float32 rays, the samples of a pixel next to each other; unit directions."""
-    per_pixel = side * side
-    for row in prange(len(rays) // (width * per_pixel)):
-        for column in range(width):
-            for s in range(per_pixel):
-                x = (column + (s % side + 0.5) / side - cx) / fx
-                y = (row + (s // side + 0.5) / side - cy) / fy
-                norm = 1.0 / np.sqrt(x * x + y * y + 1.0)
-                n = (row * width + column) * per_pixel + s
-                for k in range(3):
-                    rays[n, k] = centre[k]
-                    d = world_from_cam[k, 0] * x + world_from_cam[k, 1] * y + world_from_cam[k, 2]
-                    rays[n, 3 + k] = d * norm
+def world_rays(rays, centre, world_from_cam, in_cam):
+    """Fill (N, 6) float32 rays of the world with unit directions, from their (N, 2) x and y at z = 1 in the camera."""
+    for n in prange(len(rays)):
+        x, y = in_cam[n, 0], in_cam[n, 1]
+        norm = 1.0 / np.sqrt(x * x + y * y + 1.0)
+        for k in range(3):
+            rays[n, k] = centre[k]
+            d = world_from_cam[k, 0] * x + world_from_cam[k, 1] * y + world_from_cam[k, 2]
+            rays[n, 3 + k] = d * norm
 
 
 @njit(parallel=True, cache=True, fastmath=True)
@@ -316,12 +311,13 @@ def sun_rays(out, facing, rays, distance, normals, triangle, suns):
 
 @njit(parallel=True, cache=True, fastmath=True)
 def shade(
-    image, rays, distance, normals, triangle, uv, lit, materials, owners, triangles, openness, frames, sun, pixel_angle
-):
-    """Fill an (H, W, 3) uint8 photo.
+    light, rays, distance, normals, triangle, uv, lit, materials, owners, triangles, openness, frames, sun,
+    pixel_angle, haze,
+):  # fmt: skip
+    """Fill (H, W, 3) with the linear light of a photo's pixels.
 
     Args:
-        image: output.
+        light: output, float64.
         rays: (H * W * S, 6), the S samples of a pixel next to each other.
         distance: (N,) metres to the hit.
         normals: (N, 3) of the triangle hit.
@@ -335,8 +331,9 @@ def shade(
         frames: (F, 5) x, y, z, cosine and sine of the yaw: object frames in the world.
         sun: (3,) direction to the sun.
         pixel_angle: radians a pixel covers.
+        haze: share of white in the sky, 0 .. 1.
     """
-    height, width = image.shape[:2]
+    height, width = light.shape[:2]
     samples = len(rays) // (height * width)
     for row in prange(height):
         for column in range(width):
@@ -346,9 +343,10 @@ def shade(
                 dz = rays[n, 5]
                 if triangle[n] < 0:
                     t = _step(-0.05, 0.6, dz)
-                    red += 0.72 - 0.48 * t
-                    green += 0.8 - 0.34 * t
-                    blue += 0.86 - 0.08 * t
+                    white = haze * (0.98 + 0.07 * _noise(2.5 * rays[n, 3], 2.5 * rays[n, 4], 2.5 * dz, 71))
+                    red += (1 - haze) * (0.72 - 0.48 * t) + white
+                    green += (1 - haze) * (0.8 - 0.34 * t) + white
+                    blue += (1 - haze) * (0.86 - 0.08 * t) + white
                     continue
                 d = distance[n]
                 px, py, pz = rays[n, 0] + d * rays[n, 3], rays[n, 1] + d * rays[n, 4], rays[n, 2] + d * dz
@@ -391,16 +389,20 @@ def shade(
                 green += max(c[1], 0.0) * (sky * 1.0 + direct * 0.99 + bounce * 1.05)
                 blue += max(c[2], 0.0) * (sky * 1.18 + direct * 0.88 + bounce * 0.8)
             scale = 1.4 / samples
-            image[row, column, 0] = _encode(red * scale)
-            image[row, column, 1] = _encode(green * scale)
-            image[row, column, 2] = _encode(blue * scale)
+            light[row, column, 0] = red * scale
+            light[row, column, 1] = green * scale
+            light[row, column, 2] = blue * scale
 
 
-@njit(cache=True, fastmath=True)
-def _encode(linear):
-    """Linear light to an 8-bit value: a soft shoulder, then gamma."""
-    value = linear * (1 + 0.12 * linear) / (1 + 0.55 * linear)
-    return min(255.0, 255.0 * value ** (1 / 2.2) + 0.5)
+@njit(parallel=True, cache=True, fastmath=True)
+def encode(picture, light):
+    """Fill (H, W, 3) uint8 from linear light that is not negative: a soft shoulder, then gamma."""
+    for row in prange(light.shape[0]):
+        for column in range(light.shape[1]):
+            for k in range(3):
+                linear = light[row, column, k]
+                value = linear * (1 + 0.12 * linear) / (1 + 0.55 * linear)
+                picture[row, column, k] = min(255.0, 255.0 * value ** (1 / 2.2) + 0.5)
 
 
 def set_threads(count: int) -> None:

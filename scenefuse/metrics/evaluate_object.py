@@ -4,10 +4,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from scenefuse.demo.cameras import Cameras, read_cameras
+from scenefuse.demo.cameras import read_cameras as read_true_cameras
 from scenefuse.io.clouds import read_cloud, sampled
 from scenefuse.io.pictures import read_gray
 from scenefuse.metrics.object_truth import (
@@ -20,7 +19,6 @@ from scenefuse.metrics.object_truth import (
 )
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import (
-    Posed,
     camera_results,
     distances,
     nearest,
@@ -29,8 +27,10 @@ from scenefuse.metrics.truth import (
     scores_at,
 )
 from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.sfm.undistort import undistort_picture
 from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import read_cameras, read_views
 
 
 @dataclass(frozen=True)
@@ -48,9 +48,13 @@ class EvaluationInputs:
     """What is compared, and the truth."""
 
     workspace: Path
-    """The object's undistorted COLMAP workspace."""
+    """COLMAP workspace whose poses are compared: the undistorted one, or with poses found without SfM."""
+    sparse: Path
+    """COLMAP model of its photos as they were taken."""
+    undistorted: Path
+    """COLMAP workspace of its undistorted photos, in which the masks were made."""
     masks: Path
-    """Folder of masks of its photos."""
+    """Folder of masks of the undistorted photos."""
     stages: list[Path]
     """Folders that hold depth_maps/, in order; empty for none."""
     cloud: Path
@@ -97,7 +101,7 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
     position = float(np.median(known.fit.position)) / known.diagonal
     result: dict[str, Any] = {
         "diagonal": quantity(known.diagonal, "m"),
-        **_mask_results(inputs.masks, known.posed, inputs.truth_object / "masks", known.orbit),
+        **_mask_results(inputs),
         **camera_results(known.fit, len(known.orbit.names)),
         "camera_position_over_diagonal": quantity(position, "1"),
         **depth_results(inputs.stages, known, settings.max_photos),
@@ -112,7 +116,7 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
     if inputs.alignment_json is not None:
         errors = errors_of(inputs.alignment_json)
         result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
-    flight = read_cameras(inputs.truth_scene / "cameras.json")
+    flight = read_true_cameras(inputs.truth_scene / "cameras.json")
     surface = surface_to_find(known, flight)
     for when, path in (("before", inputs.before), ("after", inputs.after)):
         if path is not None:
@@ -124,25 +128,23 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
     print_results(result)
 
 
-def _mask_results(masks: Path, posed: Posed, true_masks: Path, orbit: Cameras) -> dict[str, Any]:
-    """IoU of every mask; the true mask is brought into the undistorted photo by the two pinhole cameras."""
-    scores = {}
-    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-    for view, _ in posed:
-        path = masks / f"{Path(view.name).stem}.png"
-        true = read_gray(true_masks / path.name)
+def _mask_results(inputs: EvaluationInputs) -> dict[str, Any]:
+    """IoU of every mask; the true mask takes the way of its photo, through the model's own camera, into the mask's."""
+    scores, missing = {}, 0
+    taken = read_cameras(inputs.sparse)
+    for view in read_views(inputs.undistorted / "sparse"):
+        path = inputs.masks / f"{Path(view.name).stem}.png"
         if not path.is_file():
+            missing += 1
             continue
-        mask = read_gray(path)
-        warp = half @ view.intrinsics @ np.linalg.inv(half @ orbit.intrinsics)
-        warped = cv2.warpPerspective(true, warp, mask.shape[::-1], flags=cv2.INTER_LINEAR)
-        scores[view.name] = mask_iou(mask > 127, warped > 127)
+        true = undistort_picture(read_gray(inputs.truth_object / "masks" / path.name), taken[view.name], view)
+        scores[view.name] = mask_iou(read_gray(path) > 127, true > 127)
     ious = list(scores.values())
     return {
         "mask_iou_mean": quantity(float(np.mean(ious)) if ious else None, "1"),
         "mask_iou_min": quantity(min(ious, default=None), "1"),
         "mask_iou_worst": quantity(min(scores, key=lambda n: scores[n], default=None), ""),
-        "masks_missing": quantity(len(posed) - len(ious), "1"),
+        "masks_missing": quantity(missing, "1"),
     }
 
 

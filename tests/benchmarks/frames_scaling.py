@@ -173,7 +173,8 @@ def frames_scaling(
     photos, truth = work / f"photos_{name}_{most}", work / f"truth_{name}_{most}"
     if not truth.is_dir():
         orbit = replace(build(OrbitSettings, shipped["demo"]["orbit"]), views=most, supersampling=1)
-        render_object(name=name, photos=photos, truth=truth, settings=orbit, seed=seed)
+        # An ideal camera: the photos go into the workspace as they are.
+        render_object(name=name, photos=photos, truth=truth, settings=orbit, camera="ideal", seed=seed)
     rows: list[dict[str, Any]] = []
     for count in frames:
         folder = work / f"{name}_{count}_{os.getpid()}"

@@ -1,7 +1,9 @@
 """The demo's objects without any structure from motion: poses, stages 1 to 4 and the cloud from frames and masks.
 
+snakemake --configfile config/examples/ideal_camera.yaml --cores 2
 PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --out results/bench/no_sfm
 
+Without SfM nothing calibrates a lens, so the demo has to be the one of the ideal camera.
 Taken from a finished demo are the frames and, as a person's own, the masks. The focal length is the one in the photos'
 EXIF, as COLMAP reads it (without EXIF its guess, 1.2 times the longer side). Only the last step, which measures the
 trajectory and the cloud, reads the truth; it aligns by the cameras' centres alone.
@@ -15,6 +17,7 @@ import cv2
 import numpy as np
 import pycolmap
 
+from scenefuse.demo.cameras import read_cameras
 from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.io.clouds import read_cloud
@@ -23,7 +26,7 @@ from scenefuse.metrics.object_truth import cloud_results, read_object_truth
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.poses.find_poses import PoseSettings, find_poses
-from scenefuse.stage import quantity, run, value, write_json
+from scenefuse.stage import StageError, quantity, run, value, write_json
 
 
 def workspace(frames: Path, masks: Path, folder: Path) -> None:
@@ -105,6 +108,11 @@ def no_sfm(
     truth = results / "demo/demo/truth"
     for name in objects:
         source, folder = results / "objects" / name, out / name
+        if read_cameras(truth / name / "cameras.json").distortion.any():
+            raise StageError(
+                f"the photos of {name} in {results} are distorted, and without SfM nothing calibrates their camera;"
+                " render the demo with config/examples/ideal_camera.yaml"
+            )
         workspace(source / "frames", source / "masks", folder)
         reconstruct(folder, own, own["hold_out_every"], seed)
         known = read_object_truth(folder / "poses", truth / "scene", truth / name, samples, seed)

@@ -13,10 +13,12 @@ import pytest
 from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
+from scenefuse.io.pictures import read_gray
 from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
+from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, look_at, rotation_between
 
@@ -42,14 +44,8 @@ def ring(count: int, distance: float, height: float) -> Cameras:
 
 def model_of(cameras: Cameras, model_from_truth: Sim3, folder: Path) -> None:
     reconstruction = pycolmap.Reconstruction()
-    k = cameras.intrinsics
-    camera = pycolmap.Camera(
-        model="PINHOLE",
-        width=cameras.width,
-        height=cameras.height,
-        params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]],
-        camera_id=1,
-    )
+    lens = cameras.camera
+    camera = pycolmap.Camera(model="OPENCV", width=lens.width, height=lens.height, params=lens.params, camera_id=1)
     reconstruction.add_camera_with_trivial_rig(camera)
     for index, name in enumerate(cameras.names):
         rotation = cameras.cam_from_world[index] @ model_from_truth.rotation.T
@@ -156,27 +152,53 @@ def test_georeferencing_is_measured_with_nothing_fitted(planted: Path, tmp_path:
     assert value(read_json(tmp_path / "s.json"), "georeference_error_median") == pytest.approx(2.0, abs=1e-3)
 
 
-def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Path) -> None:
-    scene_of(planted, tmp_path / "s.json")
-    evaluate_object(
-        inputs=EvaluationInputs(
-            workspace=planted / "undistorted",
-            masks=planted / "masks",
-            stages=[planted / "stage1", planted / "stage2"],
-            cloud=planted / "object.ply",
-            variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
-            alignment_json=planted / "no_scale/fine.json",
-            before=planted / "before.ply",
-            after=planted / "after.ply",
-            scene_json=tmp_path / "s.json",
-            truth_scene=planted / "truth/scene",
-            truth_object=planted / "truth/thing",
-        ),
-        report=tmp_path / "o.json",
-        seed=0,
-        settings=ObjectEvaluationSettings(samples=20000, max_photos=5),
+def object_of(planted: Path, folder: Path, **other: Path) -> dict:
+    """The evaluation of the planted object, some of its inputs replaced."""
+    scene_of(planted, folder / "s.json")
+    inputs = EvaluationInputs(
+        workspace=planted / "undistorted",
+        sparse=planted / "undistorted/sparse",
+        undistorted=planted / "undistorted",
+        masks=planted / "masks",
+        stages=[planted / "stage1", planted / "stage2"],
+        cloud=planted / "object.ply",
+        variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
+        alignment_json=planted / "no_scale/fine.json",
+        before=planted / "before.ply",
+        after=planted / "after.ply",
+        scene_json=folder / "s.json",
+        truth_scene=planted / "truth/scene",
+        truth_object=planted / "truth/thing",
     )
-    result = read_json(tmp_path / "o.json")
+    settings = ObjectEvaluationSettings(samples=20000, max_photos=5)
+    evaluate_object(inputs=replace(inputs, **other), report=folder / "o.json", seed=0, settings=settings)
+    return read_json(folder / "o.json")
+
+
+def test_masks_of_distorted_photos_are_compared_where_undistortion_moves_them(planted: Path, tmp_path: Path) -> None:
+    orbit = replace(
+        ring(8, 5.0, 2.5),
+        intrinsics=pinhole(90.0, 96, 72, (0.06, -0.05)),
+        distortion=np.array([-0.15, 0.04, 0.01, -0.008]),
+    )
+    truth, mesh = tmp_path / "thing", tr.read_mesh(planted / "truth/thing/mesh.ply")
+    write_json(truth / "cameras.json", read_json(planted / "truth/thing/cameras.json") | cameras_json(orbit))
+    write_mesh(truth / "mesh.ply", mesh)
+    (truth / "masks").mkdir()
+    in_cam, unmoved = np.column_stack([orbit.rays(1), np.ones(96 * 72)]), []
+    for name, pose, centre in zip(orbit.names, orbit.cam_from_world, orbit.centres):
+        rays = np.column_stack([np.broadcast_to(centre, in_cam.shape), in_cam @ pose]).astype(np.float32)
+        hit = np.isfinite(mesh.caster().cast_rays(o3d.core.Tensor.from_numpy(rays))["t_hit"].numpy()).reshape(72, 96)
+        cv2.imwrite(str(truth / f"masks/{Path(name).stem}.png"), hit.astype(np.uint8) * 255)
+        unmoved.append(mask_iou(hit, read_gray(planted / f"masks/{Path(name).stem}.png") > 127))
+    model_of(orbit, TRUTH_FROM_OBJECT.inverse(), tmp_path / "sparse")
+    result = object_of(planted, tmp_path, truth_object=truth, sparse=tmp_path / "sparse")
+    assert max(unmoved) < 0.8 and value(result, "mask_iou_min") > 0.93
+    assert value(result, "cloud_recall_1pct") > 0.97
+
+
+def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Path) -> None:
+    result = object_of(planted, tmp_path)
     assert value(result, "mask_iou_min") == 1.0
     assert value(result, "stage1_depth_error") < 1e-5
     # 10 % of a depth of about 5 m, over a diagonal of 2.45 m.

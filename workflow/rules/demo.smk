@@ -27,14 +27,15 @@ rule render_scene:
         runtime=30,
     params:
         options=flags(config["demo"]["flight"]),
+        camera=config["demo"]["camera"],
         seed=config["seed"],
         script=script("demo/render_scene.py"),
         code=code("demo/render_scene.py"),
     message:
         "Demo {wildcards.scene}: rendering the flight"
     shell:
-        "exec python {params.script} --photos {output.photos} --truth {output.truth} --seed {params.seed}"
-        " {params.options} &> {log}"
+        "exec python {params.script} --photos {output.photos} --truth {output.truth} --camera {params.camera}"
+        " --seed {params.seed} {params.options} &> {log}"
 
 
 rule render_object:
@@ -56,6 +57,7 @@ rule render_object:
         runtime=30,
     params:
         options=flags(config["demo"]["orbit"]),
+        camera=config["demo"]["camera"],
         seed=config["seed"],
         script=script("demo/render_object.py"),
         code=code("demo/render_object.py"),
@@ -63,7 +65,7 @@ rule render_object:
         "Demo {wildcards.scene}: rendering the photos around the {wildcards.object}"
     shell:
         "exec python {params.script} --name {wildcards.object} --photos {output.photos} --truth {output.truth}"
-        " --seed {params.seed} {params.options} &> {log}"
+        " --camera {params.camera} --seed {params.seed} {params.options} &> {log}"
 
 
 rule click_fiducials:

@@ -126,6 +126,8 @@ rule evaluate_object:
     """Compare an object with its truth, where it is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
     input:
         workspace=POSED,
+        sparse="results/objects/{object}/sparse",
+        undistorted="results/objects/{object}/undistorted",
         masks="results/objects/{object}/masks",
         stages=expand(
             "results/objects/{object}/stage{stage}",
@@ -163,7 +165,7 @@ rule evaluate_object:
     message:
         "{wildcards.object}: comparing with the truth"
     shell:
-        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
-        " --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --before {input.before} --after {input.after}"
+        "exec python {params.script} --workspace {input.workspace} --sparse {input.sparse} --undistorted {input.undistorted}"
+        " --masks {input.masks} --stages {input.stages} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --before {input.before} --after {input.after}"
         " --scene-json {input.scene} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --report {output} --seed {params.seed} {params.options} &> {log}"
