@@ -3,6 +3,7 @@
 He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200 of the linear solver, zero tolerances.
 """
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -63,20 +64,16 @@ def map_photos(
         StageError: too small a share of the photos is registered.
     """
     names = [p.name for p in read_photos(photos)]
-    pycolmap.set_random_seed(seed)
-    with scratch_directory(sparse.with_name(f"{sparse.name}-models")) as work:
-        models = cancellable(
-            pycolmap.incremental_mapping, database, folder, work, options=_mapper_options(len(names), calibrated, seed)
-        )
-    ranked = sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+    ranked = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
     _check_registered(ranked, names, settings.min_registered_share)
-    model = ranked[0]
-    before_px = model.compute_mean_reprojection_error()
-    first = KNOWN if calibrated else HELD
-    adjust(model, first.freedom, ROUGH_TOLERANCE)
-    drop_outliers(model)
-    choice = choose_lens(model, (KNOWN,) if calibrated else DISTORTED)
-    model = choice.lens.fit(model, TOLERANCE)
+    before_px = ranked[0].compute_mean_reprojection_error()
+    adjust(ranked[0], (KNOWN if calibrated else HELD).freedom, ROUGH_TOLERANCE)
+    drop_outliers(ranked[0])
+    choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
+    model = choice.lens.fit(ranked[0], TOLERANCE)
+    if choice.lens not in (HELD, KNOWN):
+        ranked = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed)) or ranked
+        model = choice.lens.fit(ranked[0], TOLERANCE)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(choice, model)
     print(
@@ -103,6 +100,42 @@ def map_photos(
         "seed": quantity(seed, "1"),
     }
     write_json(report, content)
+
+
+def _models(
+    database: Path, folder: Path, sparse: Path, options: pycolmap.IncrementalPipelineOptions
+) -> list[pycolmap.Reconstruction]:
+    """The models of incremental mapping, that with most photos first."""
+    pycolmap.set_random_seed(options.random_seed)
+    with scratch_directory(sparse.with_name(f"{sparse.name}-models")) as work:
+        models = cancellable(pycolmap.incremental_mapping, database, folder, work, options=options)
+    return sorted(models.values(), key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
+
+
+def _mapped_again(
+    model: pycolmap.Reconstruction,
+    database: Path,
+    folder: Path,
+    sparse: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> list[pycolmap.Reconstruction]:
+    """The models of another mapping that begins with the calibration of this one; none where fewer photos come in.
+
+    A photo that the wrong lens put at a wrong place stays there in an adjustment; a new mapping puts it right.
+    """
+    with scratch_directory(sparse.with_name(f"{sparse.name}-calibrated")) as work:
+        calibrated = work / "database.db"
+        shutil.copyfile(database, calibrated)
+        with pycolmap.Database.open(calibrated) as opened:
+            for camera in model.cameras.values():
+                known = pycolmap.Camera(camera.todict())
+                known.has_prior_focal_length = True
+                opened.update_camera(known)
+        again = _models(calibrated, folder, sparse, options)
+    if not again or again[0].num_reg_images() < model.num_reg_images():
+        print("note: a second mapping with the calibrated lens registers fewer photos; the first is kept", flush=True)
+        return []
+    return again
 
 
 def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
