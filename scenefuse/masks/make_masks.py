@@ -180,6 +180,7 @@ def _report(made: ScoredMasks, target: Target, photos: int, kept: list[str], set
         "keep": quantity(settings.keep, ""),
         "masks": quantity(len(kept), "1"),
         "photos": quantity(photos, "1"),
+        "photos_left_out": quantity(sorted(made.dropped), ""),
         "median_agreement": quantity(float(np.median([made.scores[name] for name in kept])), "1"),
         "ground": quantity("measured" if target.ground_found else "not found; bottom of the box", ""),
         "hull_voxel": quantity(made.hull.voxel, "object units"),

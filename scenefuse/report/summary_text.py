@@ -9,6 +9,7 @@ import pandas as pd
 from scenefuse.fusion.missing import CLASSES
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
+from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.tables import (
     BESIDE,
     COMPLETION,
@@ -99,6 +100,10 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
     fields = item.variants[variants[0]]
     if find(fields, "fine.status"):
         lines += _line("reason", str(reason_of(item, variants[0]) or ""))
+    label = "to improve" if status_of(item, variants[0]) == "registered" else "likely why"
+    for sentence in diagnose(item):
+        lines += _line(label, sentence)
+        label = ""
     if row["registered"] is not None and row["registered"] == row["registered"]:
         lines += _line("cameras", _cameras(row, "frames"))
     lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))

@@ -14,6 +14,7 @@ from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import JPEG_QUALITY, check_unchanged, read_photos
 from scenefuse.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
+from scenefuse.transforms import Array
 from scenefuse.workspace import View, read_workspace
 
 # A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
@@ -111,7 +112,10 @@ def _report(folder: Path, known_cue: str | None) -> dict[str, Any]:
     cameras = sorted(
         {(v.width, v.height, round(float(np.mean(np.diag(v.intrinsics)[:2])), 3)) for v in workspace.views}
     )
+    gap_deg, between = largest_gap(poses, up)
     return {
+        "largest_gap_deg": quantity(gap_deg, "deg"),
+        "gap_between": quantity([workspace.views[index].name for index in between], ""),
         "up_in_camera_frame": quantity(up, "1"),
         "up_cue": quantity(cue, ""),
         "camera_roll_median_deg": quantity(roll_deg, "deg"),
@@ -121,3 +125,20 @@ def _report(folder: Path, known_cue: str | None) -> dict[str, Any]:
         "focal_px": quantity([camera[2] for camera in cameras], "px"),
         "files": quantity(manifest(folder), ""),
     }
+
+
+def largest_gap(poses: Array, up: Array) -> tuple[float, tuple[int, int]]:
+    """The widest horizontal angle, in degrees, from which none of (N, 4, 4) cameras looks, and the two beside it.
+
+    Seen from the point that their optical axes pass nearest to.
+    """
+    centres, axes = poses[:, :3, 3], poses[:, :3, 2]
+    across = np.eye(3) - axes[:, :, None] * axes[:, None]
+    middle = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=None)[0]
+    east, north = np.linalg.svd(up[None])[2][1:]
+    away = centres - middle
+    heading = np.degrees(np.arctan2(away @ north, away @ east))
+    order = np.argsort(heading)
+    gaps = np.diff(heading[order], append=heading[order[0]] + 360.0)
+    widest = int(np.argmax(gaps))
+    return float(gaps[widest]), (int(order[widest]), int(order[(widest + 1) % len(order)]))

@@ -1,0 +1,80 @@
+"""What probably went wrong with an object, in words: which photos, and what to photograph or click instead."""
+
+from collections.abc import Callable, Iterator
+
+from scenefuse.report.collected import Collected
+from scenefuse.report.values import Fields, find
+
+# Names quoted of a list of photos.
+QUOTED = 5
+# A wider angle without any photo leaves a side of the object unseen, degrees.
+WIDE_GAP_DEG = 100.0
+# Masks deserve a word where more than this share of the photos is left out, or where the others agree by less (IoU).
+MANY_LEFT_OUT, POOR_AGREEMENT = 0.1, 0.75
+
+
+def diagnose(item: Collected) -> list[str]:
+    """Sentences on an object's photos, masks and clicks, in the order of the stages; none where all is well."""
+    return [sentence for cause in CAUSES for sentence in cause(item.stages)]
+
+
+def named(photos: list[str]) -> str:
+    """Photos by their names, a few of many."""
+    more = len(photos) - QUOTED
+    return ", ".join(photos[:QUOTED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _split(fields: Fields) -> Iterator[str]:
+    """Photos that were not placed, alone or as models of their own."""
+    lost = set(find(fields, "sparse.not_registered") or [])
+    for model in find(fields, "sparse.models_left_out") or []:
+        apart = sorted(lost & set(model["photos"]))
+        if apart:
+            lost -= set(apart)
+            yield (
+                f"photos joined among themselves, but not with the others ({len(apart)}): {named(apart)}; photograph what"
+                " lies between both groups, neighbours sharing two thirds of what they show"
+            )
+    if lost:
+        yield (
+            f"photos that could not be placed ({len(lost)}): {named(sorted(lost))}; blur, too little texture, or too little"
+            " overlap with their neighbours: replace them, or photograph the steps between"
+        )
+
+
+def _one_side(fields: Fields) -> Iterator[str]:
+    """A side from which there is no photo."""
+    gap, between = find(fields, "undistorted.largest_gap_deg"), find(fields, "undistorted.gap_between")
+    if gap is not None and gap > WIDE_GAP_DEG:
+        yield (
+            f"no photo looks at it from within {gap:.0f} degrees, between {between[0]} and {between[1]}: what can only"
+            " be seen from there is missing; photograph it from there, if one can stand there"
+        )
+
+
+def _masks(fields: Fields) -> Iterator[str]:
+    """Masks that disagree with each other."""
+    left_out, photos = find(fields, "masks.photos_left_out") or [], find(fields, "masks.photos") or 0
+    if len(left_out) > MANY_LEFT_OUT * photos:
+        yield (
+            f"{len(left_out)} of {photos} masks disagree with the others and are left out ({named(left_out)}): look at"
+            " masks.png; click the object's ends, or what the masks take by mistake, in one of these photos"
+        )
+    agreement = find(fields, "masks.median_agreement")
+    if agreement is not None and agreement < POOR_AGREEMENT:
+        yield (
+            f"the masks that are left agree by {agreement:.2f} only (IoU with their common hull): they hold different"
+            " things in different photos, or the cameras are wrong; look at masks.png"
+        )
+
+
+def _unlinked(fields: Fields) -> Iterator[str]:
+    """Nothing that the photos of object and scene share."""
+    if find(fields, "alignment.found") is False:
+        yield (
+            f"its photos are not linked with the scene's ({find(fields, 'alignment.reason')}): add a few photos from"
+            " distances between those of the flight and of the close-ups, with the surroundings in view"
+        )
+
+
+CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _one_side, _masks, _unlinked)

@@ -1,0 +1,66 @@
+"""What the summary says of an object's photos, masks and clicks when something went wrong."""
+
+import numpy as np
+import pytest
+
+from scenefuse.report.collected import Collected
+from scenefuse.report.diagnosis import diagnose, named
+from scenefuse.sfm.undistort import largest_gap
+from scenefuse.transforms import look_at
+
+GOOD = {
+    "sparse.not_registered": [],
+    "sparse.models_left_out": [],
+    "undistorted.largest_gap_deg": 20.0,
+    "undistorted.gap_between": ["a.jpg", "b.jpg"],
+    "masks.photos": 40,
+    "masks.photos_left_out": ["a.jpg"],
+    "masks.median_agreement": 0.9,
+    "alignment.found": True,
+}
+
+
+def sentences(**changes):
+    fields = GOOD | {name.replace("__", "."): item for name, item in changes.items()}
+    stages = {name: {"value": item, "unit": ""} for name, item in fields.items()}
+    return diagnose(Collected("rock", stages, {}, {}, "", "", {}))
+
+
+def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
+    assert sentences() == []
+    assert diagnose(Collected("rock", {}, {}, {}, "", "", {})) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"sparse__not_registered": ["x.jpg", "y.jpg"]}, ["could not be placed (2): x.jpg, y.jpg"]),
+        (
+            {"sparse__not_registered": ["x.jpg", "y.jpg"], "sparse__models_left_out": [{"photos": ["y.jpg", "z.jpg"]}]},
+            ["not with the others (1): y.jpg", "placed (1): x.jpg"],
+        ),
+        ({"undistorted__largest_gap_deg": 190.0}, ["within 190 degrees, between a.jpg and b.jpg"]),
+        ({"masks__photos_left_out": [f"{k}.jpg" for k in range(9)]}, ["9 of 40 masks", "and 4 more"]),
+        ({"masks__median_agreement": 0.6}, ["agree by 0.60 only"]),
+        ({"alignment__found": False, "alignment__reason": "no match"}, ["not linked with the scene's (no match)"]),
+    ],
+)
+def test_each_cause_names_photos_and_says_what_to_do(changes, words):
+    said = sentences(**changes)
+    assert said and all(any(word in sentence for sentence in said) for word in words)
+
+
+def test_few_photos_are_all_named():
+    assert named(["a", "b"]) == "a, b"
+
+
+@pytest.mark.parametrize(("seen_deg", "gap_deg"), [(330, 60), (180, 195), (90, 285)])
+def test_the_widest_gap_is_where_nobody_stood(seen_deg, gap_deg):
+    angles = np.radians(np.arange(0, seen_deg, 15))
+    poses = np.tile(np.eye(4), (len(angles), 1, 1))
+    for pose, angle in zip(poses, angles):
+        eye = np.array([4 * np.cos(angle), 4 * np.sin(angle), 1.5]) + [7, 8, 0]
+        cam_from_world = look_at(eye, [7, 8, 0.5], [0, 0, 1])
+        pose[:3, :3], pose[:3, 3] = cam_from_world[:3, :3].T, eye
+    found, between = largest_gap(poses, np.array([0.0, 0.0, 1.0]))
+    assert abs(found - gap_deg) < 16 and set(between) == {0, len(angles) - 1}
