@@ -32,13 +32,13 @@ def _split(fields: Fields) -> Iterator[str]:
         if apart:
             lost -= set(apart)
             yield (
-                f"photos joined among themselves, but not with the others ({len(apart)}): {named(apart)}; photograph what"
-                " lies between both groups, neighbours sharing two thirds of what they show"
+                f"photos joined among themselves, but not with the others ({len(apart)}): {named(apart)}; photograph"
+                " what lies between both groups, neighbours sharing two thirds of what they show"
             )
     if lost:
         yield (
-            f"photos that could not be placed ({len(lost)}): {named(sorted(lost))}; blur, too little texture, or too little"
-            " overlap with their neighbours: replace them, or photograph the steps between"
+            f"photos that could not be placed ({len(lost)}): {named(sorted(lost))}; blur, too little texture, or too"
+            " little overlap with their neighbours: replace them, or photograph the steps between"
         )
 
 
