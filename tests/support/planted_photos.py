@@ -1,0 +1,259 @@
+"""Planted trials of shared photos: two captures of one place as sparse models, bent by mapping as real ones are."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from support.photographed_place import (
+    Capture,
+    Features,
+    Kind,
+    Rows,
+    captured,
+    features,
+    lens,
+    object_photos,
+    place,
+    scene_photos,
+)
+
+from scenefuse.registration.shared_features.landmarks import Landmarks, landmarks_of
+from scenefuse.sfm.mapping import MAX_REPROJECTION_ERROR_PX, MIN_TRIANGULATION_ANGLE_DEG, adjust
+from scenefuse.transforms import Array, Sim3, fit_sim3
+
+OUTLIERS = 0.05
+# Points that a truth is fitted to, and photos of a side, at least.
+LEAST_POINTS, LEAST_PHOTOS = 80, 8
+# Length of the noise in a descriptor, over the descriptor's.
+LOOK_NOISE = 0.45
+# Relative change of the cost at which the robust adjustment ends; mapping's own follows.
+ROBUST_TOLERANCE = 1e-4
+
+
+@dataclass(frozen=True)
+class Side:
+    """One capture as mapping leaves it, and what is true about it.
+
+    Attributes:
+        capture: true camera and photos.
+        model: the sparse model. Ids of its points are 1 + the row of the true feature; ids of its images are 1 + the
+            row of the photo.
+        looks: (P, 128) unit descriptors of the features on this side.
+        seed: of the noise in the descriptors of its photos.
+    """
+
+    capture: Capture
+    model: pycolmap.Reconstruction
+    looks: NDArray[np.float32]
+    seed: int
+
+    def landmarks(self) -> Landmarks:
+        """What the alignment reads from a model and its database."""
+        return landmarks_of(self.model, self._descriptors)
+
+    def _descriptors(self, image: pycolmap.Image) -> NDArray[np.float32]:
+        look = self.looks[self.capture.shown[image.image_id - 1]]
+        noise = np.random.default_rng([self.seed, image.image_id]).normal(0, LOOK_NOISE / np.sqrt(128), look.shape)
+        return look + noise.astype(np.float32)
+
+    def points(self) -> tuple[Rows, Array]:
+        """Rows (N,) of the true features in the model, and where the model has them (N, 3)."""
+        ids = np.array(sorted(self.model.points3D), dtype=np.int64)
+        return ids - 1, np.array([self.model.points3D[i].xyz for i in ids]).reshape(-1, 3)
+
+    def world_from_model(self) -> Sim3:
+        """By all camera centres, as an evaluation with true cameras has it."""
+        images = sorted(self.model.images)
+        centres = np.array([self.model.images[i].projection_center() for i in images])
+        return fit_sim3(centres, np.array([self.capture.photos[i - 1].centre for i in images]))
+
+    def move(self, transform: Sim3) -> None:
+        """Give the model another frame."""
+        self.model.transform(pycolmap.Sim3d(transform.matrix[:3]))
+
+
+@dataclass(frozen=True)
+class PhotoTrial:
+    """The object's and the scene's side, before mapping's last adjustment, and what is true.
+
+    Attributes:
+        obj, scene: the two sides; both models in the world's frame and unit.
+        features: true points.
+        diagonal: of the object, in the world.
+        alike: features that both sides show twice or more and that look the same on both.
+    """
+
+    obj: Side
+    scene: Side
+    features: Features
+    diagonal: float
+    alike: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a trial is to be like.
+
+    Attributes:
+        kind: how the scene was photographed.
+        scene_photos, object_photos: how many photos are planned; fewer where something stands before them.
+        alike: features that look the same on both sides, at most.
+        strange: features of the object that look like another of the scene, as a share of those alike.
+        twin: whether a second copy of the object stands elsewhere.
+        bend: 1: true cameras as different from what mapping assumes as real ones are; 0: not different.
+        noise_px: of the observations of the object's and of the scene's photos.
+        points: features made for the object's and for the scene's photos.
+    """
+
+    kind: Kind = "orbit"
+    scene_photos: int = 30
+    object_photos: int = 20
+    alike: int = 200
+    strange: float = 0.2
+    twin: bool = False
+    bend: float = 1.0
+    noise_px: tuple[float, float] = (0.5, 0.5)
+    points: tuple[int, int] = (3600, 4500)
+
+
+def plant_photos(seed: int, plan: Plan) -> PhotoTrial:
+    """Make one trial; places where too little shows the object, of rods for instance, are drawn again."""
+    rng = np.random.default_rng(seed)
+    diagonal, found, captures = _photographed(rng, plan)
+    while not _tells(captures, found, diagonal):
+        diagonal, found, captures = _photographed(rng, plan)
+    looks = _unit(rng, int(found.look.max()) + 1)[found.look]
+    looks_of_object, alike = _changed(rng, looks, captures, plan)
+    sides = [
+        Side(capture, _first_model(rng, capture, found, noise, plan.bend), look, int(rng.integers(2**31)))
+        for capture, noise, look in zip(captures, plan.noise_px, (looks_of_object, looks))
+    ]
+    return PhotoTrial(*sides, found, diagonal, alike)
+
+
+def _photographed(rng: np.random.Generator, plan: Plan) -> tuple[float, Features, list[Capture]]:
+    """A place: the diagonal of its object, its features, and the object's and the scene's captures of them."""
+    where = place(rng, plan.kind, plan.twin)
+    cameras = [lens(rng, *size, plan.bend) for size in ((1600, 1200), (2000, 1500))]
+    photos = [
+        object_photos(rng, where, plan.kind, plan.object_photos),
+        scene_photos(rng, where, plan.kind, plan.scene_photos, cameras[1]),
+    ]
+    found = features(rng, where, list(zip(cameras, photos, plan.points)))
+    return where.diagonal, found, [captured(rng, where, found, c, p) for c, p in zip(cameras, photos)]
+
+
+def _tells(captures: list[Capture], found: Features, diagonal: float) -> bool:
+    """Whether enough photos show enough for a truth: the object's of the object, the scene's of it and around it."""
+    near = np.linalg.norm(found.x, axis=1) < diagonal
+    counts = [
+        (capture.seen_twice(len(found.x)) & shown).sum()
+        for capture, shown in zip(captures, (found.owner == "object", near))
+    ]
+    return min(counts) >= LEAST_POINTS and min(len(capture.photos) for capture in captures) >= LEAST_PHOTOS
+
+
+def _unit(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
+    looks = rng.normal(0, 1, (count, 128)).astype(np.float32)
+    return looks / np.linalg.norm(looks, axis=1, keepdims=True)
+
+
+def _changed(
+    rng: np.random.Generator, looks: NDArray[np.float32], captures: list[Capture], plan: Plan
+) -> tuple[NDArray[np.float32], int]:
+    """The looks on the object's side: of the features that both show, only some are as on the scene's, some wrong."""
+    obj, scene = (capture.seen_twice(len(looks)) for capture in captures)
+    both = rng.permutation(np.flatnonzero(obj & scene))
+    alike = both[: plan.alike]
+    changed = _unit(rng, len(looks))
+    rest = np.ones(len(looks), bool)
+    rest[alike] = False
+    friends = rng.permutation(np.flatnonzero(rest & obj))[: round(plan.strange * len(alike))]
+    result = np.where((obj & scene & rest)[:, None], changed, looks)
+    result[friends] = looks[rng.choice(np.flatnonzero(scene), len(friends))]
+    return result, len(alike)
+
+
+def _first_model(
+    rng: np.random.Generator, capture: Capture, found: Features, noise_px: float, bend: float
+) -> pycolmap.Reconstruction:
+    """The truth with errors of some percent, as SIMPLE_RADIAL with its principal point in the middle."""
+    true = capture.camera
+    focal = true.mean_focal_length() * (1 + 0.02 * bend * rng.normal())
+    middle = [true.width / 2, true.height / 2]
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=true.width, height=true.height, params=[focal, *middle, 0.0], camera_id=1
+    )
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(camera)
+    tracks: dict[int, list[pycolmap.TrackElement]] = {}
+    for k, (photo, rows, pixels) in enumerate(zip(capture.photos, capture.shown, capture.pixels), 1):
+        observed = pixels + rng.normal(0, noise_px, pixels.shape)
+        wrong = rng.random(len(rows)) < OUTLIERS
+        observed[wrong] += rng.uniform(-40, 40, (wrong.sum(), 2))
+        turn = Rotation.from_rotvec(np.radians(rng.normal(0, 0.3, 3))).as_matrix() @ photo.rotation
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), -turn @ photo.centre)
+        points = [pycolmap.Point2D(p) for p in observed]
+        image = pycolmap.Image(name=f"{k}.jpg", camera_id=1, image_id=k, points2D=points)
+        model.add_image_with_trivial_frame(image, pose)
+        for j, row in enumerate(rows):
+            tracks.setdefault(int(row), []).append(pycolmap.TrackElement(k, j))
+    for row, track in sorted(tracks.items()):
+        if len(track) >= 2:
+            about = found.x[row] + 5 * found.size[row] * rng.normal(0, 1, 3)
+            model.add_point3D_with_id(row + 1, pycolmap.Point3D(xyz=about, track=pycolmap.Track(track)))
+    return model
+
+
+def mapped(side: Side) -> None:
+    """Adjust a side's model in place: robustly, so that wrong observations go, then as mapping does at its end."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.ceres.solver_options.function_tolerance = ROBUST_TOLERANCE
+    options.ceres.solver_options.num_threads = 1
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.print_summary = False
+    pycolmap.bundle_adjustment(side.model, options)
+    observations = pycolmap.ObservationManager(side.model)
+    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG)
+    adjust(side.model)
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What is true of a pair of models.
+
+    Attributes:
+        scene_from_object: from the object's points to where they truly are, in the frame that the scene's cameras fix.
+        here: the same, moved to where the scene's model has its own points on and around the object.
+        centre: (3,) of the object's points, in the object's model.
+    """
+
+    scene_from_object: Sim3
+    here: Sim3
+    centre: Array
+
+
+def truth(trial: PhotoTrial) -> Truth:
+    """The true similarity between two mapped models in any frames."""
+    x = trial.features.x
+    rows, points_of_object = trial.obj.points()
+    mine = trial.features.owner[rows] == "object"
+    world_from_object = _fitted(points_of_object[mine], x[rows[mine]])
+    scene_from_world = trial.scene.world_from_model().inverse()
+    rows, points = trial.scene.points()
+    near = np.linalg.norm(x[rows], axis=1) < trial.diagonal
+    here = _fitted(x[rows[near]], points[near])
+    centre = np.median(points_of_object[mine], axis=0)
+    return Truth(scene_from_world @ world_from_object, here @ world_from_object, centre)
+
+
+def _fitted(a: Array, b: Array) -> Sim3:
+    """The similarity b_from_a without pairs that are off by more than three medians."""
+    keep = np.ones(len(a), bool)
+    for _ in range(5):
+        pose = fit_sim3(a[keep], b[keep])
+        error = np.linalg.norm(pose.apply(a) - b, axis=1)
+        keep = error <= 3 * np.median(error)
+    return pose
