@@ -26,6 +26,7 @@ from scenefuse.transforms import Array, Sim3, fit_sim3
 OUTLIERS = 0.05
 # Points that a truth is fitted to, and photos of a side, at least.
 LEAST_POINTS, LEAST_PHOTOS = 80, 8
+MOST_DRAWS = 50
 # Length of the noise in a descriptor, over the descriptor's.
 LOOK_NOISE = 0.45
 # Relative change of the cost at which the robust adjustment ends; mapping's own follows.
@@ -58,10 +59,12 @@ class Side:
         noise = np.random.default_rng([self.seed, image.image_id]).normal(0, LOOK_NOISE / np.sqrt(128), look.shape)
         return look + noise.astype(np.float32)
 
-    def points(self) -> tuple[Rows, Array]:
-        """Rows (N,) of the true features in the model, and where the model has them (N, 3)."""
+    def points(self) -> tuple[Rows, Array, Rows]:
+        """Rows (N,) of the true features in the model, where the model has them (N, 3), and in how many photos."""
         ids = np.array(sorted(self.model.points3D), dtype=np.int64)
-        return ids - 1, np.array([self.model.points3D[i].xyz for i in ids]).reshape(-1, 3)
+        points = [self.model.points3D[i] for i in ids]
+        x = np.array([p.xyz for p in points]).reshape(-1, 3)
+        return ids - 1, x, np.array([p.track.length() for p in points], dtype=np.int64)
 
     def world_from_model(self) -> Sim3:
         """By all camera centres, as an evaluation with true cameras has it."""
@@ -119,16 +122,22 @@ class Plan:
 
 
 def plant_photos(seed: int, plan: Plan) -> PhotoTrial:
-    """Make one trial; places where too little shows the object, of rods for instance, are drawn again."""
+    """Make one trial; where photos show too little of the object, of rods for instance, the place is drawn again.
+
+    Raises:
+        ValueError: fifty places show too little.
+    """
     rng = np.random.default_rng(seed)
-    diagonal, found, captures = _photographed(rng, plan)
-    while not _tells(captures, found, diagonal):
-        diagonal, found, captures = _photographed(rng, plan)
-    looks = _unit(rng, int(found.look.max()) + 1)[found.look]
-    looks_of_object, alike = _changed(rng, looks, captures, plan)
+    drawn = (_photographed(rng, plan) for _ in range(MOST_DRAWS))
+    kept = next((one for one in drawn if _tells(*one)), None)
+    if kept is None:
+        raise ValueError(f"none of {MOST_DRAWS} places shows the object in enough photos and points; plan more of them")
+    diagonal, found, captures = kept
+    looks = _unit(rng, int(found.look.max()) + 1)
+    looks_of_object, alike = _changed(rng, found.look, looks, captures, plan)
     sides = [
         Side(capture, _first_model(rng, capture, found, noise, plan.bend), look, int(rng.integers(2**31)))
-        for capture, noise, look in zip(captures, plan.noise_px, (looks_of_object, looks))
+        for capture, noise, look in zip(captures, plan.noise_px, (looks_of_object, looks[found.look]))
     ]
     return PhotoTrial(*sides, found, diagonal, alike)
 
@@ -145,7 +154,7 @@ def _photographed(rng: np.random.Generator, plan: Plan) -> tuple[float, Features
     return where.diagonal, found, [captured(rng, where, found, c, p) for c, p in zip(cameras, photos)]
 
 
-def _tells(captures: list[Capture], found: Features, diagonal: float) -> bool:
+def _tells(diagonal: float, found: Features, captures: list[Capture]) -> bool:
     """Whether enough photos show enough for a truth: the object's of the object, the scene's of it and around it."""
     near = np.linalg.norm(found.x, axis=1) < diagonal
     counts = [
@@ -161,18 +170,24 @@ def _unit(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
 
 
 def _changed(
-    rng: np.random.Generator, looks: NDArray[np.float32], captures: list[Capture], plan: Plan
+    rng: np.random.Generator, look: Rows, looks: NDArray[np.float32], captures: list[Capture], plan: Plan
 ) -> tuple[NDArray[np.float32], int]:
-    """The looks on the object's side: of the features that both show, only some are as on the scene's, some wrong."""
-    obj, scene = (capture.seen_twice(len(looks)) for capture in captures)
+    """The descriptors (P, 128) on the object's side: as on the scene's for some features, changed or wrong for others.
+
+    Of what both sides show as many features stay as the plan says, and the same share of those whose look the scene
+    shows elsewhere, on the twin or in another window.
+    """
+    obj, scene = (capture.seen_twice(len(look)) for capture in captures)
     both = rng.permutation(np.flatnonzero(obj & scene))
     alike = both[: plan.alike]
-    changed = _unit(rng, len(looks))
-    rest = np.ones(len(looks), bool)
-    rest[alike] = False
-    friends = rng.permutation(np.flatnonzero(rest & obj))[: round(plan.strange * len(alike))]
-    result = np.where((obj & scene & rest)[:, None], changed, looks)
-    result[friends] = looks[rng.choice(np.flatnonzero(scene), len(friends))]
+    elsewhere = obj & ~scene & np.isin(look, look[scene])
+    stay = ~(obj & scene) & ~(elsewhere & (rng.random(len(look)) >= len(alike) / max(len(both), 1)))
+    stay[alike] = True
+    result = np.where(stay[:, None], looks[look], _unit(rng, len(look)))
+    others = obj.copy()
+    others[alike] = False
+    friends = rng.permutation(np.flatnonzero(others))[: round(plan.strange * len(alike))]
+    result[friends] = looks[look[rng.choice(np.flatnonzero(scene), len(friends))]]
     return result, len(alike)
 
 
@@ -238,22 +253,24 @@ class Truth:
 def truth(trial: PhotoTrial) -> Truth:
     """The true similarity between two mapped models in any frames."""
     x = trial.features.x
-    rows, points_of_object = trial.obj.points()
+    rows, points, photos = trial.obj.points()
     mine = trial.features.owner[rows] == "object"
-    world_from_object = _fitted(points_of_object[mine], x[rows[mine]])
-    scene_from_world = trial.scene.world_from_model().inverse()
-    rows, points = trial.scene.points()
+    world_from_object = _fitted(points[mine], x[rows[mine]], photos[mine])
+    centre = np.median(points[mine], axis=0)
+    rows, points, photos = trial.scene.points()
     near = np.linalg.norm(x[rows], axis=1) < trial.diagonal
-    here = _fitted(x[rows[near]], points[near])
-    centre = np.median(points_of_object[mine], axis=0)
-    return Truth(scene_from_world @ world_from_object, here @ world_from_object, centre)
+    here = _fitted(x[rows[near]], points[near], photos[near])
+    return Truth(trial.scene.world_from_model().inverse() @ world_from_object, here @ world_from_object, centre)
 
 
-def _fitted(a: Array, b: Array) -> Sim3:
-    """The similarity b_from_a without pairs that are off by more than three medians."""
-    keep = np.ones(len(a), bool)
+def _fitted(a: Array, b: Array, photos: Rows) -> Sim3:
+    """The similarity b_from_a, without pairs that are off by more than three medians; the more photos, the more weight.
+
+    A point in two photos has a weight of 1, because they leave it one observation more than it has coordinates.
+    """
+    keep, weights = np.ones(len(a), bool), (photos - 1).astype(np.float64)
     for _ in range(5):
-        pose = fit_sim3(a[keep], b[keep])
+        pose = fit_sim3(a[keep], b[keep], weights[keep])
         error = np.linalg.norm(pose.apply(a) - b, axis=1)
         keep = error <= 3 * np.median(error)
     return pose
