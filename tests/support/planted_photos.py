@@ -243,11 +243,14 @@ class Truth:
         scene_from_object: from the object's points to where they truly are, in the frame that the scene's cameras fix.
         here: the same, moved to where the scene's model has its own points on and around the object.
         centre: (3,) of the object's points, in the object's model.
+        misfit: median distance that `here` leaves between the scene's points there and the truth, over the object's
+            diagonal; where it is large the scene's model is torn or doubled there, and no similarity is right.
     """
 
     scene_from_object: Sim3
     here: Sim3
     centre: Array
+    misfit: float
 
 
 def truth(trial: PhotoTrial) -> Truth:
@@ -260,7 +263,9 @@ def truth(trial: PhotoTrial) -> Truth:
     rows, points, photos = trial.scene.points()
     near = np.linalg.norm(x[rows], axis=1) < trial.diagonal
     here = _fitted(x[rows[near]], points[near], photos[near])
-    return Truth(trial.scene.world_from_model().inverse() @ world_from_object, here @ world_from_object, centre)
+    misfit = np.median(np.linalg.norm(here.inverse().apply(points[near]) - x[rows[near]], axis=1)) / trial.diagonal
+    scene_from_object = trial.scene.world_from_model().inverse() @ world_from_object
+    return Truth(scene_from_object, here @ world_from_object, centre, float(misfit))
 
 
 def _fitted(a: Array, b: Array, photos: Rows) -> Sim3:
