@@ -27,10 +27,12 @@ report: .venv/ready
 
 bench: bench-registration bench-nerf
 
-# Planted registrations, beside the paper's recipe, FGR and KISS-Matcher; about half an hour on two cores.
+# Planted registrations: by clouds, beside the paper's recipe, FGR and KISS-Matcher; about half an hour on two cores. Then by features
+# that photos share; some minutes.
 bench-registration: .venv/ready
 	pip install --quiet --disable-pip-version-check -r tests/benchmarks/requirements.txt
 	PYTHONPATH=tests OMP_NUM_THREADS=1 python tests/benchmarks/registration.py --jobs $(CORES)
+	PYTHONPATH=tests OMP_NUM_THREADS=1 python tests/benchmarks/shared_photos.py --jobs $(CORES)
 
 # Hash encoding, marching, matching and training steps, beside plain PyTorch and nerfstudio's encoding; a minute. Only that one module of
 # nerfstudio is used, so what else it depends on is not installed.

@@ -133,7 +133,7 @@ def align_landmarks(obj: Landmarks, scene: Landmarks, settings: AlignmentSetting
     print(f"{len(obj.points)} points of the object, {len(scene.points)} of the scene, {len(pairs)} matches", flush=True)
     seen = observations(obj, scene, pairs)
     consensus = find_consensus(seen, seed)
-    if consensus is None:
+    if consensus is None or not consensus.inliers.any():
         return _report(None, len(pairs))
     centre = np.median(obj.points, axis=0)
     inliers = seen.subset(consensus.inliers)

@@ -2,10 +2,11 @@
 
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -85,7 +86,28 @@ def read_landmarks(
     Raises:
         StageError: the database does not belong to the model.
     """
-    reconstruction = read_model(model)
+    with _untouched(database) as copy, pycolmap.Database.open(copy) as opened:
+
+        def descriptors(image: pycolmap.Image) -> NDArray[np.uint8]:
+            known = opened.exists_image(image.image_id)
+            found = opened.read_descriptors(image.image_id).data if known else np.zeros((0, 128), np.uint8)
+            if len(found) != len(image.points2D):
+                raise StageError(
+                    f"{database} holds {len(found)} features of photo {image.name}, but {model} was made from"
+                    f" {len(image.points2D)}; rerun the matching and mapping of these photos"
+                )
+            return found
+
+        return landmarks_of(read_model(model), descriptors, most_points, descriptors_per_point)
+
+
+def landmarks_of(
+    reconstruction: pycolmap.Reconstruction,
+    descriptors_of: Callable[[pycolmap.Image], NDArray[Any]],
+    most_points: int = MOST_POINTS,
+    descriptors_per_point: int = DESCRIPTORS_PER_POINT,
+) -> Landmarks:
+    """The landmarks of a sparse model; `descriptors_of` a photo are (N, 128), one for each of its features."""
     images = {image.image_id: image for image in sorted(posed_images(reconstruction), key=lambda i: i.image_id)}
     view_of = {image_id: k for k, image_id in enumerate(images)}
     ids = sorted(reconstruction.points3D, key=lambda p: (-reconstruction.points3D[p].track.length(), p))[:most_points]
@@ -99,20 +121,12 @@ def read_landmarks(
     chosen = _spread_evenly(start, descriptors_per_point)
     rays = np.zeros((len(elements), 2))
     descriptors = np.zeros((len(ids) * descriptors_per_point, 128), dtype=np.float32)
-    with _untouched(database) as copy, pycolmap.Database.open(copy) as opened:
-        for image_id, image in images.items():
-            found = opened.read_descriptors(image_id).data if opened.exists_image(image_id) else np.zeros((0, 128))
-            if len(found) != len(image.points2D):
-                raise StageError(
-                    f"{database} holds {len(found)} features of photo {image.name}, but {model} was made from"
-                    f" {len(image.points2D)}; rerun the matching and mapping of these photos"
-                )
-            rows = np.flatnonzero(elements[:, 0] == image_id)
-            xy = np.array([image.points2D[k].xy for k in elements[rows, 1]]).reshape(-1, 2)
-            camera = reconstruction.cameras[image.camera_id]
-            rays[rows] = np.asarray(camera.cam_from_img(xy)).reshape(-1, 2)
-            taken = np.flatnonzero(elements[chosen, 0] == image_id)
-            descriptors[taken] = found[elements[chosen[taken], 1]]
+    for image_id, image in images.items():
+        rows = np.flatnonzero(elements[:, 0] == image_id)
+        xy = np.array([image.points2D[k].xy for k in elements[rows, 1]]).reshape(-1, 2)
+        rays[rows] = np.asarray(reconstruction.cameras[image.camera_id].cam_from_img(xy)).reshape(-1, 2)
+        taken = np.flatnonzero(elements[chosen, 0] == image_id)
+        descriptors[taken] = descriptors_of(image)[elements[chosen[taken], 1]]
     descriptors /= np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1e-9)
     return Landmarks(
         [image.name for image in images.values()],
