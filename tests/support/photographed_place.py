@@ -169,8 +169,9 @@ def scene_photos(
         i, j = np.divmod(np.arange(count), across)
         middle = rng.uniform(-0.3, 0.3, 2) * across
         eyes = np.stack([step * (i - across / 2 + middle[0]), step * (j - across / 2 + middle[1]), far + 0 * i], 1)
-        tilt = np.tan(np.radians(rng.uniform(20, 45)))
-        ahead = np.where(i % 2, 1, -1)[:, None] * [0, tilt * far, 0]
+        # Lines look ahead, down, back, down, ...: lines that only look ahead and back share too few features.
+        tilt = np.tan(np.radians(rng.uniform(15, 30)))
+        ahead = np.array([1, 0, -1, 0])[i % 4][:, None] * [0, tilt * far, 0]
         targets = eyes * [1, 1, 0] + ahead
     elif kind == "orbit":
         angle = 2 * np.pi * np.arange(count) / count * (1 + (rng.random() < 0.5))

@@ -136,11 +136,11 @@ def plant_photos(seed: int, plan: Plan) -> PhotoTrial:
     diagonal, found, captures = kept
     looks = _unit(rng, int(found.look.max()) + 1)
     looks_of_object, alike = _changed(rng, found.look, looks, captures, plan)
-    sides = [
+    obj, scene = (
         Side(capture, _first_model(rng, capture, found, noise, plan.bend), look, int(rng.integers(2**31)))
         for capture, noise, look in zip(captures, plan.noise_px, (looks_of_object, looks[found.look]))
-    ]
-    return PhotoTrial(*sides, found, diagonal, alike)
+    )
+    return PhotoTrial(obj, scene, found, diagonal, alike)
 
 
 def _photographed(rng: np.random.Generator, plan: Plan) -> tuple[float, Features, list[Capture]]:
