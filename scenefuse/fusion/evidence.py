@@ -17,7 +17,7 @@ from scenefuse.transforms import Array, Sim3
 
 UNCHECKED, MEASURED, NERF_ONLY, STEREO_ONLY = 0, 1, 2, 3
 """Values of the field `evidence`."""
-FIELDS = ("photos", "match", "deviation", "evidence")
+FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
 """What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
 KEPT, SEEN_THROUGH, ENCLOSED, REPLACED = 0, 1, 2, 3
 """What becomes of a point of the scene, field `reason` of those taken away."""
@@ -157,13 +157,32 @@ def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
 
 def with_evidence(cloud: Cloud, matches: Matches, measured: NDArray[np.bool_], otherwise: int) -> Cloud:
     """The cloud with only these fields: what photos know of its points, and `evidence`: MEASURED or `otherwise`."""
+    deviation = np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32)
     fields: dict[str, NDArray[Any]] = {
         "photos": matches.photos.astype(np.uint16),
         "match": np.where(matches.tested > 0, matches.match, np.nan).astype(np.float32),
-        "deviation": np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32),
+        "deviation": deviation,
+        "world_deviation": deviation.copy(),
         "evidence": np.where(measured, MEASURED, otherwise).astype(np.uint8),
     }
     return replace(cloud, fields=fields)
+
+
+def with_pose_uncertainty(cloud: Cloud, covariance: Array, centre: Array) -> Cloud:
+    """Points of an object, `world_deviation` with what its pose adds along their normals (method M10).
+
+    Args:
+        cloud: in the scene, with normals and fields of evidence.
+        covariance: (7, 7) of the pose about `centre`: rotation vector (radians), shift, log scale.
+        centre: (3,) in the scene.
+    """
+    if cloud.normals is None:
+        return cloud
+    lever, normals = cloud.points - centre, cloud.normals.astype(np.float64)
+    along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
+    of_pose = np.einsum("ni,ij,nj->n", along, covariance, along)
+    whole = np.sqrt(cloud.fields["deviation"].astype(np.float64) ** 2 + np.maximum(of_pose, 0))
+    return replace(cloud, fields=cloud.fields | {"world_deviation": whole.astype(np.float32)})
 
 
 def unchecked(cloud: Cloud) -> Cloud:

@@ -22,6 +22,7 @@ from scenefuse.fusion.evidence import (
     around,
     unchecked,
     weigh,
+    with_pose_uncertainty,
 )
 from scenefuse.fusion.modes import (
     FEATHER_SPACINGS,
@@ -126,8 +127,9 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     Args:
         inputs: see FusionInputs.
         outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
-            point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit), `evidence`
-            (0 not checked, 1 measured, 2 NeRF only, 3 stereo only).
+            point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit),
+            `world_deviation` (the same; of the object's points with the uncertainty of its pose), `evidence` (0 not
+            checked, 1 measured, 2 NeRF only, 3 stereo only).
         settings: see FusionSettings.
     """
     start = time.perf_counter()
@@ -146,6 +148,10 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
                 photos_of(inputs.scene_workspace, placed.points),
             )
             fused = fuse_by_evidence(placed, scene, *photos, settings)
+            covariance = value(registration, "covariance") if "covariance" in registration else None
+            if covariance is not None:
+                added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
+                fused = replace(fused, added=added)
         else:
             fused = fuse_by_distance(obj, scene, part, pose, settings)
     _write(fused, read_json(inputs.crop_json), inputs, outputs)

@@ -17,6 +17,7 @@ from scenefuse.fusion.evidence import (
     STEREO_ONLY,
     Side,
     weigh,
+    with_pose_uncertainty,
 )
 from scenefuse.fusion.fuse_object import evidence_report, fuse_by_evidence
 from scenefuse.fusion.modes import FusionSettings
@@ -143,6 +144,15 @@ def test_one_wrong_camera_changes_little(near, far):
     good = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
     assert good.added.mean() > 0.97 and found.added.mean() > 0.9
     assert np.abs(found.obj.points[found.added][:, 2]).max() < 0.01
+
+
+def test_the_pose_adds_along_the_normal_what_it_may_be_off():
+    cloud = Cloud(np.array([[2.0, 0, 0], [0, 0, 1]]), np.array([[0, 0, 1], [0, 0, 1]], np.float32))
+    cloud = replace(cloud, fields={"deviation": np.array([0.3, 0.3], np.float32)})
+    turn_y, shift_z, scale = (np.diag(sd) for sd in np.eye(7)[[1, 5, 6]] * [[0.2], [0.4], [0.5]])
+    for deviation, expected in ((turn_y, [0.5, 0.3]), (shift_z, [0.5, 0.5]), (scale, [0.3, np.hypot(0.3, 0.5)])):
+        found = with_pose_uncertainty(cloud, deviation**2, np.zeros(3)).fields["world_deviation"]
+        np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
 def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_and_is_said(near, far):
