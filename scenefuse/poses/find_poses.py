@@ -16,6 +16,8 @@ from scenefuse.poses.bundle_adjustment import AdjustedBundle, adjust_bundle, lin
 from scenefuse.poses.correspondences import PhotoFeatures, find_features, find_pairs
 from scenefuse.poses.pair_scales import learn_pair_scales
 from scenefuse.poses.pose_graph import average_poses, largest_component, spanning_tree_poses
+from scenefuse.sfm.bundle.adjustment import TOLERANCE
+from scenefuse.sfm.bundle.lens import HELD, KNOWN, STRAIGHT, choose_lens, describe_lens
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, write_json
 from scenefuse.transforms import Sim3, fit_sim3, rotation_angle_deg, rotation_between
@@ -33,7 +35,8 @@ class PoseSettings:
     """How poses are found without SfM."""
 
     refine_focal: bool = setting(True)
-    """Whether the focal length is refined together with the poses; false where it was calibrated."""
+    """Whether the focal length, and the principal point where the photos determine it, are refined together with the
+    poses; false where they were calibrated."""
     feature_width_px: int = 960
     """Width at which features are found in the photos, pixels."""
     features: int = 2000
@@ -94,12 +97,16 @@ def find_poses(*, workspace: Path, posed: Path, report: Path, settings: PoseSett
     given = read_workspace(workspace)
     found = find(_read_photos(given), settings, device)
     object_from_graph = _frame(found, has_sfm=len(given.points) > 0)
+    model = _model(found, object_from_graph)
+    choice = choose_lens(model, STRAIGHT if settings.refine_focal else (KNOWN,))
+    if choice.lens not in (HELD, KNOWN):
+        model = choice.lens.fit(model, TOLERANCE)
     with atomic_directory(posed) as folder:
         left_out = shutil.ignore_patterns("sparse", ".snakemake_timestamp")
         shutil.copytree(workspace, folder, ignore=left_out, dirs_exist_ok=True)
         (folder / "sparse").mkdir()
-        _write_model(folder / "sparse", found, object_from_graph)
-    content = _report(given, found, object_from_graph)
+        model.write(folder / "sparse")
+    content = _report(given, found, object_from_graph) | describe_lens(choice, model)
     write_json(report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
     print(f"poses of {content['photos_with_pose']['value']} photos", flush=True)
 
@@ -218,18 +225,21 @@ def _frame(found: FoundPoses, has_sfm: bool) -> Sim3:
     return Sim3(turn.scale, turn.rotation, -turn.apply(middle))
 
 
-def _write_model(folder: Path, found: FoundPoses, object_from_graph: Sim3) -> None:
-    """A COLMAP model of the photos that are `seen`, one camera each."""
+def _model(found: FoundPoses, object_from_graph: Sim3) -> pycolmap.Reconstruction:
+    """A COLMAP model of the photos that are `seen`; photos of one calibration share a camera."""
     model, adjusted, tracks = pycolmap.Reconstruction(), found.adjusted, found.adjusted.tracks
     members: list[list[pycolmap.TrackElement]] = [[] for _ in adjusted.points]
+    cameras: dict[tuple[float, ...], int] = {}
     for index in np.flatnonzero(found.seen):
         number, view = int(index) + 1, found.views[index]
         scale, k = adjusted.focal_scale, view.intrinsics
-        params = [k[0, 0] * scale, k[1, 1] * scale, k[0, 2], k[1, 2]]
-        size = {"width": view.width, "height": view.height}
-        model.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="PINHOLE", params=params, camera_id=number, **size)  # type: ignore[arg-type]
-        )
+        params = k[0, 0] * scale, k[1, 1] * scale, k[0, 2], k[1, 2]
+        if params not in cameras:
+            cameras[params] = len(cameras) + 1
+            size = {"width": view.width, "height": view.height, "camera_id": cameras[params]}
+            model.add_camera_with_trivial_rig(
+                pycolmap.Camera(model="PINHOLE", params=params, **size)  # type: ignore[arg-type]
+            )
         rows = np.flatnonzero(tracks.photo == index)
         in_photo = np.column_stack([found.features[index].rays[tracks.row[rows]], np.ones(len(rows))])
         pixels = (in_photo @ k.T)[:, :2]
@@ -238,7 +248,7 @@ def _write_model(folder: Path, found: FoundPoses, object_from_graph: Sim3) -> No
         centre = object_from_graph.apply(pose[:3, 3])
         image = pycolmap.Image(
             name=view.name,
-            camera_id=number,
+            camera_id=cameras[params],
             image_id=number,
             points2D=pycolmap.Point2DList([pycolmap.Point2D(pixel) for pixel in pixels]),
         )
@@ -248,4 +258,4 @@ def _write_model(folder: Path, found: FoundPoses, object_from_graph: Sim3) -> No
     for point, track in zip(object_from_graph.apply(adjusted.points), members):
         if len(track) >= 2:
             model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
-    model.write(folder)
+    return model

@@ -56,7 +56,7 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     assert "32632" in las_crs(out / "object_in_scene.laz")
     assert (out / "picture.png").stat().st_size > 1000
     printed = capsys.readouterr().out.strip().splitlines()
-    assert len(printed) == 5 and printed[0].startswith("registered: ") and "whole scene" in printed[2]
+    assert len(printed) == 6 and printed[0].startswith("registered: ") and "whole scene" in printed[3]
 
 
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
