@@ -29,7 +29,7 @@ DARKEST, BRIGHTEST = 0.04, 0.98
 # Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
 LOG_DELTA = 0.05
 # Pull of gains towards 1, as a share of the pairs that determine them; of the vignetting, of all pairs.
-GAIN_PULL, FALLOFF_PULL = 1e-3, 1e-3
+GAIN_PULL, FALLOFF_PULL = 1e-3, 1e-5
 ROUNDS = 10
 # The pull on a gain that is fitted to a finished render, in squared colour per pixel.
 RIDGE = 1e-4
@@ -143,16 +143,18 @@ def solved(shared: SharedColors, photos: int) -> Appearance:
     radial = torch.stack([shared.radius2, shared.radius2**2], 2)
     basis = (radial[:, 0] - radial[:, 1]).double()
     difference = shared.difference.double()
-    pull = GAIN_PULL * (torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)).clamp(min=1)
+    pairs = torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)
     log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
     for _ in range(ROUNDS):
         left = difference - (log_gain[a] - log_gain[b]) - (basis @ falloff)[:, None]
         weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
-        log_gain = _gains(a, b, weight, difference - (basis @ falloff)[:, None], pull)
+        log_gain = _gains(a, b, weight, difference - (basis @ falloff)[:, None], GAIN_PULL * pairs.clamp(min=1))
         left = (difference - (log_gain[a] - log_gain[b])).mean(1)
         normal = (basis * weight[:, None]).T @ basis + FALLOFF_PULL * count * torch.eye(2, dtype=torch.float64)
         falloff = torch.linalg.solve(normal, (basis * weight[:, None]).T @ left)
-    return Appearance((log_gain - log_gain.mean(0)).float(), falloff.float())
+    known = (pairs > 0)[:, None]
+    mean = (log_gain * known).sum(0) / known.sum().clamp(min=1)
+    return Appearance(((log_gain - mean) * known).float(), falloff.float())
 
 
 def _gains(a: Tensor, b: Tensor, weight: Tensor, difference: Tensor, pull: Tensor) -> Tensor:

@@ -205,9 +205,9 @@ def measure_quality(
 
 
 def right_half(mask: Tensor) -> Tensor:
-    """The pixels of a mask (H, W) on the right of, or at, their median column."""
+    """The pixels of a mask (H, W) on the right of their median column."""
     columns = torch.arange(mask.shape[1]).expand_as(mask)
-    return mask & (columns >= columns[mask].median()) if mask.any() else mask
+    return mask & (columns > columns[mask].median()) if mask.any() else mask
 
 
 def fitted_to_left_half(rendered: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
