@@ -45,11 +45,12 @@ NEAREST, BLURRED_BELOW = 8, 0.7
 
 @dataclass
 class Appearance:
-    """Log gains (V, 3) of V photos' red, green and blue, and the coefficients (2,) of one vignetting for all of them.
+    """Log gains (V, 3) of V photos' red, green and blue, and the coefficient () of one vignetting for all of them.
 
-    The vignetting is exp(a r^2 + b r^4), r = 0 at the principal point and 1 at half the picture's diagonal from it: an
-    even polynomial in the radius after Goldman, "Vignette and exposure calibration and compensation" (2010). Photos
-    determine gains up to one factor per channel, which is fixed by a mean log gain of 0.
+    The vignetting is exp(a r^2), a <= 0, r = 0 at the principal point and 1 at half the picture's diagonal from it: the
+    first term of the even polynomial of Goldman, "Vignette and exposure calibration and compensation" (2010). More
+    terms would be extrapolated, as objects seldom reach the corners. Photos determine gains up to one factor per
+    channel, which is fixed by a mean log gain of 0.
     """
 
     log_gain: Tensor
@@ -58,11 +59,11 @@ class Appearance:
     @classmethod
     def none(cls, photos: int, device: str) -> "Appearance":
         """All photos alike."""
-        return cls(torch.zeros(photos, 3, device=device), torch.zeros(2, device=device))
+        return cls(torch.zeros(photos, 3, device=device), torch.zeros((), device=device))
 
     def factor(self, view: Tensor, radius2: Tensor) -> Tensor:
         """(R, 3) what colours of the field are multiplied by in photos `view` (R,) at squared radii (R,)."""
-        return torch.exp(self.log_gain[view] + log_falloff(self.falloff, radius2)[:, None])
+        return torch.exp(self.log_gain[view] + (self.falloff * radius2)[:, None])
 
 
 @dataclass(frozen=True)
@@ -140,18 +141,17 @@ def solved(shared: SharedColors, photos: int) -> Appearance:
     A photo that shares no colours gets a gain of 1.
     """
     a, b, count = shared.a, shared.b, max(len(shared.a), 1)
-    radial = torch.stack([shared.radius2, shared.radius2**2], 2)
-    basis = (radial[:, 0] - radial[:, 1]).double()
+    radial = (shared.radius2[:, 0] - shared.radius2[:, 1]).double()
     difference = shared.difference.double()
     pairs = torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)
-    log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros((), dtype=torch.float64)
     for _ in range(ROUNDS):
-        left = difference - (log_gain[a] - log_gain[b]) - (basis @ falloff)[:, None]
+        left = difference - (log_gain[a] - log_gain[b]) - (falloff * radial)[:, None]
         weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
-        log_gain = _gains(a, b, weight, difference - (basis @ falloff)[:, None], GAIN_PULL * pairs.clamp(min=1))
+        log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], GAIN_PULL * pairs.clamp(min=1))
         left = (difference - (log_gain[a] - log_gain[b])).mean(1)
-        normal = (basis * weight[:, None]).T @ basis + FALLOFF_PULL * count * torch.eye(2, dtype=torch.float64)
-        falloff = torch.linalg.solve(normal, (basis * weight[:, None]).T @ left)
+        falloff = (weight * radial * left).sum() / ((weight * radial**2).sum() + FALLOFF_PULL * count)
+        falloff = falloff.clamp(max=0.0)
     known = (pairs > 0)[:, None]
     mean = (log_gain * known).sum(0) / known.sum().clamp(min=1)
     return Appearance(((log_gain - mean) * known).float(), falloff.float())
@@ -174,22 +174,17 @@ def nearest(center: Tensor, count: int) -> Tensor:
     return distance.topk(min(count, len(center) - 1), largest=False).indices
 
 
-def log_falloff(coefficients: Tensor, radius2: Tensor) -> Tensor:
-    """Logarithm of the vignetting with coefficients (2,) of r^2 and r^4, at squared radii of any shape."""
-    return radius2 * (coefficients[0] + coefficients[1] * radius2)
-
-
 def squared_radius(uv: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
     """Squared distance (R,) of pixels (R, 2) from the principal points of (R, 3, 3), 1 at half the diagonal."""
     return 4 * ((uv - intrinsics[:, :2, 2]) ** 2).sum(1) / (width**2 + height**2)
 
 
-def falloff_map(coefficients: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
+def falloff_map(falloff: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
     """Vignetting (H, W, 1) of a photo with intrinsics (3, 3)."""
     down, across = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
     uv = torch.stack([across.flatten(), down.flatten()], 1)
     radius2 = squared_radius(uv, intrinsics.expand(len(uv), 3, 3), width, height)
-    return torch.exp(log_falloff(coefficients, radius2)).view(height, width, 1)
+    return torch.exp(falloff * radius2).view(height, width, 1)
 
 
 def fitted_log_gain(rendered: Tensor, photo: Tensor) -> Tensor:
@@ -220,7 +215,7 @@ def gains_nearby(log_gain: Tensor, center: Tensor, trained: Tensor) -> Tensor:
 
 
 def without_appearance(images: Tensor, intrinsics: Tensor, log_gain: Tensor, falloff: Tensor) -> Tensor:
-    """Photos (V, H, W, 3) uint8 with gains (V, 3) and vignetting (2,) taken out: all as if of one exposure."""
+    """Photos (V, H, W, 3) uint8 with gains (V, 3) and vignetting () taken out: all as if of one exposure."""
     height, width = images.shape[1:3]
     result = torch.empty_like(images)
     for index, image in enumerate(images):

@@ -54,7 +54,7 @@ class RenderedMaps:
         rendered: V renders in nerf units, with the vignetting and `log_gain`; those of photos that do not measure
             quality have no colours.
         log_gain: (V, 3) of training photos as trained, of held-out ones as of the nearest (`gains_nearby`).
-        falloff: (2,) of the vignetting.
+        falloff: () of the vignetting.
         measured: (V,) bool, photos that measure quality: the held-out ones, or all.
         diagonal: of the object, in its unit.
     """

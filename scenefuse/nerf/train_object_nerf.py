@@ -250,7 +250,7 @@ def _appearance(given: _Given, weight: Tensor, maps: RenderedMaps) -> dict[str, 
     return {
         "photo_gains": quantity({n: [round(float(g), 4) for g in row] for n, row in zip(names, gains)}, "1"),
         "log_gain_deviation": quantity(float(gains.mean(1).log().std(correction=0)), "1"),
-        "vignetting_at_corner": quantity(float(maps.falloff.sum().exp()), "1"),
+        "vignetting_at_corner": quantity(float(maps.falloff.exp()), "1"),
         "blurred_photos": quantity(blurred, "1"),
     }
 

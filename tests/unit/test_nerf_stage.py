@@ -164,7 +164,7 @@ def test_gains_are_taken_out_of_the_cloud_s_colours(workspace, stage2, tmp_path)
     clouds = []
     for number, factor in enumerate((1.0, 2.0)):
         gains = torch.full_like(saved["log_gain"], float(np.log(factor)))
-        torch.save(saved | {"log_gain": gains, "falloff": torch.zeros(2)}, tmp_path / "stage2/model.pt")
+        torch.save(saved | {"log_gain": gains, "falloff": torch.tensor(0.0)}, tmp_path / "stage2/model.pt")
         _make_cloud(workspace, tmp_path / "stage2", tmp_path / f"{number}.ply")
         clouds.append(read_cloud(tmp_path / f"{number}.ply"))
     assert np.array_equal(clouds[0].points, clouds[1].points)
