@@ -41,10 +41,10 @@ class LossWeights:
         return torch.stack([getattr(self, f"{name}_weight") * term for name, term in terms.items()]).sum()
 
 
-def color_loss(predicted: Tensor, target: Tensor, inside: Tensor) -> Tensor:
-    """Huber loss of (R, 3) colours in 0..1, mean over the rays inside the mask (R,)."""
+def color_loss(predicted: Tensor, target: Tensor, weight: Tensor) -> Tensor:
+    """Huber loss of (R, 3) colours in 0..1, mean over the rays by weight (R,): 0 outside the mask."""
     error = huber_loss(predicted, target, reduction="none", delta=COLOR_DELTA).mean(1)
-    return (error * inside).sum() / inside.sum().clamp(min=1)
+    return (error * weight).sum() / weight.sum().clamp(min=1)
 
 
 def depth_loss(distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor) -> Tensor:

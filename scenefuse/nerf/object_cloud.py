@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
@@ -17,6 +18,7 @@ from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.views import Views, load_views
+from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
 
@@ -86,7 +88,8 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     """Fuse a NeRF stage's depth maps into the object's cloud (method N13), in the object's camera (SfM) frame.
 
     Rendered depths are first moved to where the photos match best, where they match, and those that no photo confirms
-    although there is texture are left out (`refine_by_photos`).
+    although there is texture are left out (`refine_by_photos`). Colours are those of one exposure: what the NeRF found
+    of each photo's gains and of the vignetting is taken out.
 
     Args:
         inputs: photos, masks and the NeRF stage.
@@ -108,7 +111,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     poses, rendered = saved["object_from_cam"].numpy(), max(int((maps.depths > 0).sum()), 1)
     refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
     maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
-    raw, diagonal = fuse_depths(views, poses, maps, settings)
+    raw, diagonal = fuse_depths(_neutral(views, saved), poses, maps, settings)
     if len(raw) < LEAST_POINTS:
         raise StageError(
             f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
@@ -209,6 +212,12 @@ def _views(inputs: CloudInputs, names: list[str]) -> Views:
             f"{inputs.stage} was made from other photos than {inputs.workspace} holds now; run the NeRF stage again"
         )
     return views
+
+
+def _neutral(views: Views, saved: dict[str, Any]) -> Views:
+    """The photos with the gains and the vignetting that the NeRF found taken out."""
+    images, intrinsics = torch.from_numpy(views.images), torch.from_numpy(views.intrinsics.astype(np.float32))
+    return replace(views, images=without_appearance(images, intrinsics, saved["log_gain"], saved["falloff"]).numpy())
 
 
 def _read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps:

@@ -1,6 +1,6 @@
 """What a trained NeRF shows of its photos: depth, confidence and normal maps, renders, and how good they are."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from scenefuse.io.maps import write_depth, write_normals
 from scenefuse.io.pictures import write_picture
 from scenefuse.mvs.consistency import compare, extent, normals_from_depth, surface_points
 from scenefuse.mvs.views import Views
+from scenefuse.nerf.appearance import falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
@@ -50,7 +51,10 @@ class RenderedMaps:
         poses: (V, 4, 4) object_from_cam of the maps.
         depths: (V, H, W) along z, 0 for none.
         confidence: (V, H, W) in 0..1.
-        rendered: V renders in nerf units; those of photos that do not measure quality have no colours.
+        rendered: V renders in nerf units, with the vignetting and `log_gain`; those of photos that do not measure
+            quality have no colours.
+        log_gain: (V, 3) of training photos as trained, of held-out ones as of the nearest (`gains_nearby`).
+        falloff: () of the vignetting.
         measured: (V,) bool, photos that measure quality: the held-out ones, or all.
         diagonal: of the object, in its unit.
     """
@@ -60,6 +64,8 @@ class RenderedMaps:
     depths: Maps
     confidence: Maps
     rendered: list[RenderedView]
+    log_gain: Tensor
+    falloff: Tensor
     measured: NDArray[np.bool_]
     diagonal: float
 
@@ -87,10 +93,15 @@ def render_maps(
     """
     measured = views.held_out if views.held_out.any() else np.ones(len(views.names), bool)
     where = dilate(photos.masks, BEYOND_MASK_PX)
+    looks = nerf.appearance.log_gain.cpu(), nerf.appearance.falloff.cpu()
+    log_gain = gains_nearby(looks[0], photos.center, torch.from_numpy(np.flatnonzero(~views.held_out)))
     rendered = [
         render_view(nerf.field, nerf.occupancy, photos.camera(view), where[view], settings.render_samples, colored)
         for view, colored in enumerate(measured)
     ]
+    for view in np.flatnonzero(measured):
+        factor = log_gain[view].exp() * falloff_map(looks[1], photos.intrinsics[view], *photos.masks.shape[1:])
+        rendered[view] = replace(rendered[view], color=rendered[view].color * factor)
     depths: Any = np.stack([_solid_depth(view).numpy() for view in rendered]) / scale
     if not (depths > 0).any():
         raise StageError(
@@ -98,7 +109,7 @@ def render_maps(
         )
     diagonal = extent(np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, poses)]))
     confidence = _confidence(depths, rendered, views, poses, settings.map_agreement * diagonal)
-    return RenderedMaps(views, poses, depths, confidence, rendered, measured, diagonal)
+    return RenderedMaps(views, poses, depths, confidence, rendered, log_gain, looks[1], measured, diagonal)
 
 
 def write_maps(maps: RenderedMaps, folder: Path) -> None:
@@ -115,12 +126,21 @@ def write_maps(maps: RenderedMaps, folder: Path) -> None:
 
 
 def write_nerf(path: Path, nerf: Nerf, nerf_from_object: Sim3, maps: RenderedMaps) -> None:
-    """Write what a later stage goes on from: the field, its cube, and the poses of the photos."""
+    """Write what a later stage goes on from: the field, its cube, and poses and appearance of the photos.
+
+    The gains of held-out photos, which the cloud's colours need too, are fitted to the whole photo here.
+    """
+    log_gain = maps.log_gain.clone()
+    for row in np.flatnonzero(maps.views.held_out):
+        mask, photo = torch.from_numpy(maps.views.masks[row]), torch.from_numpy(maps.views.images[row])
+        log_gain[row] += fitted_log_gain(maps.rendered[row].color[mask], photo[mask] / 255.0)
     saved = {
         "model": nerf.state(),
         "nerf_from_object": torch.from_numpy(nerf_from_object.matrix),
         "names": maps.views.names,
         "object_from_cam": torch.from_numpy(maps.poses),
+        "log_gain": log_gain,
+        "falloff": maps.falloff,
     }
     try:
         torch.save(saved, path)
@@ -139,9 +159,12 @@ def read_nerf(stage: Path) -> dict[str, Any]:
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the NeRF stage first")
     try:
-        return torch.load(path, map_location="cpu", weights_only=True)
+        saved = torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # a truncated file raises any of half a dozen
         raise StageError(f"{path} is damaged; delete {stage} and run the NeRF stage again") from None
+    if "log_gain" not in saved:
+        raise StageError(f"{path} is of an earlier version, without the photos' gains; run the NeRF stage again")
+    return saved
 
 
 def measure_quality(
@@ -149,9 +172,11 @@ def measure_quality(
 ) -> dict[str, Any]:
     """Mean quality on the photos `measured` (V,), for the report.
 
-    Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background.
+    Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background. The
+    quality of the right half is given twice: as rendered, and with gains fitted to the left half, as in NeRF in the
+    Wild (Martin-Brualla et al. 2021, section 5).
     """
-    rows = []
+    rows, halves = [], []
     for index in np.flatnonzero(measured):
         mask = torch.from_numpy(views.masks[index])
         photo = torch.from_numpy(views.images[index]).float() / 255.0
@@ -160,15 +185,35 @@ def measure_quality(
         near = dilate(mask[None], SSIM_REACH_PX)[0]
         signal = psnr(picture, masked, mask), psnr(picture, masked, everything)
         rows.append((*signal, ssim(picture, masked, near), silhouette_iou(rendered[index].opacity, mask)))
+        right = right_half(mask)
+        fitted = fitted_to_left_half(rendered[index].color, masked, mask).clamp(0, 1)
+        halves.append([rate(p, masked, right) for rate in (psnr, ssim) for p in (picture, fitted)])
     inside, whole, structure, outline = np.mean(rows, axis=0)
+    half = np.mean(halves, axis=0)
     return {
         "psnr_held_out": quantity(float(inside), "dB"),
         "psnr_held_out_masked_photo": quantity(float(whole), "dB"),
         "ssim": quantity(float(structure), "1"),
+        "psnr_right_half": quantity(float(half[0]), "dB"),
+        "psnr_right_half_fitted_on_left": quantity(float(half[1]), "dB"),
+        "ssim_right_half": quantity(float(half[2]), "1"),
+        "ssim_right_half_fitted_on_left": quantity(float(half[3]), "1"),
         "silhouette_iou": quantity(float(outline), "1"),
         "measured_on": quantity("held-out photos" if views.held_out.any() else "training photos", ""),
         "photos_measured": quantity(int(measured.sum()), "1"),
     }
+
+
+def right_half(mask: Tensor) -> Tensor:
+    """The pixels of a mask (H, W) on the right of their median column."""
+    columns = torch.arange(mask.shape[1]).expand_as(mask)
+    return mask & (columns > columns[mask].median()) if mask.any() else mask
+
+
+def fitted_to_left_half(rendered: Tensor, photo: Tensor, mask: Tensor) -> Tensor:
+    """A render (H, W, 3) with the gains that suit the photo best in the left half of the mask (H, W)."""
+    left = mask & ~right_half(mask)
+    return rendered * fitted_log_gain(rendered[left], photo[left]).exp()
 
 
 def psnr(a: Tensor, b: Tensor, where: Tensor) -> float:

@@ -9,12 +9,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from scenefuse.checkpoints import State, key_of
 from scenefuse.cores import use_threads
 from scenefuse.depth.prior import DepthPrior, read_prior
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.views import Views, load_views
+from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -114,7 +116,8 @@ def train_object_nerf(
     if given.earlier is not None and warm:
         go_on_from(nerf, given.earlier["model"])
     photos = given.photos.select(given.trained)
-    training = Training(photos, settings.schedule, settings.recipe, settings.losses, warm, seed)
+    weight = photo_weights(measured_sharpness(photos.images, photos.masks), photos.center)
+    training = Training(photos, settings.schedule, settings.recipe, settings.losses, warm, seed, weight)
     checkpoint = checkpoints / _key(given, settings, device, seed) / "state.pt"
     what = f"{len(given.trained)} photos, hull {given.volume.hull.mean():.1%} of the cube, {training.steps} steps"
     print(f"{what} on {device} ({kernels_on(device)})", flush=True)
@@ -129,6 +132,7 @@ def train_object_nerf(
         "nerf_from_object": quantity(nerf_from_object.matrix, "nerf units per object unit"),
         "started_from_previous": quantity(warm, ""),
         **_report(nerf, given, settings, result, maps),
+        **_appearance(given, weight, maps),
         **drift,
         **measure_quality(given.views, maps.rendered, maps.measured, exact),
     }
@@ -236,9 +240,26 @@ def _report(
     }
 
 
+def _appearance(given: _Given, weight: Tensor, maps: RenderedMaps) -> dict[str, Any]:
+    """What the photos differ in: gains and weights of those trained on, by name, and the vignetting."""
+    names = [given.views.names[row] for row in given.trained]
+    gains = maps.log_gain[torch.from_numpy(given.trained)].exp()
+    blurred = {name: round(float(w), 3) for name, w in zip(names, weight) if w < 1}
+    for name, share in blurred.items():
+        print(f"{name} is blurred beside the photos taken near it: its colours count {share:.0%}", flush=True)
+    return {
+        "photo_gains": quantity({n: [round(float(g), 4) for g in row] for n, row in zip(names, gains)}, "1"),
+        "log_gain_deviation": quantity(float(gains.mean(1).log().std(correction=0)), "1"),
+        "vignetting_at_corner": quantity(float(maps.falloff.exp()), "1"),
+        "blurred_photos": quantity(blurred, "1"),
+    }
+
+
 def _print_summary(report: dict[str, Any]) -> None:
     print(
-        f"{value(report, 'measured_on')}: PSNR {value(report, 'psnr_held_out'):.2f} dB, "
+        f"{value(report, 'measured_on')}: PSNR {value(report, 'psnr_held_out'):.2f} dB as rendered, right half "
+        f"{value(report, 'psnr_right_half'):.2f}, with gains fitted on the left half "
+        f"{value(report, 'psnr_right_half_fitted_on_left'):.2f}, "
         f"SSIM {value(report, 'ssim'):.3f}, confident {value(report, 'confident_share'):.1%}, "
         f"{value(report, 'seconds')} s",
         flush=True,

@@ -16,13 +16,14 @@ from torch import Tensor, nn
 
 from scenefuse.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
 from scenefuse.nerf import losses
+from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.pose_refinement import corrected
-from scenefuse.nerf.progress import Progress
 from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
+from scenefuse.progress import Progress
 from scenefuse.stage import setting
 
 # Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
@@ -36,6 +37,9 @@ SAMPLES_FALL_UNTIL = 0.5
 LOWEST_RATE = 0.02
 # Poses stay as they are at first: the gradients of an untrained field would scatter them.
 POSES_FROM = 0.2
+# Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
+# again when they are better. A warm training finds them at its start too.
+APPEARANCE_AT = (0.15, 0.4)
 # Where a prior expects the surface, at most this share of a ray's samples lies within this distance of it.
 PRIOR_SHARE, PRIOR_HALF_WIDTH = 0.6, 0.04
 # A step's random numbers come from a seed of their own, so that a resumed training draws the same ones.
@@ -94,10 +98,12 @@ class NerfRecipe:
 
 @dataclass
 class Nerf:
-    """All that is trained: the field, its occupancy grid, and corrections (V, 6) of the poses (rotation, centre)."""
+    """All that is trained: the field, its occupancy grid, the photos' appearance, and corrections (V, 6) of their poses
+    (rotation, centre)."""
 
     field: Field
     occupancy: Occupancy
+    appearance: Appearance
     pose: Tensor
 
     def state(self) -> State:
@@ -108,6 +114,8 @@ class Nerf:
             "hull": self.occupancy.hull.cpu(),
             "density": self.occupancy.density.cpu(),
             "occupied": self.occupancy.occupied.cpu(),
+            "log_gain": self.appearance.log_gain.cpu(),
+            "falloff": self.appearance.falloff.cpu(),
             "pose": self.pose.detach().cpu(),
         }
 
@@ -115,7 +123,8 @@ class Nerf:
 def new_nerf(settings: FieldSettings, hull: Tensor, photos: int, seed: int, device: str) -> Nerf:
     """An untrained NeRF in a hull (G, G, G), for a number of training photos."""
     field = Field(settings, torch.Generator().manual_seed(seed)).to(device)
-    return Nerf(field, Occupancy.from_hull(hull.to(device)), torch.zeros(photos, 6, device=device))
+    looks = Appearance.none(photos, device)
+    return Nerf(field, Occupancy.from_hull(hull.to(device)), looks, torch.zeros(photos, 6, device=device))
 
 
 def go_on_from(nerf: Nerf, earlier: State) -> None:
@@ -137,6 +146,7 @@ class Training:
         weights: of the losses.
         warm: the NeRF is already trained: all levels are open and the grid is pruned from the start.
         seed: decides every random draw together with the step's number.
+        photo_weight: (V,) weight of each photo's colours, or None for 1.
     """
 
     photos: PhotoTensors
@@ -145,6 +155,7 @@ class Training:
     weights: LossWeights
     warm: bool
     seed: int
+    photo_weight: Tensor | None = None
 
     @property
     def steps(self) -> int:
@@ -205,6 +216,7 @@ def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer, pose: Te
     """Put a checkpoint into NeRF, optimiser and poses; the steps that are done."""
     nerf.field.load_state_dict(saved["model"]["field"])
     device = nerf.field.table.device
+    nerf.appearance = Appearance(*(saved["model"][name].to(device) for name in ("log_gain", "falloff")))
     nerf.occupancy = Occupancy(*(saved["model"][name].to(device) for name in ("hull", "density", "occupied")))
     optimizer.load_state_dict(saved["optimizer"])
     with torch.no_grad():
@@ -220,13 +232,15 @@ def _optimizer(field: Field, pose: nn.Parameter) -> torch.optim.Optimizer:
 
 
 def _prepare(nerf: Nerf, training: Training, step: int) -> None:
-    """Open levels of the grid and bring the occupancy up to date, as far as the step is due for it."""
+    """Open levels of the grid, update the occupancy, find the appearance, as far as the step is due for it."""
     progress = step / training.steps
     if not training.warm:
         coarse_to_fine(nerf.field, progress, training.recipe.coarse_until)
     if step % OCCUPANCY_EVERY == 0 and (step or training.warm):
         prune = training.warm or progress > PRUNE_FROM
         nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step, prune)
+    if step in {round(share * training.steps) for share in APPEARANCE_AT} or (step == 0 and training.warm):
+        nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos)
 
 
 def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) -> RayBatch:
@@ -272,7 +286,7 @@ def _loss_terms(
     origin, direction = rays.origin.detach().contiguous(), rays.direction.detach().contiguous()
     drawn = march(origin, direction, nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior)
     sigma, seen = _render(nerf.field, rays, drawn, batch, training.recipe.edge_boost)
-    color, psnr = _photometric(seen, batch, drawn.ray, background)
+    color, psnr = _photometric(nerf.appearance, training, seen, batch, drawn.ray, background)
     terms = {"color": color, **_geometric(training, rays, batch, drawn, sigma, seen), "psnr": psnr}
     return terms, drawn.t.numel()
 
@@ -308,17 +322,23 @@ def _render(
     return sigma, composite(sigma, field.color(features, rays.direction[drawn.ray]), drawn.t, drawn.delta)
 
 
-def _photometric(seen: Composited, batch: RayBatch, ray: Tensor, background: Tensor) -> tuple[Tensor, Tensor]:
+def _photometric(
+    appearance: Appearance, training: Training, seen: Composited, batch: RayBatch, ray: Tensor, background: Tensor
+) -> tuple[Tensor, Tensor]:
     """Photometric loss and PSNR of the rays `ray` (H,), both on random colours (R, 3).
 
-    On a random background a field cannot pass off emptiness as colour, so colours teach opacity as well (instant-ngp's
-    training on images with alpha).
+    The field's colours are compared as their photo shows them. On a random background a field cannot pass off emptiness
+    as colour, so colours teach opacity as well (instant-ngp's training on images with alpha).
     """
-    inside, matte, shown = batch.inside[ray], batch.matte[ray, None], background[ray]
-    composed = seen.color + (1 - seen.opacity)[:, None] * shown
+    view, inside, matte, shown = batch.view[ray], batch.inside[ray], batch.matte[ray, None], background[ray]
+    height, width = training.photos.images.shape[1:3]
+    intrinsics = training.photos.intrinsics.to(view.device)[view]
+    factor = appearance.factor(view, squared_radius(batch.uv[ray], intrinsics, width, height))
+    composed = factor * seen.color + (1 - seen.opacity)[:, None] * shown
     target = matte * batch.color[ray] + (1 - matte) * shown
     error = ((composed.detach() - target) ** 2)[inside].mean().clamp(min=1e-10)
-    return losses.color_loss(composed, target, inside), -10 * torch.log10(error)
+    weight = inside if training.photo_weight is None else inside * training.photo_weight.to(view.device)[view]
+    return losses.color_loss(composed, target, weight), -10 * torch.log10(error)
 
 
 def _geometric(

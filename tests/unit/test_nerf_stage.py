@@ -10,6 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.painted_sphere import sphere_views
 
+from scenefuse.io.clouds import read_cloud
 from scenefuse.io.maps import read_depth, write_depth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
@@ -100,6 +101,22 @@ def stage2(workspace):
     return workspace / "stage2"
 
 
+def _make_cloud(root, stage, cloud):
+    make_object_cloud(
+        inputs=CloudInputs(
+            workspace=root / "undistorted",
+            workspace_json=root / "undistorted.json",
+            masks=root / "masks",
+            stage=stage,
+            stage_json=root / f"{stage.name}.json",
+        ),
+        cloud=cloud,
+        report=cloud.with_suffix(".json"),
+        settings=CloudSettings(min_views=2, spacing=0.01, gates=GATES, refinement=UNREFINED),
+        seed=0,
+    )
+
+
 def test_two_stages_and_the_cloud(workspace, stage2):
     _run(workspace, "stage4", previous=stage2)
     report = read_json(workspace / "stage4.json")
@@ -114,19 +131,7 @@ def test_two_stages_and_the_cloud(workspace, stage2):
     saved = torch.load(workspace / "stage4/model.pt", weights_only=True)
     assert len(saved["names"]) == 12 and saved["nerf_from_object"].shape == (4, 4)
     assert not list((workspace / "checkpoints").rglob("*.pt"))
-    make_object_cloud(
-        inputs=CloudInputs(
-            workspace=workspace / "undistorted",
-            workspace_json=workspace / "undistorted.json",
-            masks=workspace / "masks",
-            stage=workspace / "stage4",
-            stage_json=workspace / "stage4.json",
-        ),
-        cloud=workspace / "object.ply",
-        report=workspace / "object.json",
-        settings=CloudSettings(min_views=2, spacing=0.01, gates=GATES, refinement=UNREFINED),
-        seed=0,
-    )
+    _make_cloud(workspace, workspace / "stage4", workspace / "object.ply")
     cloud = read_json(workspace / "object.json")
     assert value(cloud, "points") > 200 and value(cloud, "up_in_camera_frame") == [0.0, 0.0, 1.0]
     assert np.shape(value(cloud, "nerf_from_object")) == (4, 4)
@@ -138,6 +143,40 @@ def test_a_later_stage_starts_from_the_poses_of_the_earlier_one(workspace, stage
     moved, later = (torch.load(stage / "model.pt", weights_only=True) for stage in (stage2, workspace / "later"))
     assert torch.equal(moved["object_from_cam"], later["object_from_cam"])
     assert not torch.equal(moved["object_from_cam"], torch.from_numpy(sphere_views()[3]))
+
+
+def test_the_report_names_gains_and_both_qualities_of_the_right_half(workspace, stage2):
+    report = read_json(workspace / "stage2.json")
+    gains = value(report, "photo_gains")
+    assert sorted(gains) == [f"{i:02d}.png" for i in range(12) if i not in (3, 9)]
+    assert all(0.5 < gain < 2 for rows in gains.values() for gain in rows)
+    assert value(report, "blurred_photos") == {}
+    assert value(report, "vignetting_at_corner") == pytest.approx(1.0, abs=0.3)
+    for name in ("psnr_right_half", "psnr_right_half_fitted_on_left", "ssim_right_half_fitted_on_left"):
+        assert np.isfinite(value(report, name))
+
+
+def test_gains_are_taken_out_of_the_cloud_s_colours(workspace, stage2, tmp_path):
+    saved = torch.load(stage2 / "model.pt", weights_only=True)
+    (tmp_path / "stage2").mkdir()
+    for maps in ("depth_maps", "confidence_maps", "normal_maps"):
+        (tmp_path / "stage2" / maps).symlink_to(stage2 / maps)
+    clouds = []
+    for number, factor in enumerate((1.0, 2.0)):
+        gains = torch.full_like(saved["log_gain"], float(np.log(factor)))
+        torch.save(saved | {"log_gain": gains, "falloff": torch.tensor(0.0)}, tmp_path / "stage2/model.pt")
+        _make_cloud(workspace, tmp_path / "stage2", tmp_path / f"{number}.ply")
+        clouds.append(read_cloud(tmp_path / f"{number}.ply"))
+    assert np.array_equal(clouds[0].points, clouds[1].points)
+    assert np.abs(clouds[0].colors / 2.0 - clouds[1].colors).max() <= 1
+
+
+def test_a_model_without_gains_is_named(workspace, stage2, tmp_path):
+    saved = torch.load(stage2 / "model.pt", weights_only=True)
+    del saved["log_gain"]
+    torch.save(saved, tmp_path / "model.pt")
+    with pytest.raises(StageError, match="of an earlier version, without the photos' gains; run the NeRF stage again"):
+        _run(workspace, "other", previous=tmp_path)
 
 
 def test_a_missing_earlier_stage_is_named(workspace):

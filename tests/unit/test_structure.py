@@ -13,7 +13,7 @@ LIBRARY = ROOT / "scenefuse"
 PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
 PACKAGES += ["metrics", "report"]
 # Shared by all, and importing no package.
-SHARED = ["stage", "transforms", "cores", "checkpoints", "fingerprint", "machine", "job_records"]
+SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records"]
 # The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.
 MAY_IMPORT = {name: {*SHARED, *PACKAGES[: PACKAGES.index(name) + 1]} for name in PACKAGES}
 MAY_IMPORT |= {name: set(SHARED) for name in SHARED}
@@ -21,9 +21,9 @@ MAY_IMPORT["metrics"] |= {"demo.cameras"}
 MAY_IMPORT |= {"demo": {*SHARED, "io", "workspace", "demo"}, "config": {*SHARED, *PACKAGES, "demo"}}
 MOST_MODULES = 16
 CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
-CORE += ("progress", "pose_refinement")
+CORE += ("appearance", "pose_refinement")
 OUTSIDE = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
-OURS = {f"scenefuse.{name}" for name in ("stage", "transforms", "cores", "checkpoints")}
+OURS = {f"scenefuse.{name}" for name in ("stage", "transforms", "cores", "checkpoints", "progress")}
 
 
 def modules() -> list[Path]:

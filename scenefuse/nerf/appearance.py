@@ -1,0 +1,263 @@
+"""What photos of one object differ in beside their view: exposure, white balance, vignetting, sharpness.
+
+Colours are those of the files, 0..1, as a tone curve left them. Where the curve is a power of the light, which gamma
+is, a factor of the light is a factor of the colour: so a gain per photo and channel stands for exposure and white
+balance.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, conv2d, max_pool2d
+
+from scenefuse.nerf.field import Field
+from scenefuse.nerf.losses import COLOR_DELTA
+from scenefuse.nerf.occupancy import Occupancy
+from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.render import render_view
+
+# Colours of a place are compared in photos shrunk to at most this width: depths need not be exact to a pixel for it.
+SMALL_PX = 96
+RENDER_SAMPLES = 32
+# A place is compared in the photos taken nearest to the one it is found in, where both show it: depths differ by less
+# than this share.
+COMPARED, SAME_DEPTH = 24, 0.02
+LEAST_OPACITY = 0.9
+# Darker pixels are mostly noise, and brighter ones mostly clipped.
+DARKEST, BRIGHTEST = 0.04, 0.98
+# Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
+LOG_DELTA = 0.05
+# Pull of gains towards 1, as a share of the pairs that determine them; of the vignetting, of all pairs.
+GAIN_PULL, FALLOFF_PULL = 1e-3, 1e-5
+ROUNDS = 10
+# The pull on a gain that is fitted to a finished render, in squared colour per pixel.
+RIDGE = 1e-4
+# A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
+LIKE_NEAREST = 2
+# Sharpness compares details finer than the first Gaussian's sigma with those between the two, in pixels.
+FINE_PX, COARSE_PX = 1.0, 3.0
+# It is read so far inside the mask: the object's outline is sharp in a blurred photo's mask too.
+INSIDE_PX = 3
+# A photo is compared with so many from nearby, and is blurred with less than this share of their median sharpness.
+NEAREST, BLURRED_BELOW = 8, 0.7
+
+
+@dataclass
+class Appearance:
+    """Log gains (V, 3) of V photos' red, green and blue, and the coefficient () of one vignetting for all of them.
+
+    The vignetting is exp(a r^2), a <= 0, r = 0 at the principal point and 1 at half the picture's diagonal from it: the
+    first term of the even polynomial of Goldman, "Vignette and exposure calibration and compensation" (2010). More
+    terms would be extrapolated, as objects seldom reach the corners. Photos determine gains up to one factor per
+    channel, which is fixed by a mean log gain of 0.
+    """
+
+    log_gain: Tensor
+    falloff: Tensor
+
+    @classmethod
+    def none(cls, photos: int, device: str) -> "Appearance":
+        """All photos alike."""
+        return cls(torch.zeros(photos, 3, device=device), torch.zeros((), device=device))
+
+    def factor(self, view: Tensor, radius2: Tensor) -> Tensor:
+        """(R, 3) what colours of the field are multiplied by in photos `view` (R,) at squared radii (R,)."""
+        return torch.exp(self.log_gain[view] + (self.falloff * radius2)[:, None])
+
+
+@dataclass(frozen=True)
+class SharedColors:
+    """Places that two photos show: views a and b (N,), squared radii (N, 2), log colour in a less that in b (N, 3)."""
+
+    a: Tensor
+    b: Tensor
+    radius2: Tensor
+    difference: Tensor
+
+
+def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors) -> Appearance:
+    """Gains and vignetting from the places that several photos show, as the field's depths have them.
+
+    The field's own colours are not used: they depend on the direction of view, and could take over whatever differs
+    smoothly from photo to photo.
+    """
+    small = shrunk(photos)
+    views = [
+        render_view(field, occupancy, small.camera(view), mask, RENDER_SAMPLES, colored=False)
+        for view, mask in enumerate(small.masks)
+    ]
+    depths = torch.stack([torch.where(view.opacity > LEAST_OPACITY, view.depth, 0.0) for view in views])
+    shared = shared_colors(small, depths)
+    found = solved(shared, len(photos))
+    device = field.table.device
+    return Appearance(found.log_gain.to(device), found.falloff.to(device))
+
+
+def shrunk(photos: PhotoTensors) -> PhotoTensors:
+    """Photos (V, h, w) of a whole fraction of the size; a pixel's mask holds where all of it lies on the object."""
+    factor = -(-photos.images.shape[2] // SMALL_PX)
+    images = avg_pool2d(photos.images.permute(0, 3, 1, 2).float(), factor).permute(0, 2, 3, 1)
+    masks = max_pool2d((~photos.masks).float()[:, None], factor)[:, 0] == 0
+    intrinsics = photos.intrinsics.clone()
+    intrinsics[:, :2] /= factor
+    nothing = torch.zeros(masks.shape)
+    mattes = masks.to(torch.uint8) * 255
+    return PhotoTensors(images, masks, mattes, intrinsics, photos.rotation, photos.center, nothing, nothing)
+
+
+def shared_colors(photos: PhotoTensors, depths: Tensor) -> SharedColors:
+    """Pairs of pixels (V, h, w) that show one place, from depths (V, h, w) along z, 0 for none."""
+    near = nearest(photos.center, COMPARED)
+    parts = [_shared(photos, depths, view, int(other)) for view in range(len(photos)) for other in near[view]]
+    if not parts:
+        none = torch.zeros(0, dtype=torch.int64)
+        return SharedColors(none, none, torch.zeros(0, 2), torch.zeros(0, 3))
+    return SharedColors(*(torch.cat(column) for column in zip(*parts)))
+
+
+def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """What one photo's pixels are in another, where both show the place in colours that can be compared."""
+    height, width = depths.shape[1:]
+    rows, columns = torch.nonzero(depths[a] > 0).unbind(1)
+    uv = torch.stack([columns, rows], 1) + 0.5
+    (k_a, turn_a, center_a), (k_b, turn_b, center_b) = photos.camera(a), photos.camera(b)
+    ray = torch.cat([(uv - k_a[:2, 2]) / k_a.diagonal()[:2], torch.ones(len(uv), 1)], 1)
+    x = ((ray * depths[a, rows, columns, None]) @ turn_a.T + center_a - center_b) @ turn_b
+    there = x[:, :2] / x[:, 2:].clamp(min=1e-9) * k_b.diagonal()[:2] + k_b[:2, 2]
+    u, v = (there[:, axis].clamp(0, size - 1).long() for axis, size in ((0, width), (1, height)))
+    ours, theirs = (photos.images[view, y, x] / 255.0 for view, y, x in ((a, rows, columns), (b, v, u)))
+    kept = (x[:, 2] > 0) & ((there > 0) & (there < torch.tensor([width, height]))).all(1)
+    kept &= (depths[b, v, u] - x[:, 2]).abs() < SAME_DEPTH * x[:, 2]
+    kept &= (torch.minimum(ours, theirs) > DARKEST).all(1) & (torch.maximum(ours, theirs) < BRIGHTEST).all(1)
+    radius2 = [squared_radius(p, k.expand(len(p), 3, 3), width, height) for p, k in ((uv, k_a), (there, k_b))]
+    index = torch.ones(int(kept.sum()), dtype=torch.int64)
+    return index * a, index * b, torch.stack(radius2, 1)[kept], (ours[kept] / theirs[kept]).log()
+
+
+def solved(shared: SharedColors, photos: int) -> Appearance:
+    """Gains and vignetting that shared colours agree under: least squares of log colours, with Huber's weights.
+
+    A photo that shares no colours gets a gain of 1.
+    """
+    a, b, count = shared.a, shared.b, max(len(shared.a), 1)
+    radial = (shared.radius2[:, 0] - shared.radius2[:, 1]).double()
+    difference = shared.difference.double()
+    pairs = torch.bincount(a, minlength=photos) + torch.bincount(b, minlength=photos)
+    log_gain, falloff = torch.zeros(photos, 3, dtype=torch.float64), torch.zeros((), dtype=torch.float64)
+    for _ in range(ROUNDS):
+        left = difference - (log_gain[a] - log_gain[b]) - (falloff * radial)[:, None]
+        weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
+        log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], GAIN_PULL * pairs.clamp(min=1))
+        left = (difference - (log_gain[a] - log_gain[b])).mean(1)
+        falloff = (weight * radial * left).sum() / ((weight * radial**2).sum() + FALLOFF_PULL * count)
+        falloff = falloff.clamp(max=0.0)
+    known = (pairs > 0)[:, None]
+    mean = (log_gain * known).sum(0) / known.sum().clamp(min=1)
+    return Appearance(((log_gain - mean) * known).float(), falloff.float())
+
+
+def _gains(a: Tensor, b: Tensor, weight: Tensor, difference: Tensor, pull: Tensor) -> Tensor:
+    """Log gains (V, 3) with g_a - g_b nearest to the differences (N, 3), weighted (N,), and pulled to 0 (V,)."""
+    photos = len(pull)
+    laplacian = torch.zeros(photos * photos, dtype=torch.float64).index_add(0, a * photos + b, weight)
+    laplacian = laplacian.view(photos, photos) + laplacian.view(photos, photos).T
+    normal = torch.diag(laplacian.sum(1) + pull) - laplacian
+    right = torch.zeros(photos, 3, dtype=torch.float64)
+    right = right.index_add(0, a, weight[:, None] * difference).index_add(0, b, -weight[:, None] * difference)
+    return torch.linalg.solve(normal, right)
+
+
+def nearest(center: Tensor, count: int) -> Tensor:
+    """(V, n) for each camera centre (V, 3) the nearest others, `count` or all."""
+    distance = torch.cdist(center, center).fill_diagonal_(torch.inf)
+    return distance.topk(min(count, len(center) - 1), largest=False).indices
+
+
+def squared_radius(uv: Tensor, intrinsics: Tensor, width: int, height: int) -> Tensor:
+    """Squared distance (R,) of pixels (R, 2) from the principal points of (R, 3, 3), 1 at half the diagonal."""
+    return 4 * ((uv - intrinsics[:, :2, 2]) ** 2).sum(1) / (width**2 + height**2)
+
+
+def falloff_map(falloff: Tensor, intrinsics: Tensor, height: int, width: int) -> Tensor:
+    """Vignetting (H, W, 1) of a photo with intrinsics (3, 3)."""
+    down, across = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    uv = torch.stack([across.flatten(), down.flatten()], 1)
+    radius2 = squared_radius(uv, intrinsics.expand(len(uv), 3, 3), width, height)
+    return torch.exp(falloff * radius2).view(height, width, 1)
+
+
+def fitted_log_gain(rendered: Tensor, photo: Tensor) -> Tensor:
+    """Log gains (3,) that bring rendered colours (N, 3) to a photo's (N, 3).
+
+    Least squares with Huber's weights, iterated, and a weak pull towards a gain of 1. Black renders, and none, give 0.
+    """
+    gain = torch.ones(3, dtype=torch.float64)
+    c, p = rendered.double(), photo.double()
+    ridge = RIDGE * max(len(c), 1)
+    for _ in range(ROUNDS):
+        weight = (COLOR_DELTA / (gain * c - p).abs().clamp(min=1e-9)).clamp(max=1.0)
+        gain = ((weight * c * p).sum(0) + ridge) / ((weight * c * c).sum(0) + ridge)
+    return gain.log().float()
+
+
+def gains_nearby(log_gain: Tensor, center: Tensor, trained: Tensor) -> Tensor:
+    """Log gains (V, 3) of all photos: of those trained on their own, of others the mean of the nearest ones'.
+
+    Args:
+        log_gain: (T, 3) of the photos trained on.
+        center: (V, 3) camera centres of all.
+        trained: (T,) indices of the photos trained on.
+    """
+    distance = torch.cdist(center, center[trained])
+    nearest = distance.topk(min(LIKE_NEAREST, len(trained)), largest=False).indices
+    return log_gain[nearest].mean(1).index_copy(0, trained, log_gain)
+
+
+def without_appearance(images: Tensor, intrinsics: Tensor, log_gain: Tensor, falloff: Tensor) -> Tensor:
+    """Photos (V, H, W, 3) uint8 with gains (V, 3) and vignetting () taken out: all as if of one exposure."""
+    height, width = images.shape[1:3]
+    result = torch.empty_like(images)
+    for index, image in enumerate(images):
+        factor = log_gain[index].exp() * falloff_map(falloff, intrinsics[index], height, width)
+        result[index] = (image / factor).round().clamp(0, 255).to(torch.uint8)
+    return result
+
+
+def photo_weights(sharpness: Tensor, center: Tensor) -> Tensor:
+    """Weight (V,) of each photo's colours: 1, or less where it is blurred beside the photos from nearby.
+
+    Args:
+        sharpness: (V,) as `measured_sharpness` has it.
+        center: (V, 3) camera centres.
+    """
+    count = len(sharpness)
+    if count < 2:
+        return torch.ones(count)
+    share = sharpness / torch.quantile(sharpness[nearest(center, NEAREST)], 0.5, dim=1).clamp(min=1e-9)
+    return torch.where(share < BLURRED_BELOW, (share / BLURRED_BELOW) ** 2, torch.ones(count))
+
+
+def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
+    """Sharpness (V,) of (V, H, W, 3) uint8 photos in their masks (V, H, W): fine detail as a share of coarser detail.
+
+    The ratio of two neighbouring bands depends little on contrast and on what is shown; blur takes the finer band away.
+    Photos with too little in their mask get the median of the others.
+    """
+    found = torch.full((len(images),), torch.nan)
+    for index, (image, mask) in enumerate(zip(images, dilate(masks, -INSIDE_PX))):
+        if mask.sum() < 2:
+            continue
+        gray = image.float().mean(2)
+        smooth = _blurred(gray, FINE_PX)
+        found[index] = (gray - smooth)[mask].std() / (smooth - _blurred(gray, COARSE_PX))[mask].std().clamp(min=1e-6)
+    return torch.where(found.isnan(), found.nanmedian().nan_to_num(1.0), found)
+
+
+def _blurred(gray: Tensor, sigma: float) -> Tensor:
+    """A picture (H, W) under a Gaussian."""
+    reach = int(3 * sigma + 0.5)
+    line = torch.exp(-((torch.arange(-reach, reach + 1) / sigma) ** 2) / 2)
+    line = (line / line.sum()).view(1, 1, 1, -1)
+    rows = conv2d(gray[None, None], line, padding=(0, reach))
+    return conv2d(rows, line.transpose(2, 3), padding=(reach, 0))[0, 0]
