@@ -1,5 +1,6 @@
 """What probably went wrong with an object, in words: which photos, and what to photograph or click instead."""
 
+import math
 from collections.abc import Callable, Iterator
 
 from scenefuse.report.collected import Collected
@@ -11,6 +12,8 @@ QUOTED = 5
 WIDE_GAP_DEG = 100.0
 # Masks deserve a word where more than this share of the photos is left out, or where the others agree by less (IoU).
 MANY_LEFT_OUT, POOR_AGREEMENT = 0.1, 0.75
+# Photos this much brighter or darker than the others, in stops (powers of two), deserve a word.
+EXPOSURE_JUMP = 0.7
 
 
 def diagnose(item: Collected) -> list[str]:
@@ -68,6 +71,22 @@ def _masks(fields: Fields) -> Iterator[str]:
         )
 
 
+def _exposed(fields: Fields) -> Iterator[str]:
+    """Photos that are blurred, or much brighter or darker than the others, in the order of that."""
+    blurred = find(fields, "stage2.blurred_photos")
+    if blurred:
+        names = sorted(blurred)
+        yield f"blurred photos ({len(names)}): {named(names)}; they count less in the NeRF: replace or remove them"
+    gains = find(fields, "stage2.photo_gains") or {}
+    stops = {name: abs(math.log2(sum(gain) / len(gain))) for name, gain in gains.items()}
+    jumps = sorted((name for name in stops if stops[name] > EXPOSURE_JUMP), key=lambda name: -stops[name])
+    if jumps:
+        yield (
+            f"photos exposed {EXPOSURE_JUMP:g} stops and more beside the others ({len(jumps)}): {named(jumps)}; it is"
+            " evened out, but what is too dark or too bright holds no detail: fix the exposure while photographing"
+        )
+
+
 def _unlinked(fields: Fields) -> Iterator[str]:
     """Nothing that the photos of object and scene share."""
     if find(fields, "alignment.found") is False:
@@ -77,4 +96,4 @@ def _unlinked(fields: Fields) -> Iterator[str]:
         )
 
 
-CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _one_side, _masks, _unlinked)
+CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _one_side, _masks, _exposed, _unlinked)

@@ -17,6 +17,8 @@ GOOD = {
     "masks.photos_left_out": ["a.jpg"],
     "masks.median_agreement": 0.9,
     "alignment.found": True,
+    "stage2.blurred_photos": {},
+    "stage2.photo_gains": {"a.jpg": [1.2, 0.9, 1.0]},
 }
 
 
@@ -42,6 +44,8 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
         ({"undistorted__largest_gap_deg": 190.0}, ["within 190 degrees, between a.jpg and b.jpg"]),
         ({"masks__photos_left_out": [f"{k}.jpg" for k in range(9)]}, ["9 of 40 masks", "and 4 more"]),
         ({"masks__median_agreement": 0.6}, ["agree by 0.60 only"]),
+        ({"stage2__blurred_photos": {"b.jpg": 0.4}}, ["blurred photos (1): b.jpg"]),
+        ({"stage2__photo_gains": {"a.jpg": [1, 1.1, 1], "b.jpg": [0.5, 0.5, 0.5]}}, ["others (1): b.jpg"]),
         ({"alignment__found": False, "alignment__reason": "no match"}, ["not linked with the scene's (no match)"]),
     ],
 )
