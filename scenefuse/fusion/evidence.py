@@ -87,7 +87,7 @@ class Weighed:
     notes: tuple[str, ...]
 
 
-def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
+def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None) -> Weighed:
     """Check the points of an object and of the scene around it in the photos of both.
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
@@ -100,13 +100,14 @@ def weigh(obj: Side, scene: Side, nerf_only: bool) -> Weighed:
         obj: the object in the scene's frame, registered.
         scene: the scene's points around it.
         nerf_only: whether points of the object that no photo confirms are added where the scene has none.
+        certain: how certain the registration was; see `settle`.
     """
     obj, scene = replace(obj, cloud=with_normals(obj.cloud)), replace(scene, cloud=with_normals(scene.cloud))
     diagonal = obj.cloud.diagonal
     of_obj, of_scene = _own(obj, scene), _own(scene, obj)
     on_obj = _supported(obj.cloud.points, of_obj.measured, diagonal)
     on_scene = _supported(scene.cloud.points, of_scene.measured, diagonal)
-    found = settle(obj.cloud[on_obj], scene.cloud[on_scene], diagonal)
+    found = settle(obj.cloud[on_obj], scene.cloud[on_scene], diagonal, certain)
     settled, moved = found or (Sim3.identity(), None)
     obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
     across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
@@ -146,6 +147,8 @@ def _notes(obj: Side, scene: Side, on_obj: NDArray[np.bool_], moved: float | Non
         notes.append(
             "the object stays where the registration put it: too little is measured on both sides, or it would move far"
         )
+    elif moved == 0:
+        notes.append("the object stays where the registration put it: that is more certain than what the surfaces say")
     return tuple(notes)
 
 

@@ -36,6 +36,7 @@ from scenefuse.fusion.modes import (
 from scenefuse.fusion.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.io.units import length_unit
+from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
@@ -147,7 +148,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
                 photos_of(inputs.object_workspace, obj.points, pose),
                 photos_of(inputs.scene_workspace, placed.points),
             )
-            fused = fuse_by_evidence(placed, scene, *photos, settings)
+            fused = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
             covariance = value(registration, "covariance") if "covariance" in registration else None
             if covariance is not None:
                 added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
@@ -173,7 +174,21 @@ def is_placed(registration: dict[str, Any]) -> bool:
     return value(registration, "status") in ("registered", "ungated")
 
 
-def fuse_by_evidence(obj: Cloud, scene: Cloud, of_obj: Photos, of_scene: Photos, settings: FusionSettings) -> Fused:
+def uncertainty_on_scene(registration: dict[str, Any]) -> Uncertainty | None:
+    """Of a pose on the scene as it is, by a fine registration's JSON; None where nothing checked the pose."""
+    known = value(registration, "on_scene") if "on_scene" in registration else {}
+    covariance = known["covariance"]["value"] if known else None
+    return None if covariance is None else Uncertainty.of(np.array(covariance))
+
+
+def fuse_by_evidence(
+    obj: Cloud,
+    scene: Cloud,
+    of_obj: Photos,
+    of_scene: Photos,
+    settings: FusionSettings,
+    uncertainty: Uncertainty | None = None,
+) -> Fused:
     """Fuse by what photos know of the points of both sides; see `weigh`.
 
     Args:
@@ -182,10 +197,12 @@ def fuse_by_evidence(obj: Cloud, scene: Cloud, of_obj: Photos, of_scene: Photos,
         of_obj: the object's photos in the scene's frame.
         of_scene: the scene's photos that see the object.
         settings: see FusionSettings.
+        uncertainty: of the object's pose on the scene, where it is known.
     """
+    certain = None if uncertainty is None else uncertainty.size(obj.diagonal)
     rows = np.flatnonzero(around(scene, obj))
     near = scene[rows]
-    weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only)
+    weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only, certain)
     step = spacing(near.points)
     moved, gain, bias = with_colors_of(weighed.obj, near, FILL_SPACINGS * step, settings.match_colors)
     added = thinned(moved[weighed.added], settings.density * step)

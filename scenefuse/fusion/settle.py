@@ -21,22 +21,30 @@ MOST, QUERIES = 20000, 5000
 """Points at most of each side, drawn evenly, and of these those that look for a partner. They are not averaged, which
 would round corners off."""
 ROUNDS = 10
+OUT_OF_PLACE = 0.005
+"""An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed: a
+registration's position may be as uncertain as that."""
 HALVES, STEADY = 6, 0.003
 """Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale
 to be settled too: a roof alone does not say how large a house is."""
 
 
-def settle(obj: Cloud, scene: Cloud, diagonal: float, seed: int = 0) -> tuple[Sim3, float] | None:
+def settle(
+    obj: Cloud, scene: Cloud, diagonal: float, certain: float | None = None, seed: int = 0
+) -> tuple[Sim3, float] | None:
     """The similarity that lays measured points of an object on those of the scene, and how far it moves them.
 
     The registration worked on whole clouds, with what stereo made up at edges and the NeRF where nothing was seen; here
     both sides are what their photos confirmed, so the same refinement (method R8: planes, points and colours both ways)
-    is more exact. The scale stays what it is where the surfaces do not determine it.
+    is more exact. The scale stays what it is where the surfaces do not determine it. Where the registration was more
+    certain than that, by the photos that both sides share for instance, the object stays as it is, unless it would move
+    by more than OUT_OF_PLACE: the surfaces of a scene's stereo have errors of their own.
 
     Args:
         obj: measured points in the scene's frame, with normals, and colours if both have them.
         scene: the scene's around them, likewise.
         diagonal: of the object.
+        certain: `size` of the registration's uncertainty on the scene, over the diagonal; None where it is not known.
         seed: of the drawing.
 
     Returns:
@@ -51,6 +59,8 @@ def settle(obj: Cloud, scene: Cloud, diagonal: float, seed: int = 0) -> tuple[Si
     if spread is None or spread.size(diagonal) > STEADY:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
+    if certain is not None and moved <= OUT_OF_PLACE and (spread is None or certain < spread.size(diagonal)):
+        return Sim3.identity(), 0.0
     return (pose, moved) if moved <= MOST_SETTLED else None
 
 

@@ -22,13 +22,20 @@ from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.fusion.evidence import MEASURED, around
-from scenefuse.fusion.fuse_object import FROM_OBJECT, fuse_by_distance, fuse_by_evidence, together
+from scenefuse.fusion.fuse_object import (
+    FROM_OBJECT,
+    fuse_by_distance,
+    fuse_by_evidence,
+    together,
+    uncertainty_on_scene,
+)
 from scenefuse.fusion.modes import FusionSettings
 from scenefuse.fusion.photo_check import LEAST_PHOTOS, moved_photos, read_photos
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
+from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.stage import StageError, read_json, run, threads, value
 from scenefuse.transforms import Array, Sim3
 from scenefuse.workspace import read_workspace
@@ -57,6 +64,7 @@ class Case:
         scene: the whole scene.
         crop: the scene's points on the object.
         pose: scene_from_object.
+        uncertainty: of the pose on the scene, as the registration states it.
         truth_from_scene: from the scene's evaluation.
         known: the object as it truly is.
         surface: (M, 3) what is to be found of its surface, in the truth's frame.
@@ -68,6 +76,7 @@ class Case:
     scene: Cloud
     crop: Cloud
     pose: Sim3
+    uncertainty: Uncertainty | None
     truth_from_scene: Sim3
     known: ObjectTruth
     surface: Array
@@ -96,7 +105,7 @@ def fuse(case: Case, settings: FusionSettings) -> Cloud:
         placed = case.object.transformed(case.pose)
         own = read_photos(read_workspace(case.results / "objects" / case.name / "undistorted"), case.object.points)
         theirs = read_photos(read_workspace(case.results / "scenes/demo/undistorted"), placed.points)
-        fused = fuse_by_evidence(placed, case.scene, moved_photos(own, case.pose), theirs, settings)
+        fused = fuse_by_evidence(placed, case.scene, moved_photos(own, case.pose), theirs, settings, case.uncertainty)
     else:
         fused = fuse_by_distance(case.object, case.scene, case.crop, case.pose, settings)
     return together(fused.kept, fused.added)
@@ -127,6 +136,7 @@ def read_case(results: Path, name: str, scene: Cloud) -> Case:
         scene,
         read_cloud(folder / "registration/full/crop.ply"),
         Sim3.from_matrix(np.array(value(fine, "scene_from_object"))),
+        uncertainty_on_scene(fine),
         Sim3.from_matrix(np.array(value(read_json(results / "scenes/demo/truth.json"), "truth_from_scene"))),
         known,
         surface_to_find(known, read_cameras(truth / "scene/cameras.json")),

@@ -119,6 +119,18 @@ def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
 
 
+def test_an_object_whose_pose_is_more_certain_than_the_surfaces_stays(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
+    off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.008]))
+    sides = Side(obj.transformed(off), moved_photos(near, off)), Side(scene, far)
+    stays, settles = (weigh(*sides, nerf_only=False, certain=certain) for certain in (0.0, 0.1))
+    assert stays.moved == 0 and any("more certain" in note for note in stays.notes)
+    assert settles.moved > 0.002
+    away = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
+    sides = Side(obj.transformed(away), moved_photos(near, away)), Side(scene, far)
+    assert weigh(*sides, nerf_only=False, certain=0.0).moved > 0.005
+
+
 def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
     rng = np.random.default_rng(1)
     sheets = [sheet(-0.8, 0.8, step, noise=noise) for step, noise in ((0.02, 0.003), (0.03, 0.008))]
