@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.shared_photos import align, drawn
+from benchmarks.shared_photos import drawn
 from support.photographed_place import HALF_ANGLE_DEG, HALF_SCALE_LOG
 from support.planted import errors
 from support.planted_photos import Plan, mapped, plant_photos, truth
 
+from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.stage import value
 from scenefuse.transforms import Sim3
 
@@ -32,7 +33,8 @@ def test_a_trial_without_bending_is_solved_right(straight):
     object_from_world = Sim3(3.0, np.eye(3)[[1, 2, 0]], np.array([4.0, 5, 6]))
     straight.obj.move(object_from_world @ straight.obj.world_from_model())
     straight.scene.move(straight.scene.world_from_model())
-    content, known = align(straight.obj, straight.scene, 0), truth(straight)
+    settings, known = AlignmentSettings(), truth(straight)
+    content = align_landmarks(straight.obj.landmarks(), straight.scene.landmarks(), settings, seed=0)
     assert value(content, "found") is True
     pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
     for true in (known.scene_from_object, known.here, object_from_world.inverse()):
