@@ -7,14 +7,19 @@ def variant_options(part):
 
 
 def crop_mode(wildcards):
-    """How a variant crops; without fiducials, the object's masks mark it."""
+    """How a variant crops; without fiducials, the object's masks mark it, which takes photos of both sides."""
     marked = object_row(wildcards.object).get("fiducials")
-    return VARIANTS[wildcards.variant]["crop"]["mode"] if marked else "masks"
+    mode = VARIANTS[wildcards.variant]["crop"]["mode"] if marked else "masks"
+    if mode == "masks" and not is_linked(wildcards):
+        return "fiducials" if marked else "none"
+    return mode
 
 
 def crop_marks(wildcards):
     """The files that mark an object in its scene: option of the crop -> path."""
     if VARIANTS[wildcards.variant]["crop"].get("whole_scene"):
+        return {}
+    if crop_mode(wildcards) == "none":
         return {}
     if crop_mode(wildcards) == "masks":
         folder = f"results/objects/{wildcards.object}"

@@ -26,9 +26,10 @@ LEAST_LEFT = 0.05
 class CropSettings:
     """Settings of the crop."""
 
-    mode: Literal["fiducials", "masks"] = setting("fiducials")
+    mode: Literal["fiducials", "masks", "none"] = setting("fiducials")
     """What marks the object in the scene: fiducials, or its masks, seen through the alignment from shared features (in
-    any case for objects without fiducials)."""
+    any case for objects without fiducials). `none`: the object is looked for in the whole scene (in any case without
+    fiducials where one side has no photos)."""
     shape: Literal["box", "oriented", "hull"] = setting("box")
     """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float = setting(0.05, least=0)
