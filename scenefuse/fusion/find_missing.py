@@ -82,7 +82,10 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         _write_geojson(outputs.geojson, [])
         status, reason = "unregistered", value(fusion, "reason")
         if value(fusion, "status") == "fused":
-            status, reason = "not_looked_for", "the object is a cloud without photos: what these lack is not known"
+            status, reason = (
+                "not_looked_for",
+                "the object has no photos: surface that none of them confirms is not looked for",
+            )
         write_json(outputs.report, {"status": quantity(status, ""), "reason": quantity(reason, "")})
         return
     folders = inputs.object_workspace, inputs.masks

@@ -4,7 +4,7 @@ Read here and not by Open3D, whose readers take positions as float32: at UTM coo
 """
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -127,45 +127,59 @@ def triangles(polygons: list[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]
     return np.concatenate(corners)[order], np.concatenate(of)[order]
 
 
+@dataclass
+class _Obj:
+    """The lines of an OBJ file, rows from 0; `place` is -1 where a corner has no `vt`."""
+
+    vertices: list[list[float]] = field(default_factory=list)
+    uvs: list[list[float]] = field(default_factory=list)
+    polygons: list[list[int]] = field(default_factory=list)
+    places: list[list[int]] = field(default_factory=list)
+    used: list[str] = field(default_factory=list)
+    libraries: list[str] = field(default_factory=list)
+    material: str = ""
+
+    def take(self, line: str) -> None:
+        word, _, rest = line.strip().partition(" ")
+        if word == "v":
+            self.vertices.append([float(cell) for cell in rest.split()])
+        elif word == "vt":
+            self.uvs.append([float(cell) for cell in rest.split()[:2]])
+        elif word == "f":
+            cells = [cell.split("/") for cell in rest.split()]
+            self.polygons.append([_row(cell[0], len(self.vertices)) for cell in cells])
+            self.places.append([_row(c[1], len(self.uvs)) if len(c) > 1 and c[1] else -1 for c in cells])
+            self.used.append(self.material)
+        elif word == "usemtl":
+            self.material = rest.strip()
+        elif word == "mtllib":
+            self.libraries.append(rest.strip())
+
+
 def read_obj(path: Path) -> Columns:
     """Wavefront OBJ: positions, colours behind them, polygons, pictures of the materials (`map_Kd`).
 
     Without faces its vertices are the points.
     """
-    vertices: list[list[float]] = []
-    uvs: list[list[float]] = []
-    polygons: list[list[int]] = []
-    places: list[list[int]] = []
-    used, names, libraries = [], {"": -1}, []
-    name = ""
+    content = _Obj()
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
-            word, _, rest = line.strip().partition(" ")
-            if word == "v":
-                vertices.append([float(cell) for cell in rest.split()])
-            elif word == "vt":
-                uvs.append([float(cell) for cell in rest.split()[:2]])
-            elif word == "f":
-                cells = [cell.split("/") for cell in rest.split()]
-                polygons.append([_row(cell[0], len(vertices)) for cell in cells])
-                places.append([_row(cell[1], len(uvs)) if len(cell) > 1 and cell[1] else -1 for cell in cells])
-                used.append(names.setdefault(name, len(names) - 1))
-            elif word == "usemtl":
-                name = rest.strip()
-            elif word == "mtllib":
-                libraries.append(rest.strip())
-    table = np.array([vertex[:6] if len(vertex) >= 6 else vertex[:3] for vertex in vertices], np.float64)
-    table = table.reshape(len(vertices), -1)
-    points = {axis: table[:, k] for k, axis in enumerate("xyz")} if len(table) else {k: np.empty(0) for k in "xyz"}
-    colors = table[:, 3:6] * (255.0 if table[:, 3:6].max() <= 1 else 1.0) if table.shape[1] == 6 else None
-    if not polygons:
-        return points | ({} if colors is None else dict(zip(("red", "green", "blue"), np.rint(colors).T)))
-    faces, of = triangles(polygons)
-    corner = triangles(places)[0]
-    known = np.array([*uvs, [np.nan, np.nan]], np.float64)
-    found = [material for library in libraries for material in _materials(path.parent / library).items()]
-    materials = tuple(dict(found).get(key, Material()) for key in names if key) if found else ()
-    return sampled_columns(Mesh(table[:, :3], faces, colors, known[corner], np.array(used)[of], materials))
+            content.take(line)
+    if not content.vertices:
+        return {axis: np.empty(0) for axis in "xyz"}
+    width = 6 if min(map(len, content.vertices)) >= 6 else 3
+    table = np.array([vertex[:width] for vertex in content.vertices], np.float64)
+    colors = table[:, 3:] * (255.0 if table[:, 3:].max() <= 1 else 1.0) if width == 6 else None
+    if not content.polygons:
+        columns: Columns = dict(zip("xyz", table[:, :3].T))
+        return columns if colors is None else columns | dict(zip(("red", "green", "blue"), np.rint(colors).T))
+    faces, of = triangles(content.polygons)
+    uvs = np.array([*content.uvs, [np.nan, np.nan]], np.float64)[triangles(content.places)[0]]
+    known = dict(pair for name in content.libraries for pair in _materials(path.parent / name).items())
+    names = sorted(set(content.used))
+    material = np.array([names.index(name) for name in content.used])[of]
+    materials = tuple(known.get(name, Material()) for name in names) if known else ()
+    return sampled_columns(Mesh(table[:, :3], faces, colors, uvs, material, materials))
 
 
 def _row(cell: str, count: int) -> int:

@@ -14,7 +14,6 @@ from scenefuse.io.settings import ROOT, merge, problem, schema_of, with_defaults
 from scenefuse.io.tables import Row, read_table
 from scenefuse.stage import StageError
 
-
 # Columns that say something about a row's photos.
 OF_PHOTOS = ("calibration", "prompts", "masks", "truth")
 
@@ -63,8 +62,8 @@ def read_project(config: Mapping[str, Any]) -> Project:
             )
         if row.get("truth") and scenes[row["scene"]].get("cloud"):
             raise StageError(
-                f"{settings['objects']}: object '{name}' has a truth, but its scene '{row['scene']}' is a cloud, and the"
-                " evaluation compares cameras; empty the cell"
+                f"{settings['objects']}: object '{name}' has a truth, but its scene '{row['scene']}' is a cloud, and"
+                " the evaluation compares cameras; empty the cell"
             )
     return Project(settings, scenes, objects, _variants(settings["registration"]))
 

@@ -33,8 +33,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
     missing.png (what is still missing, and from where photos would show it), registration.png (object over crop, with
-    the decision) and object.png (frames, masks, depth of the four stages,
-    renders, the object's cloud, alone where it was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
+    the decision) and object.png (frames, masks, depth of the four stages, renders, the object's cloud, alone where it
+    was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
