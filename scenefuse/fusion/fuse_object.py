@@ -132,7 +132,7 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
             point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit),
             `world_deviation` (the same; of the object's points with the uncertainty of its pose), `evidence` (0 not
-            checked, 1 measured, 2 NeRF only, 3 stereo only).
+            checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only).
         settings: see FusionSettings.
     """
     start = time.perf_counter()

@@ -20,10 +20,6 @@ UP = np.array([0.0, 0.0, 1.0])
 # Fewer points than this give no features to register by.
 MIN_POINTS = 200
 MIN_FIDUCIALS = 4
-UNMARKED = (
-    "nothing marks the object: there are no fiducials, and masks can only mark it where object and scene both have"
-    " photos; it is looked for in the whole scene, as if that showed little else"
-)
 
 
 @dataclass(frozen=True)
@@ -62,13 +58,10 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
             fiducials nor a pose of the object from the alignment.
     """
     scene, mode = read_cloud(inputs.scene), "none" if settings.whole_scene else settings.mode
-    unmarked = not settings.whole_scene and mode == "none"
     fiducials, voted = np.zeros((0, 3)), 0
     if mode == "none":
         cut = whole(scene)
-        if unmarked:
-            cut = replace(cut, notes=[UNMARKED])
-            print(UNMARKED, flush=True)
+        print(cut.notes[0], flush=True)
     elif mode == "masks":
         cut, voted = crop_by_masks(scene, inputs, settings)
     else:
