@@ -16,7 +16,7 @@ from scenefuse.fusion.next_photos import UPWARDS, Plan, plan_stations
 from scenefuse.fusion.photo_check import Photos
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.units import length_unit
-from scenefuse.sfm.geodesy import LocalFrame, scene_frame
+from scenefuse.sfm.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.workspace import View, with_mask
@@ -40,14 +40,14 @@ class MissingInputs:
     """JSON of the fusion: where the object settled in the scene."""
     crop_json: Path
     """JSON of the crop stage, for the direction of gravity."""
-    object_workspace: Path
-    """The object's undistorted COLMAP workspace."""
-    scene_workspace: Path
-    """The scene's, in the frame of its cloud."""
-    masks: Path
-    """Folder of the object's masks, {photo}.png."""
     georeference_json: Path
     """JSON with `crs` and the scene's origin, if it has one."""
+    object_workspace: Path | None = None
+    """The object's undistorted COLMAP workspace; without it nothing is looked for."""
+    scene_workspace: Path | None = None
+    """The scene's, in the frame of its cloud, where it has photos."""
+    masks: Path | None = None
+    """Folder of the object's masks, {photo}.png; as the workspace."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class MissingOutputs:
 
 def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     """Find the surface of a fused object that no photo confirms, and the camera positions that would show most of it
-    (method F5, F6); of an unregistered object nothing is written but the reason.
+    (method F5, F6); of an unregistered object, and of one without photos, nothing is written but the reason.
 
     Args:
         inputs: see MissingInputs.
@@ -75,15 +75,21 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     start = time.perf_counter()
     use_threads(threads())
     fusion, unit = read_json(inputs.fusion_json), length_unit(inputs.georeference_json)
-    if value(fusion, "status") != "fused":
+    if value(fusion, "status") != "fused" or inputs.object_workspace is None or inputs.masks is None:
         nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
         write_cloud(outputs.missing, nothing)
         _write_table(outputs.next_photos, [])
         _write_geojson(outputs.geojson, [])
-        reason = {"status": quantity("unregistered", ""), "reason": quantity(value(fusion, "reason"), "")}
-        write_json(outputs.report, reason)
+        status, reason = "unregistered", value(fusion, "reason")
+        if value(fusion, "status") == "fused":
+            status, reason = (
+                "not_looked_for",
+                "the object has no photos: surface that none of them confirms is not looked for",
+            )
+        write_json(outputs.report, {"status": quantity(status, ""), "reason": quantity(reason, "")})
         return
-    obj, photos, masks = _in_scene(inputs, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
+    folders = inputs.object_workspace, inputs.masks
+    obj, photos, masks = _in_scene(inputs, *folders, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
     completed = with_normals(read_cloud(inputs.fused_scene))
     missing = find_missing_surface(obj, completed[around(completed, obj)], photos, masks)
     up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
@@ -97,12 +103,14 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     write_json(outputs.report, content)
 
 
-def _in_scene(inputs: MissingInputs, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
+def _in_scene(
+    inputs: MissingInputs, workspace: Path, masks: Path, pose: Sim3
+) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
     """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
     own = with_normals(read_cloud(inputs.object))
     obj = own.transformed(pose)
-    photos = photos_of(inputs.object_workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
-    views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
+    photos = photos_of(workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
+    views = [(view, masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
     return obj, photos, [_silhouette(view, path) for view, path in views if path.is_file()]
 
 
@@ -129,7 +137,7 @@ def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
     }
 
 
-def photo_rows(plan: Plan, up: Array, frame: LocalFrame | None) -> list[dict[str, Any]]:
+def photo_rows(plan: Plan, up: Array, frame: LocalFrame | GridFrame | None) -> list[dict[str, Any]]:
     """A row for each photo; up: (3,) direction opposite to gravity, scene frame."""
     rows, level = [], rotation_between(up, UPWARDS)
     for number, station in enumerate(plan.stations, 1):
@@ -140,7 +148,7 @@ def photo_rows(plan: Plan, up: Array, frame: LocalFrame | None) -> list[dict[str
                 "photo": int(view.name),
                 **{axis: float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)},
             }
-            if frame is not None:
+            if frame is not None and frame.crs is not None:
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude, 3)

@@ -22,6 +22,7 @@ from scenefuse.fusion.evidence import (
     around,
     unchecked,
     weigh,
+    with_normals,
     with_pose_uncertainty,
 )
 from scenefuse.fusion.modes import (
@@ -43,6 +44,8 @@ from scenefuse.transforms import Array, Sim3
 from scenefuse.workspace import read_workspace
 
 FROM_SCENE, FROM_OBJECT = 0, 1
+GREY = 128
+"""Of the points of an object without colours in a scene that has some."""
 
 
 @dataclass(frozen=True)
@@ -130,16 +133,19 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
             point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit),
             `world_deviation` (the same; of the object's points with the uncertainty of its pose), `evidence` (0 not
-            checked, 1 measured, 2 NeRF only, 3 stereo only).
+            checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only).
         settings: see FusionSettings.
     """
     start = time.perf_counter()
     use_threads(threads())
     scene, part, obj = (read_cloud(path) for path in (inputs.scene, inputs.crop, inputs.object))
     registration = read_json(inputs.fine_json)
+    settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
+    if scene.normals is not None:
+        obj = with_normals(obj)
     if not is_placed(registration):
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
-        pose, fused = None, _unchanged(obj, scene)
+        pose, fused, notes = None, _unchanged(obj, scene), []
     else:
         pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
         if settings.mode == "evidence":
@@ -155,6 +161,12 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
                 fused = replace(fused, added=added)
         else:
             fused = fuse_by_distance(obj, scene, part, pose, settings)
+    if scene.colors is not None and obj.colors is None:
+        notes.append("the object has no colours: its points are grey in the scene")
+        grey = np.full((len(fused.added), 3), GREY, np.uint8)
+        fused = replace(fused, added=replace(fused.added, colors=grey))
+    for note in notes:
+        print(note, flush=True)
     _write(fused, read_json(inputs.crop_json), inputs, outputs)
     unit = length_unit(inputs.georeference_json)
     write_json(outputs.evidence, evidence_report(fused, unit))
@@ -163,10 +175,28 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     content = _report(fused, registration, spacing(part.points), unit) | {
         "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
         "mode": quantity(settings.mode, ""),
+        "notes": quantity(([] if fused.weighed is None else list(fused.weighed.notes)) + notes, ""),
         "object_points": quantity(len(obj), "points"),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(outputs.report, content)
+
+
+def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
+    """What can be done of `evidence` with the photos that there are, and notes of what cannot.
+
+    An object given as a cloud was measured by something else: where no photo contradicts its points, they fill what the
+    scene lacks, marked as not confirmed. Without any photo, distances alone decide.
+    """
+    if settings.mode != "evidence" or object_photos:
+        return settings, []
+    if scene_photos:
+        note = (
+            "the object has no photos: what the scene's neither confirm nor contradict is added where nothing else is"
+        )
+        return replace(settings, nerf_only=True), [note]
+    note = "neither side has photos: no point is checked; the object's points fill what the scene lacks, by distance"
+    return replace(settings, mode="fill"), [note]
 
 
 def is_placed(registration: dict[str, Any]) -> bool:
@@ -265,7 +295,6 @@ def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, un
         "scene_spacing": quantity(scene_spacing, unit),
         "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
         "settled_by": quantity(None if weighed is None else weighed.moved, "diagonals"),
-        "notes": quantity([] if weighed is None else list(weighed.notes), ""),
         "fill_distance": quantity(fused.same_distance, unit),
         "color_gain": quantity(fused.gain, "1"),
         "color_bias": quantity(fused.bias, "of 255"),

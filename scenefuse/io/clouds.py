@@ -138,11 +138,18 @@ def sampled(points: NDArray[np.float64], most: int, seed: int) -> NDArray[np.flo
 
 
 def read_cloud(path: Path) -> Cloud:
-    """Read PLY, LAS, LAZ, E57, PCD, or text (XYZ, PTS, TXT, ASC, CSV). Rows without a finite position are left out.
+    """Read PLY, LAS, LAZ, E57, PCD, text (XYZ, PTS, TXT, ASC, CSV), or a mesh (PLY, OBJ, GLB) as points on its faces.
+
+    Rows without a finite position are left out.
 
     Raises:
         StageError: the file is missing, damaged, of an unknown ending, or holds no points.
     """
+    return read_counted(path)[0]
+
+
+def read_counted(path: Path) -> tuple[Cloud, int]:
+    """`read_cloud`, and how many rows without a finite position were left out."""
     columns = read_columns(Path(path))
     points = np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1)
     finite = np.isfinite(points).all(1)
@@ -153,12 +160,13 @@ def read_cloud(path: Path) -> Cloud:
         points, columns = points[finite], {name: values[finite] for name, values in columns.items()}
     normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
     colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
-    return Cloud(
+    cloud = Cloud(
         points,
         None if normals is None else np.nan_to_num(normals.astype(np.float32)),
         None if colors is None else bytes_of(colors),
         {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
     )
+    return cloud, int(np.sum(~finite))
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:

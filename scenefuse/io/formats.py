@@ -1,4 +1,5 @@
-"""Point cloud files of any known ending as named columns: PLY, LAS and LAZ, E57, PCD, and rows of text.
+"""Point cloud files of any known ending as named columns: PLY, LAS and LAZ (COPC too), E57, PCD, rows of text, and
+meshes (PLY with faces, OBJ, GLB), from whose faces points are drawn.
 
 Columns have the names that PLY uses (x, y, z, nx, ny, nz, red, green, blue); all others keep their own. Positions keep
 the precision of the file. Libraries are loaded when a file needs them.
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
 from scenefuse.stage import StageError
 
 Columns = dict[str, NDArray[Any]]
@@ -33,7 +35,7 @@ def read_columns(path: Path) -> Columns:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise StageError(
-            f"{path}: '{path.suffix}' is no known ending of a point cloud; convert it to one of {', '.join(READERS)}"
+            f"{path}: '{path.suffix}' is no known ending of a cloud or mesh; convert it to one of {', '.join(READERS)}"
         )
     if not path.is_file():
         raise StageError(f"{path} does not exist; give the path of a cloud ({', '.join(READERS)})")
@@ -84,8 +86,22 @@ def _common_name(name: str) -> str:
 def _ply(path: Path) -> Columns:
     from plyfile import PlyData
 
-    vertex = PlyData.read(path)["vertex"].data
-    return {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
+    content = PlyData.read(path)
+    vertex = content["vertex"].data
+    columns = {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
+    if "face" not in content or not len(content["face"].data):
+        return columns
+    face = content["face"].data
+    corners = next((name for name in ("vertex_indices", "vertex_index") if name in face.dtype.names), None)
+    if corners is None or not set(POSITION) <= set(columns):
+        return columns
+    named = {_common_name(name): values for name, values in columns.items()}
+    vertices = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
+    colors = None
+    if set(COLOR) <= set(named):
+        colors = bytes_of(np.stack([named[name] for name in COLOR], axis=1)).astype(np.float64)
+    faces = triangles(list(face[corners]))[0]
+    return sampled_columns(Mesh(vertices, faces, colors, None, np.full(len(faces), -1)))
 
 
 def _las(path: Path) -> Columns:
@@ -282,6 +298,8 @@ def _numbers(line: str) -> list[float]:
 
 READERS = {
     ".ply": _ply,
+    ".obj": read_obj,
+    ".glb": read_glb,
     ".las": _las,
     ".laz": _las,
     ".e57": _e57,

@@ -14,6 +14,9 @@ from scenefuse.io.settings import ROOT, merge, problem, schema_of, with_defaults
 from scenefuse.io.tables import Row, read_table
 from scenefuse.stage import StageError
 
+# Columns that say something about a row's photos.
+OF_PHOTOS = ("calibration", "prompts", "masks", "truth")
+
 
 @dataclass(frozen=True)
 class Project:
@@ -46,11 +49,21 @@ def read_project(config: Mapping[str, Any]) -> Project:
     scenes, objects = (_checked_table(settings[f"{kind}s"], kind) for kind in ("scene", "object"))
     if not scenes:
         raise StageError(f"{settings['scenes']} has no rows; add one for each scene")
+    for kind, rows in (("scene", scenes), ("object", objects)):
+        for name, row in rows.items():
+            wrong = _cloud_problem(row)
+            if wrong:
+                raise StageError(f"{settings[f'{kind}s']}: {kind} '{name}' {wrong}")
     for name, row in objects.items():
         if row["scene"] not in scenes:
             raise StageError(
                 f"{settings['objects']}: object '{name}' lies in scene '{row['scene']}',"
                 f" which {settings['scenes']} does not list"
+            )
+        if row.get("truth") and scenes[row["scene"]].get("cloud"):
+            raise StageError(
+                f"{settings['objects']}: object '{name}' has a truth, but its scene '{row['scene']}' is a cloud, and"
+                " the evaluation compares cameras; empty the cell"
             )
     return Project(settings, scenes, objects, _variants(settings["registration"]))
 
@@ -65,6 +78,18 @@ def _checked_table(name: str, kind: str) -> dict[str, Row]:
         if wrong:
             raise StageError(f"{name}, row {number}, {wrong}")
     return rows
+
+
+def _cloud_problem(row: Row) -> str:
+    """What is wrong with a row that has a cloud in the place of photos, or neither; "" where nothing is."""
+    if not row.get("cloud"):
+        return "" if row.get("photos") else "has neither photos nor cloud; fill one of these columns"
+    if row.get("photos"):
+        return "has both photos and a cloud; keep the one that is to be used, in a row of its own the other"
+    for column in OF_PHOTOS:
+        if row.get(column):
+            return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
+    return ""
 
 
 def _variants(registration: Mapping[str, Any]) -> dict[str, dict[str, Any]]:

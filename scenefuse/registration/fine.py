@@ -115,6 +115,7 @@ def _report(
         **pose_quantities(best),
         "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
         "decided_by": quantity(decision.decided_by, ""),
+        "rests_on": quantity(rests_on(best, problem.evidence), ""),
         "margin": quantity(decision.margin, "1"),
         "free_axis": quantity(decision.free_axis, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
@@ -125,6 +126,18 @@ def _report(
         "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
         "seconds": quantity(seconds, "s"),
     }
+
+
+def rests_on(best: Hypothesis, evidence: Evidence) -> list[str]:
+    """What spoke for or against a pose."""
+    known = {
+        "shape": True,
+        "colours": best.score.color is not None,
+        "gravity": evidence.ups is not None,
+        "free space": evidence.free_space is not None,
+        "shared features": evidence.alignment is not None,
+    }
+    return [name for name, there in known.items() if there]
 
 
 def _stated(outcome: Outcome, evidence: EvidenceFiles, centre: Array, length: str) -> dict[str, Any]:

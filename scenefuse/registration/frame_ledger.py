@@ -15,10 +15,11 @@ def write_frame_ledger(
     """Collect the transforms between the frames of one object (docs/frames.md).
 
     Frames: `nerf` (normalised, what the field is trained in), `object` (the object's cameras), `scene`, `world`
-    (easting, northing, height in the scene's CRS, where it is georeferenced).
+    (easting, northing, height in the scene's CRS, where it is georeferenced; the file's own coordinates where the scene
+    was given as a cloud), `file` (the own coordinates of an object that was given as a cloud).
 
     Args:
-        object_json: JSON of the object cloud, with `nerf_from_object`.
+        object_json: JSON of the object cloud, with `nerf_from_object` or `object_from_file`.
         fine_json: JSON of the fine registration, with `scene_from_object`.
         georeference_json: JSON of the scene, with `crs_from_scene` where it is known.
         report: output JSON; a transform that is not known is null.
@@ -28,11 +29,13 @@ def write_frame_ledger(
     """
     known: dict[str, Sim3 | None] = {
         "nerf_from_object": _read(object_json, "nerf_from_object"),
+        "object_from_file": _read(object_json, "object_from_file"),
         "scene_from_object": _read(fine_json, "scene_from_object"),
         "world_from_scene": _read(georeference_json, "crs_from_scene"),
     }
     scene, world, nerf = (known[n] for n in ("scene_from_object", "world_from_scene", "nerf_from_object"))
     known["world_from_object"] = world @ scene if world and scene else None
+    known["world_from_file"] = _world_from_file(known)
     known["scene_from_nerf"] = scene @ nerf.inverse() if scene and nerf else None
     content: dict[str, Any] = {}
     for name, transform in known.items():
@@ -40,6 +43,12 @@ def write_frame_ledger(
         content[f"{name}_inverse_error"] = quantity(None if transform is None else round_trip(transform), "1")
     content["status"] = quantity(value(read_json(fine_json), "status"), "")
     write_json(report, content)
+
+
+def _world_from_file(known: dict[str, Sim3 | None]) -> Sim3 | None:
+    """From the coordinates of an object's own file to the world; None where there is no such file, or no pose."""
+    world, obj = known["world_from_object"], known["object_from_file"]
+    return world @ obj if world and obj else None
 
 
 def round_trip(transform: Sim3) -> float:

@@ -100,6 +100,7 @@ def _report(best: Hypothesis, problem: Problem, length: str, seconds: float) -> 
         **pose_quantities(best),
         "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
         "decided_by": quantity("geometry", ""),
+        "rests_on": quantity(["shape"], ""),
         "margin": quantity(None, "1"),
         "free_axis": quantity(None, ""),
         "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),

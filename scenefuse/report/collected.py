@@ -40,19 +40,29 @@ class Collected:
     failed_variants: dict[str, str]
 
 
-def collect_scene(folder: Path, chunks: int) -> tuple[Fields, str]:
+def collect_scene(folder: Path, chunks: int, is_cloud: bool = False) -> tuple[Fields, str]:
     """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
 
     Args:
         folder: the scene's results.
         chunks: jobs that its depth maps are split into.
+        is_cloud: whether it was given as a cloud.
     """
-    there, gap = unbroken(folder, (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)), "dense.json"))
+    made = (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)))
+    there, gap = unbroken(folder, (*(("georeference.json",) if is_cloud else made), "dense.json"))
     found = read_fields(folder, [name for name in there if "/" not in name])
     return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
 
 
-def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = "", scene_gap: str = "") -> Collected:
+def collect(
+    folder: Path,
+    variants: list[str],
+    jobs: JobRecords,
+    scene: str = "",
+    scene_gap: str = "",
+    is_cloud: bool = False,
+    linked: bool = True,
+) -> Collected:
     """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
 
     Args:
@@ -61,15 +71,17 @@ def collect(folder: Path, variants: list[str], jobs: JobRecords, scene: str = ""
         jobs: where the rules' logs and benchmarks are.
         scene: name of the scene that the object lies in.
         scene_gap: the first file that this scene lacks, or "".
+        is_cloud: whether the object was given as a cloud.
+        linked: whether object and scene both have photos.
     """
-    there, gap = unbroken(folder, _OBJECT_FILES)
-    stages = read_fields(folder, [*there, *([] if gap else ["alignment.json"])])
+    there, gap = unbroken(folder, ("object.json",) if is_cloud else _OBJECT_FILES)
+    stages = read_fields(folder, [*there, *(["alignment.json"] if linked and not gap else [])])
     if find(stages, "stage1.workspace") == "poses":
         stages |= read_fields(folder, ["poses.json"])
     who = folder.name
     if not gap and scene_gap:
         gap, who = f"{scene_gap} of the scene {scene}", scene
-    if not gap:
+    if linked and not gap:
         there, gap = unbroken(folder, ("alignment.json",))
         stages |= read_fields(folder, there)
     per_variant, gaps = ({variant: {} for variant in variants}, {}) if gap else _collect_variants(folder, variants)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
-from scenefuse.report.object_sheet import SIDES_DEG, object_sheet, upright
+from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view.view_file import View, write_view
@@ -33,8 +33,8 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
     after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
     missing.png (what is still missing, and from where photos would show it), registration.png (object over crop, with
-    the decision) and object.png (frames, masks, depth of the four stages,
-    renders, the object's cloud); of a fused object view.ply and view.json too, for the 3D view of the report page.
+    the decision) and object.png (frames, masks, depth of the four stages, renders, the object's cloud, alone where it
+    was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
@@ -52,10 +52,14 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         "registration": _registration(inputs.name, join),
         **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
     }
-    if join.fused:
-        pictures["missing"] = _missing(inputs.name, join, clouds[1][1])
-    cloud = join.object_cloud or upright(read_cloud(inputs.object_cloud), inputs.workspace)
-    pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, inputs.stages)
+    if join.fused and join.missing is not None:
+        pictures["missing"] = _missing(inputs.name, join, join.missing, clouds[1][1])
+    cloud = join.object_cloud or read_cloud(inputs.object_cloud)
+    if inputs.workspace is None or inputs.masks is None:
+        pictures["object"] = cloud_sheet(inputs.name, cloud)
+    else:
+        cloud = join.object_cloud or upright(cloud, inputs.workspace)
+        pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, list(inputs.stages))
     with atomic_directory(figures) as folder:
         for name, picture in pictures.items():
             save_png(folder / f"{name}.png", picture)
@@ -65,14 +69,20 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
 
 
 def draw_scene(
-    *, name: str, dense: Path, georeferenced: Path, objects: list[Path], failed: tuple[str, ...] = (), figure: Path
+    *,
+    name: str,
+    dense: Path,
+    georeferenced: Path | None = None,
+    objects: list[Path],
+    failed: tuple[str, ...] = (),
+    figure: Path,
 ) -> None:
     """Draw a scene from above and obliquely with its camera positions and the boxes of its objects.
 
     Args:
         name: the scene's name, for the title.
         dense: the scene's dense cloud.
-        georeferenced: COLMAP model in the same frame.
+        georeferenced: COLMAP model in the same frame; None where the scene was given as a cloud.
         objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
         failed: names of the objects that failed; they get no box.
         figure: output PNG, below 1 MB.
@@ -81,10 +91,12 @@ def draw_scene(
         StageError: an input is missing.
     """
     cloud = read_cloud(dense)
-    centres = np.array([view.centre for view in read_views(georeferenced)]).reshape(-1, 3)
+    views = [] if georeferenced is None else read_views(georeferenced)
+    centres = np.array([view.centre for view in views]).reshape(-1, 3)
     shown = [folder for folder in objects if folder.name not in failed]
     boxes = {f.name: _box_corners(read_cloud(f / "registration/full/crop.ply").points) for f in shown}
-    note = f"{len(cloud):,} points, cameras (red): {len(centres)}, objects (boxes): {len(boxes)}"
+    cameras = "given as a cloud, no cameras" if georeferenced is None else f"cameras (red): {len(centres)}"
+    note = f"{len(cloud):,} points, {cameras}, objects (boxes): {len(boxes)}"
     save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
 
 
@@ -165,9 +177,9 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
 
 
-def _missing(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
+def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.float32]) -> Image:
     """What is still missing, coloured by why, from above with the stations, and from the best of these."""
-    tile, cells = (430, 350), join.missing
+    tile = (430, 350)
     kinds = cells.fields["missing"] if len(cells) else np.zeros(0, np.uint8)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = np.concatenate(

@@ -41,6 +41,14 @@ def object_sheet(name: str, cloud: Cloud, workspace: Path, masks: Path, stages: 
     return draw_sheet(Sheet(f"{name}: the object by itself", note, rows, row_labels, [], captions, tile))
 
 
+def cloud_sheet(name: str, cloud: Cloud) -> Image:
+    """The same of an object that was given as a cloud: the cloud from four sides."""
+    radii, framed, tile = point_radii(cloud.points), inner(cloud.points), (320, 240)
+    sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
+    note = f"given as a cloud of {len(cloud):,} points: no photos, no masks, no stages"
+    return draw_sheet(Sheet(f"{name}: the object by itself", note, [sides], ["cloud"], [], {}, tile))
+
+
 def _depth_row(photos: list[Path], masks: Path, stages: list[Path]) -> tuple[list[Image | None], str]:
     """The depth maps of the first photo that most stages have, colour-mapped on one scale over its mask."""
     files = {p.name: [s / "depth_maps" / f"{p.name}.bin" for s in stages] for p in photos}

@@ -63,7 +63,8 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     unit = find(fields, "georeference.length_unit") or "scene units"
     if find(fields, "dense.points") is None:
         return _line("missing", f"no dense cloud: {row['error']}")
-    lines = _line("cameras", _cameras(row, "photos"))
+    given = _given(fields, "dense")
+    lines = _line("given", given) if given else _line("cameras", _cameras(row, "photos"))
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame))
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
@@ -75,6 +76,20 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
 def _beside(measure: str, column: str) -> str:
     """The column of scenes.tsv for a completion metric itself, its null, before or after."""
     return measure if column == "value" else f"{measure}_{column}"
+
+
+def _given(fields: Fields, stage: str) -> str:
+    """The file that a scene or an object was given as, or ""."""
+    source = find(fields, f"{stage}.source")
+    if not source:
+        return ""
+    crs = find(fields, "georeference.crs")
+    return f"as a cloud, {source}, without photos" + (f"; coordinates: {_crs_name(crs)}" if crs else "")
+
+
+def _crs_name(crs: str) -> str:
+    """A CRS in a line: its code, or the name that begins its WKT."""
+    return crs.split('"')[1] if '"' in crs else crs
 
 
 def _cameras(row: dict[str, Any], pictures: str) -> str:
@@ -104,6 +119,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
     for sentence in diagnose(item):
         lines += _line(label, sentence)
         label = ""
+    lines += _line("given", _given(item.stages, "object"))
     if row["registered"] is not None and row["registered"] == row["registered"]:
         lines += _line("cameras", _cameras(row, "frames"))
     lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
@@ -181,7 +197,9 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
         lines += _line("", f"{variants[0]}: {_pairs(units)}")
     decided = find(item.variants[variants[0]], "fine.decided_by")
     if decided is not None:
-        lines += _line("pose", _DECIDED.get(decided, decided) + _spread(item.variants[variants[0]]))
+        rests_on = ", ".join(find(item.variants[variants[0]], "fine.rests_on") or [])
+        resting = f" ({rests_on})" if rests_on and decided == "geometry" else ""
+        lines += _line("pose", _DECIDED.get(decided, decided) + resting + _spread(item.variants[variants[0]]))
     return [line.rstrip() for line in lines]
 
 

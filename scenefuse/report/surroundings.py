@@ -31,7 +31,7 @@ class Surroundings:
         fused: whether the object was fused.
         decision: one line: status, reason, scores.
         unit: of the scene's lengths.
-        missing: cells of the object's surface that the completed scene lacks.
+        missing: cells of the object's surface that the completed scene lacks; None where they were not looked for.
         stations: (S, 3) places to photograph these from, best first.
     """
 
@@ -43,7 +43,7 @@ class Surroundings:
     fused: bool
     decision: str
     unit: str
-    missing: Cloud
+    missing: Cloud | None
     stations: Array
 
 
@@ -67,17 +67,17 @@ class FigureInputs:
     """JSON of the fine registration: status, reason, scene_from_object."""
     metrics_json: Path
     """JSON of the metrics, for the scores in titles."""
-    workspace: Path
-    """The object's undistorted COLMAP workspace (images/, sparse/)."""
-    masks: Path
-    """Folder of the object's masks, {photo}.png."""
     missing: Path
     """Cells of the object's surface that are still missing (PLY, scene frame)."""
     missing_json: Path
     """JSON of the same."""
     next_photos: Path
     """CSV of the stations from where photos would show them."""
-    stages: list[Path]
+    workspace: Path | None = None
+    """The object's undistorted COLMAP workspace (images/, sparse/); None where the object was given as a cloud."""
+    masks: Path | None = None
+    """Folder of the object's masks, {photo}.png; as the workspace."""
+    stages: tuple[Path, ...] = ()
     """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
 
 
@@ -108,16 +108,20 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
         )
     unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
+    missing = _missing(inputs)
     return Surroundings(
         before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit,
-        _missing(inputs).transformed(level),
+        None if missing is None else missing.transformed(level),
         level.apply(read_stations(inputs.next_photos)),
     )  # fmt: skip
 
 
-def _missing(inputs: FigureInputs) -> Cloud:
-    """The cells; none where nothing is missing, or the object has no pose."""
-    share = read_json(inputs.missing_json).get("missing", {}).get("value")
+def _missing(inputs: FigureInputs) -> Cloud | None:
+    """The cells; none where nothing is missing; None where the object has no pose or no photos."""
+    content = read_json(inputs.missing_json)
+    if "missing" not in content:
+        return None
+    share = value(content, "missing")
     return read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
 
 

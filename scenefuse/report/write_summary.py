@@ -26,6 +26,8 @@ def write_summary(
     variants: list[str],
     jobs: JobRecords,
     summary: Path,
+    cloud_scenes: tuple[str, ...] = (),
+    cloud_objects: tuple[str, ...] = (),
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
@@ -41,6 +43,8 @@ def write_summary(
         variants: registration variants, the one that is fused first.
         jobs: folders of the rules' logs and benchmarks; see JobRecords.
         summary: output folder; other files in it are left alone.
+        cloud_scenes: names of the scenes that were given as clouds.
+        cloud_objects: names of the objects that were.
 
     Raises:
         StageError: no variant is given, or not one scene for each object.
@@ -49,9 +53,17 @@ def write_summary(
         raise StageError("no registration variant is given; name at least one, the one that is fused first")
     if len(scene_of) != len(objects):
         raise StageError(f"{len(objects)} objects but {len(scene_of)} scenes are given; name the scene of each object")
-    parts = {folder.name: collect_scene(folder, chunks) for folder in scenes}
+    parts = {folder.name: collect_scene(folder, chunks, folder.name in cloud_scenes) for folder in scenes}
     found = [
-        collect(folder, variants, jobs, scene, parts[scene][1] if scene in parts else "")
+        collect(
+            folder,
+            variants,
+            jobs,
+            scene,
+            parts[scene][1] if scene in parts else "",
+            folder.name in cloud_objects,
+            folder.name not in cloud_objects and scene not in cloud_scenes,
+        )
         for folder, scene in zip(objects, scene_of)
     ]
     scene_fields = {name: fields for name, (fields, _) in parts.items()}

@@ -107,10 +107,37 @@ def _middle(values: Array) -> float:
     return float(values[distance <= FAR * np.median(distance)].mean())
 
 
-def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | None:
+@dataclass(frozen=True)
+class GridFrame:
+    """The axes of a projected CRS about an origin, as an imported cloud has them.
+
+    Attributes:
+        crs: anything pyproj understands; None where the file names none.
+        origin: (3,) in the file's coordinates.
+    """
+
+    crs: str | None
+    origin: Array
+
+    def in_crs(self, x_in_local: Array) -> Array:
+        """(N, 3) points of the frame in the file's coordinates."""
+        return np.asarray(x_in_local, dtype=np.float64) + self.origin
+
+    def inverse(self, x_in_local: Array) -> Array:
+        """(N, 3) points of the frame to (N, 3) WGS84 latitude (deg), longitude (deg), and height as the file has it."""
+        assert self.crs is not None
+        easting, northing, height = self.in_crs(x_in_local).T
+        to_wgs84 = pyproj.Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
+        longitude, latitude = to_wgs84.transform(easting, northing)
+        return np.stack([latitude, longitude, height], axis=1)
+
+
+def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | None:
     """The frame of a scene by the content of its georeference.json; None where the scene is not georeferenced."""
     if "origin_latitude_deg" not in georeference:
-        return None
+        if "origin_in_crs" not in georeference:
+            return None
+        return GridFrame(value(georeference, "crs"), np.array(value(georeference, "origin_in_crs")))
     latitude, longitude, altitude = (
         value(georeference, f"origin_{name}") for name in ("latitude_deg", "longitude_deg", "altitude_m")
     )

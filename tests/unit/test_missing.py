@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import cv2
 import numpy as np
@@ -170,7 +171,7 @@ def files(tmp_path, half):
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", ""), **{
         f"origin_{k}": quantity(v, "") for k, v in (("latitude_deg", 47.4), ("longitude_deg", 8.5), ("altitude_m", 400))
     }})  # fmt: skip
-    names = ("object.ply", "fused.ply", "fusion.json", "crop.json", "object", "scene", "masks", "georeference.json")
+    names = ("object.ply", "fused.ply", "fusion.json", "crop.json", "georeference.json", "object", "scene", "masks")
     inputs = MissingInputs(*(tmp_path / name for name in names))
     outputs = MissingOutputs(*(tmp_path / name for name in ("missing.ply", "next.csv", "next.geojson", "missing.json")))
     return inputs, outputs
@@ -206,3 +207,11 @@ def test_a_mask_of_another_size_is_one_sentence(files):
     with pytest.raises(StageError, match="3.png is 60 x 50 pixels, but its photo 200 x 200"):
         find_missing(inputs=inputs, outputs=outputs)
     assert not outputs.missing.exists()
+
+
+def test_of_an_object_without_photos_the_stage_writes_that_nothing_was_looked_for(files):
+    inputs, outputs = files
+    find_missing(inputs=replace(inputs, object_workspace=None, masks=None), outputs=outputs)
+    report = read_json(outputs.report)
+    assert value(report, "status") == "not_looked_for" and "the object has no photos" in value(report, "reason")
+    assert "missing" not in report and len(outputs.next_photos.read_text().splitlines()) == 1

@@ -113,7 +113,7 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
         ({"object_row": "shed\tgarden\tclose"}, "object 'shed' lies in scene 'garden', which scenes.tsv does not list"),
         ({"object_row": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
         ({"scene_row": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
-        ({"object_row": "shed\tyard\t"}, "objects.tsv, row 1, photos: '' "),
+        ({"object_row": "shed\tyard\t"}, "objects.tsv: object .shed. has neither photos nor cloud; fill one of these"),
         ({"scene_row": ""}, "scenes.tsv has no rows; add one for each scene"),
     ],
     ids=["unknown scene", "object with a dash", "scene with a dash", "no photos", "no scene"],
@@ -121,3 +121,45 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
 def test_a_bad_row_is_one_sentence_with_its_table(project, rows, sentence):
     with pytest.raises(StageError, match=sentence):
         project(**rows)
+
+
+@pytest.fixture
+def cloud_project(tmp_path, monkeypatch):
+    """Read a project whose tables have clouds: rows by column."""
+    monkeypatch.chdir(tmp_path)
+
+    def read(scene=None, obj=None):
+        scene = {"scene": "yard", "cloud": "yard.laz"} | (scene or {})
+        obj = {"object": "shed", "scene": "yard", "cloud": "shed.ply"} | (obj or {})
+        for name, row in (("scenes.tsv", scene), ("objects.tsv", obj)):
+            (tmp_path / name).write_text("\t".join(row) + "\n" + "\t".join(row.values()) + "\n")
+        return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"})
+
+    return read
+
+
+def test_a_row_with_a_cloud_needs_no_photos(cloud_project):
+    found = cloud_project()
+    assert found.scenes["yard"]["cloud"] == "yard.laz" and found.objects["shed"]["cloud"] == "shed.ply"
+
+
+@pytest.mark.parametrize(
+    "rows, sentence",
+    [
+        ({"scene": {"cloud": ""}}, "scenes.tsv: scene 'yard' has neither photos nor cloud"),
+        ({"obj": {"cloud": ""}}, "objects.tsv: object 'shed' has neither photos nor cloud"),
+        ({"scene": {"photos": "flight"}}, "scenes.tsv: scene 'yard' has both photos and a cloud; keep the one"),
+        ({"obj": {"photos": "close"}}, "objects.tsv: object 'shed' has both photos and a cloud"),
+        ({"obj": {"masks": "masks"}}, "'shed' is a cloud and has no photos that its masks could be for; empty that"),
+        ({"obj": {"prompts": "a.tsv"}}, "'shed' is a cloud and has no photos that its prompts could be for"),
+        ({"scene": {"calibration": "1 PINHOLE"}}, "'yard' is a cloud and has no photos that its calibration"),
+        (
+            {"obj": {"cloud": "", "photos": "close", "truth": "t"}},
+            "'shed' has a truth, but its scene 'yard' is a cloud",
+        ),
+    ],
+    ids=["no scene", "no object", "both", "object both", "masks", "prompts", "calibration", "truth"],
+)
+def test_a_bad_row_with_a_cloud_is_one_sentence(cloud_project, rows, sentence):
+    with pytest.raises(StageError, match=sentence):
+        cloud_project(**rows)

@@ -10,6 +10,7 @@ def kept_masks(name):
 def mask_inputs(wildcards):
     """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
     row, settings = object_row(wildcards.object), config["object"]["masks"]
+    photos_of(row, f"object '{wildcards.object}'")
     try:
         folders = mask_folders(kept_masks(wildcards.object))
     except StageError as error:

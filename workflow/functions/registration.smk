@@ -7,23 +7,26 @@ def variant_options(part):
 
 
 def crop_mode(wildcards):
-    """How a variant crops; without fiducials, the object's masks mark it."""
-    marked = object_row(wildcards.object).get("fiducials")
-    return VARIANTS[wildcards.variant]["crop"]["mode"] if marked else "masks"
+    """How a variant crops; without fiducials, the object's masks mark it, which takes photos of both sides. Without either,
+    the whole scene is kept: None."""
+    crop = VARIANTS[wildcards.variant]["crop"]
+    marked, linked = object_row(wildcards.object).get("fiducials"), is_linked(wildcards)
+    if crop.get("whole_scene") or not (marked or linked):
+        return None
+    return crop["mode"] if marked and linked else "fiducials" if marked else "masks"
 
 
 def crop_marks(wildcards):
     """The files that mark an object in its scene: option of the crop -> path."""
-    if VARIANTS[wildcards.variant]["crop"].get("whole_scene"):
-        return {}
-    if crop_mode(wildcards) == "masks":
+    mode = crop_mode(wildcards)
+    if mode == "masks":
         folder = f"results/objects/{wildcards.object}"
         return {
             "alignment_json": f"{folder}/alignment.json",
             "workspace": f"{folder}/undistorted",
             "masks": f"{folder}/masks",
         }
-    return {"fiducials": object_row(wildcards.object)["fiducials"]}
+    return {"fiducials": object_row(wildcards.object)["fiducials"]} if mode else {}
 
 
 def crop_inputs(wildcards):
@@ -36,5 +39,6 @@ def crop_inputs(wildcards):
 
 def crop_options(wildcards):
     """Settings of a variant's crop."""
-    own = {"mode": crop_mode(wildcards)} | crop_marks(wildcards)
-    return flags(VARIANTS[wildcards.variant]["crop"] | own)
+    mode = crop_mode(wildcards)
+    own = {"mode": mode} if mode else {"whole_scene": True}
+    return flags(VARIANTS[wildcards.variant]["crop"] | own | crop_marks(wildcards))

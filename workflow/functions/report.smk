@@ -26,13 +26,21 @@ def results_of(wildcards):
     return files
 
 
+def scene_model(wildcards):
+    """The cameras of a scene; none where it is given as a cloud."""
+    folder = f"results/scenes/{wildcards.scene}/georeferenced"
+    return [] if scene_row(wildcards.scene).get("cloud") else [folder]
+
+
 def summary_command(log):
     """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
+    clouds = {"cloud_scenes": CLOUD_SCENES, "cloud_objects": CLOUD_OBJECTS}
+    given = flags({name: found for name, found in clouds.items() if found})
     return (
         f"python {script('report/write_summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
         f" --chunks {len(CHUNKS)} --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)}"
         f" --scene-of {' '.join(row['scene'] for row in OBJECTS.values())} --variants {' '.join(VARIANTS)}"
-        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary &> {log}"
+        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary{given and f' {given}'} &> {log}"
     )
 
 

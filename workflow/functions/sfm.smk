@@ -1,30 +1,39 @@
 # Inputs of structure from motion: the photos that the tables name.
 
 
+def photos_of(row, who):
+    """The cell `photos` of a row; a scene or object that is given as a cloud has none."""
+    if row.get("cloud"):
+        raise WorkflowError(
+            f"{who} is given as a cloud: nothing is made from photos of it"
+        )
+    return row["photos"]
+
+
 def scene_photos(wildcards):
     """The photos of a scene."""
     return photos_in(
-        scene_row(wildcards.scene)["photos"],
+        photos_of(scene_row(wildcards.scene), f"scene '{wildcards.scene}'"),
         f"{config['scenes']}, scene '{wildcards.scene}'",
     )
 
 
 def scene_folder(wildcards):
     """Their folder, for a command line."""
-    return shlex.quote(scene_row(wildcards.scene)["photos"])
+    return shlex.quote(scene_row(wildcards.scene).get("photos", ""))
 
 
 def object_photos(wildcards):
     """The photos, or the video, of an object."""
     return photos_in(
-        object_row(wildcards.object)["photos"],
+        photos_of(object_row(wildcards.object), f"object '{wildcards.object}'"),
         f"{config['objects']}, object '{wildcards.object}'",
     )
 
 
 def object_source(wildcards):
     """Their folder, or the video, for a command line."""
-    return shlex.quote(object_row(wildcards.object)["photos"])
+    return shlex.quote(object_row(wildcards.object).get("photos", ""))
 
 
 def calibration_of(row, kind):

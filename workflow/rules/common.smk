@@ -1,6 +1,7 @@
 # What the rules share: the project, its files, and how settings become command lines.
 import glob
 import os
+import re
 import shlex
 import sys
 from functools import cache
@@ -28,6 +29,10 @@ except StageError as error:
     raise WorkflowError(str(error)) from None
 config.update(PROJECT.settings)
 SCENES, OBJECTS, VARIANTS = PROJECT.scenes, PROJECT.objects, PROJECT.variants
+CLOUD_SCENES, CLOUD_OBJECTS = (
+    [name for name, row in rows.items() if row.get("cloud")]
+    for rows in (SCENES, OBJECTS)
+)
 if config["gpu"] == "auto":
     config["gpu"] = int(has_gpu())
 # Jobs on one machine share its memory and take turns on its card, unless `--resources` says otherwise; on a cluster, where
@@ -79,6 +84,56 @@ def in_scene(*paths):
         return [f"results/scenes/{scene}/{path}" for path in paths]
 
     return files
+
+
+def in_photographed_scene(*paths):
+    """The same; none where the scene is given as a cloud."""
+
+    def files(wildcards):
+        scene = object_row(wildcards.object)["scene"]
+        return [] if scene_row(scene).get("cloud") else in_scene(*paths)(wildcards)
+
+    return files
+
+
+def if_photographed(*paths):
+    """Input function: files that the photos of the object give; none where it is given as a cloud."""
+
+    def files(wildcards):
+        row = object_row(wildcards.object)
+        found = [path.replace("{object}", wildcards.object) for path in paths]
+        return [] if row.get("cloud") else found
+
+    return files
+
+
+def is_linked(wildcards):
+    """Whether the object and its scene both have photos."""
+    row = object_row(wildcards.object)
+    return not (row.get("cloud") or scene_row(row["scene"]).get("cloud"))
+
+
+def if_linked(*paths):
+    """Input function: files that the photos of both sides give."""
+    return lambda wildcards: (
+        if_photographed(*paths)(wildcards) if is_linked(wildcards) else []
+    )
+
+
+def options_of(*names):
+    """Params function: inputs that a row may lack, as command line options of the same names."""
+
+    def words(wildcards, input):
+        found = {name: input.get(name) for name in names}
+        return flags(
+            {
+                name: [files] if isinstance(files, str) else list(files)
+                for name, files in found.items()
+                if files
+            }
+        )
+
+    return words
 
 
 def objects_in(wildcards):

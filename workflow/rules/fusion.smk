@@ -16,8 +16,8 @@ rule fuse_object:
         crop_json="results/objects/{object}/registration/full/crop.json",
         fine="results/objects/{object}/registration/full/fine.json",
         scene=in_scene("dense.ply"),
-        workspace=POSED,
-        scene_workspace=in_scene("undistorted"),
+        object_workspace=if_photographed(POSED),
+        scene_workspace=in_photographed_scene("undistorted"),
         georeference=in_scene("georeference.json"),
     output:
         fused="results/objects/{object}/fused.ply",
@@ -38,13 +38,14 @@ rule fuse_object:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=flags(config["fusion"]),
+        photos=options_of("object_workspace", "scene_workspace"),
         script=script("fusion/fuse_object.py"),
         code=code("fusion/fuse_object.py"),
     message:
         "{wildcards.object}: fusion"
     shell:
         "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-json {input.crop_json}"
-        " --fine-json {input.fine} --object-workspace {input.workspace} --scene-workspace {input.scene_workspace}"
+        " --fine-json {input.fine} {params.photos}"
         " --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
         " --fused-laz {output.laz} --checked {output.checked} --evidence {output.evidence} --report {output.report} {params.options} &> {log}"
 
@@ -56,9 +57,9 @@ rule find_missing:
         fused_scene="results/objects/{object}/fused_scene.ply",
         fusion="results/objects/{object}/fusion.json",
         crop_json="results/objects/{object}/registration/full/crop.json",
-        workspace=POSED,
-        scene_workspace=in_scene("undistorted"),
-        masks="results/objects/{object}/masks",
+        object_workspace=if_photographed(POSED),
+        scene_workspace=in_photographed_scene("undistorted"),
+        masks=if_photographed("results/objects/{object}/masks"),
         georeference=in_scene("georeference.json"),
     output:
         missing="results/objects/{object}/missing.ply",
@@ -76,14 +77,14 @@ rule find_missing:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
+        photos=options_of("object_workspace", "scene_workspace", "masks"),
         script=script("fusion/find_missing.py"),
         code=code("fusion/find_missing.py"),
     message:
         "{wildcards.object}: what is still missing"
     shell:
         "exec python {params.script} --object {input.cloud} --fused-scene {input.fused_scene} --fusion-json {input.fusion}"
-        " --crop-json {input.crop_json} --object-workspace {input.workspace}"
-        " --scene-workspace {input.scene_workspace} --masks {input.masks} --georeference-json {input.georeference}"
+        " --crop-json {input.crop_json} {params.photos} --georeference-json {input.georeference}"
         " --missing {output.missing} --next-photos {output.photos} --geojson {output.geojson} --report {output.report} &> {log}"
 
 

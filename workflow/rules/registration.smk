@@ -52,7 +52,7 @@ rule crop_scene:
     input:
         crop_inputs,
         scene=in_scene("dense.ply"),
-        sparse=in_scene("georeferenced"),
+        sparse=in_photographed_scene("georeferenced"),
         georeference_json=in_scene("georeference.json"),
     output:
         crop="results/objects/{object}/registration/{variant}/crop.ply",
@@ -68,13 +68,14 @@ rule crop_scene:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         options=crop_options,
+        model=options_of("sparse"),
         script=script("registration/crop_scene.py"),
         files=state_of(crop_inputs),
         code=code("registration/crop_scene.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: crop"
     shell:
-        "exec python {params.script} --scene {input.scene} --sparse {input.sparse} --georeference-json {input.georeference_json}"
+        "exec python {params.script} --scene {input.scene} {params.model} --georeference-json {input.georeference_json}"
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
@@ -85,7 +86,7 @@ rule estimate_scale:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        workspace_json="results/objects/{object}/undistorted.json",
+        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
     output:
         "results/objects/{object}/registration/{variant}/scale.json",
     log:
@@ -99,13 +100,14 @@ rule estimate_scale:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         options=variant_options("scale"),
+        gravity=options_of("workspace_json"),
         script=script("registration/estimate_scale.py"),
         code=code("registration/estimate_scale.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: scale"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --workspace-json {input.workspace_json} --report {output} {params.options} &> {log}"
+        " {params.gravity} --report {output} {params.options} &> {log}"
 
 
 rule register_coarsely:
@@ -115,7 +117,7 @@ rule register_coarsely:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        workspace_json="results/objects/{object}/undistorted.json",
+        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
         scale="results/objects/{object}/registration/{variant}/scale.json",
     output:
         "results/objects/{object}/registration/{variant}/coarse.json",
@@ -131,6 +133,7 @@ rule register_coarsely:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=variant_options("coarse"),
+        gravity=options_of("workspace_json"),
         seed=config["seed"],
         script=script("registration/register_coarsely.py"),
         code=code("registration/register_coarsely.py"),
@@ -138,7 +141,7 @@ rule register_coarsely:
         "{wildcards.object}, variant {wildcards.variant}: coarse registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --workspace-json {input.workspace_json} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
+        " {params.gravity} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
 
 
 rule register_finely:
@@ -148,15 +151,15 @@ rule register_finely:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        workspace_json="results/objects/{object}/undistorted.json",
+        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
         scale="results/objects/{object}/registration/{variant}/scale.json",
         coarse="results/objects/{object}/registration/{variant}/coarse.json",
-        alignment="results/objects/{object}/alignment.json",
-        object_spread="results/objects/{object}/spread.npz",
-        scene_spread=in_scene("spread.npz"),
-        workspace=in_scene("undistorted"),
-        depth=in_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
-        depth_json=in_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
+        alignment_json=if_linked("results/objects/{object}/alignment.json"),
+        object_spread=if_photographed("results/objects/{object}/spread.npz"),
+        scene_spread=in_photographed_scene("spread.npz"),
+        workspace=in_photographed_scene("undistorted"),
+        depth=in_photographed_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
+        depth_json=in_photographed_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
     output:
         fine="results/objects/{object}/registration/{variant}/fine.json",
         picture=report(
@@ -177,6 +180,10 @@ rule register_finely:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=variant_options("fine"),
+        gravity=options_of("workspace_json"),
+        evidence=options_of(
+            "alignment_json", "object_spread", "scene_spread", "workspace", "depth"
+        ),
         seed=config["seed"],
         script=script("registration/register_finely.py"),
         code=code("registration/register_finely.py"),
@@ -184,9 +191,8 @@ rule register_finely:
         "{wildcards.object}, variant {wildcards.variant}: fine registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --workspace-json {input.workspace_json} --scale-json {input.scale} --coarse-json {input.coarse} --alignment-json {input.alignment}"
-        " --object-spread {input.object_spread} --scene-spread {input.scene_spread}"
-        " --workspace {input.workspace} --depth {input.depth} --report {output.fine} --picture {output.picture}"
+        " {params.gravity} --scale-json {input.scale} --coarse-json {input.coarse} {params.evidence}"
+        " --report {output.fine} --picture {output.picture}"
         " --seed {params.seed} {params.options} &> {log}"
 
 
@@ -197,7 +203,7 @@ rule register_as_paper:
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/paper/crop.ply",
         crop_json="results/objects/{object}/registration/paper/crop.json",
-        workspace_json="results/objects/{object}/undistorted.json",
+        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
     output:
         scale="results/objects/{object}/registration/paper/scale.json",
         coarse="results/objects/{object}/registration/paper/coarse.json",
@@ -219,6 +225,7 @@ rule register_as_paper:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
+        gravity=options_of("workspace_json"),
         seed=config["seed"],
         script=script("registration/register_as_paper.py"),
         code=code("registration/register_as_paper.py"),
@@ -226,7 +233,7 @@ rule register_as_paper:
         "{wildcards.object}: registration by the paper's recipe"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " --workspace-json {input.workspace_json} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
+        " {params.gravity} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
         " --picture {output.picture} --seed {params.seed} &> {log}"
 
 

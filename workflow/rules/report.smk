@@ -15,7 +15,7 @@ rule draw_scene:
     """The scene from above and from the side, with its cameras and objects."""
     input:
         cloud="results/scenes/{scene}/dense.ply",
-        model="results/scenes/{scene}/georeferenced",
+        georeferenced=scene_model,
         crops=of_objects("registration/full/crop.ply"),
     output:
         report(
@@ -34,12 +34,13 @@ rule draw_scene:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         objects=object_folders,
+        cameras=options_of("georeferenced"),
         script=script("report/draw_scene.py"),
         code=code("report/draw_scene.py"),
     message:
         "Scene {wildcards.scene}: figure"
     shell:
-        "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} --georeferenced {input.model}"
+        "exec python {params.script} --name {wildcards.scene} --dense {input.cloud} {params.cameras}"
         " --objects {params.objects} --figure {output} &> {log}"
 
 
@@ -56,12 +57,14 @@ rule draw_object:
         missing="results/objects/{object}/missing.ply",
         missing_json="results/objects/{object}/missing.json",
         next_photos="results/objects/{object}/next_photos.csv",
-        workspace="results/objects/{object}/undistorted",
-        masks="results/objects/{object}/masks",
-        stages=expand(
-            "results/objects/{object}/stage{stage}",
-            stage=[1, 2, 3, 4],
-            allow_missing=True,
+        workspace=if_photographed("results/objects/{object}/undistorted"),
+        masks=if_photographed("results/objects/{object}/masks"),
+        stages=if_photographed(
+            *expand(
+                "results/objects/{object}/stage{stage}",
+                stage=[1, 2, 3, 4],
+                allow_missing=True,
+            )
         ),
     output:
         report(
@@ -81,6 +84,7 @@ rule draw_object:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
+        photos=options_of("workspace", "masks", "stages"),
         script=script("report/draw_object.py"),
         code=code("report/draw_object.py"),
     message:
@@ -89,8 +93,7 @@ rule draw_object:
         "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
         " --metrics-json {input.metrics} --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
-        " --workspace {input.workspace} --masks {input.masks} --stages {input.stages}"
-        " --figures {output} &> {log}"
+        " {params.photos} --figures {output} &> {log}"
 
 
 rule view_scene:

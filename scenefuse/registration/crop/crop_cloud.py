@@ -28,7 +28,7 @@ class CropSettings:
 
     mode: Literal["fiducials", "masks"] = setting("fiducials")
     """What marks the object in the scene: fiducials, or its masks, seen through the alignment from shared features (in
-    any case for objects without fiducials)."""
+    any case for objects without fiducials, if both sides have photos; else the whole scene is searched)."""
     shape: Literal["box", "oriented", "hull"] = setting("box")
     """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float = setting(0.05, least=0)
@@ -40,7 +40,7 @@ class CropSettings:
     min_votes: float = setting(0.8, above=0, most=1)
     """Share of the object's photos showing a scene point that must have it inside their mask; mode masks only."""
     whole_scene: bool = False
-    """Keep the whole scene, whatever the mode: the ablation without cropping."""
+    """Keep the whole scene, whatever the mode: the ablation without cropping, and what is left without any mark."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,9 @@ class Crop:
 def whole(scene: Cloud) -> Crop:
     """The whole scene as a crop."""
     everything = np.ones(len(scene), dtype=bool)
+    note = "nothing was cut out: the object is looked for in the whole scene, as if that showed little else"
     return Crop(
-        everything, everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, []
+        everything, everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note]
     )
 
 

@@ -11,7 +11,8 @@ from scenefuse.io.units import length_unit
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
 from scenefuse.registration.crop.parts import MIN_PART, parts
 from scenefuse.registration.crop.vote import Votes, vote
-from scenefuse.sfm.fiducials import locate
+from scenefuse.sfm.fiducials import ScenePoints, locate, read_points
+from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -27,13 +28,14 @@ class CropInputs:
 
     scene: Path
     """Dense scene cloud (PLY), z up as the georegister stage leaves it."""
-    sparse: Path
-    """COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it."""
+    sparse: Path | None = None
+    """COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it. None where the scene was
+    given as a cloud."""
     georeference_json: Path | None = None
-    """JSON of the scene, for the unit of its lengths."""
+    """JSON of the scene, for the unit of its lengths and the origin of an imported cloud."""
     fiducials: Path | None = None
-    """Tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z), at least four different points
-    on the object; mode fiducials."""
+    """Tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z; of an imported scene in its
+    file's coordinates), at least four different points on the object; mode fiducials."""
     alignment_json: Path | None = None
     """JSON of the alignment stage, with `scene_from_object`; mode masks."""
     workspace: Path | None = None
@@ -59,6 +61,7 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
     fiducials, voted = np.zeros((0, 3)), 0
     if mode == "none":
         cut = whole(scene)
+        print(cut.notes[0], flush=True)
     elif mode == "masks":
         cut, voted = crop_by_masks(scene, inputs, settings)
     else:
@@ -74,8 +77,28 @@ def crop_by_fiducials(scene: Cloud, inputs: CropInputs, settings: CropSettings) 
     """`crop_marked` with the fiducials of a file; these, (F, 3) in the scene frame."""
     if inputs.fiducials is None:
         raise StageError("cropping by fiducials needs --fiducials; give them, or mode masks")
-    names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
+    if inputs.sparse is None:
+        names, points = points_in(inputs.fiducials, inputs.georeference_json)
+    else:
+        names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
     return crop_marked(scene, names, points, UP, settings, inputs.fiducials), points
+
+
+def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str], Array]:
+    """Names and positions (F, 3), in the scene's frame, of fiducials in the coordinates of an imported cloud.
+
+    Raises:
+        StageError: the file is missing or not well formed, or holds clicks in photos.
+    """
+    marked = read_points(fiducials)
+    if not isinstance(marked, ScenePoints):
+        raise StageError(
+            f"{fiducials} holds clicks in photos, and the scene is a cloud without photos; give points as 'point x y z'"
+            " in the cloud's coordinates"
+        )
+    frame = None if georeference_json is None else scene_frame(read_json(georeference_json))
+    origin = np.zeros(3) if frame is None else frame.in_crs(np.zeros((1, 3)))[0]
+    return marked.points, marked.positions - origin
 
 
 def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, int]:

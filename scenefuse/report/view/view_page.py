@@ -24,7 +24,7 @@ REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
 CLASSES = {
     0: ("#a9b1b9", "not checked"),
     1: ("#0f8a66", "measured: photos confirm it"),
-    2: ("#d55e00", "NeRF only: no photo confirms it"),
+    2: ("#d55e00", "no photo confirms it: from the NeRF, or a given cloud"),
     3: ("#b869a0", "stereo only: no photo confirms it"),
 }
 

@@ -1,0 +1,116 @@
+"""A scene and an object given as clouds, without a single photo: the whole workflow, from the tables to the report."""
+
+import json
+import os
+import shutil
+
+import laspy
+import numpy as np
+import pytest
+import yaml
+from support.cloud_files import UTM
+from support.planted import errors, plant
+from support.user_project import planned
+
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.stage import read_json, value
+from scenefuse.transforms import Sim3
+
+ORIGIN = Sim3(1.0, np.eye(3), UTM)
+"""Of the planted scene, in the coordinates of its file."""
+POINTS = "point\tx\ty\tz\n"
+
+
+@pytest.fixture(scope="module")
+def trial():
+    return plant("house", 0, coverage=0.6, object_points=12000, depth_maps=False)
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory, trial, snakemake):
+    """A yard as LAZ in UTM, a house as PLY in a frame of its own, marked by points; run, and call it to run again."""
+    path = tmp_path_factory.mktemp("clouds")
+    write_laz(path / "yard.laz", trial.scene, UTM, "EPSG:32632")
+    write_cloud(path / "house.ply", trial.object)
+    rows = [f"p{k}\t{x:.3f}\t{y:.3f}\t{z:.3f}\n" for k, (x, y, z) in enumerate((trial.fiducials + UTM).tolist())]
+    (path / "points.tsv").write_text(POINTS + "".join(rows))
+    (path / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.laz\n")
+    (path / "objects.tsv").write_text("object\tscene\tcloud\tfiducials\nhouse\tyard\thouse.ply\tpoints.tsv\n")
+    settings = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": {"variants": ["full"]}}
+    (path / "mine.yaml").write_text(yaml.safe_dump(settings))
+
+    def run(*words):
+        return snakemake(path, *words, config=path / "mine.yaml")
+
+    run.path, run.first = path, run()
+    assert run.first.returncode == 0, run.first.stdout[-6000:]
+    return run
+
+
+def test_the_house_is_found_and_fills_the_scene_in_its_own_coordinates(project, trial):
+    folder = project.path / "results/objects/house"
+    frames = read_json(folder / "frames.json")
+    pose = Sim3.from_matrix(np.array(value(frames, "world_from_file")))
+    truth = ORIGIN @ trial.scene_from_object
+    scale, angle, shift = errors(pose, truth, trial.object.points.mean(0), trial.diagonal)
+    assert abs(scale) < 2 and angle < 2 and shift < 0.02
+    fusion = read_json(folder / "fusion.json")
+    assert value(fusion, "mode") == "fill" and value(fusion, "added_points") > 500
+    assert "neither side has photos" in " ".join(value(fusion, "notes"))
+    before, after = (laspy.read(project.path / name) for name in ("yard.laz", "results/scenes/yard/completed.laz"))
+    assert after.header.parse_crs().to_epsg() == 32632
+    source = np.asarray(after["source"])
+    assert np.array_equal(np.sort(after.xyz[source == 0], axis=0), np.sort(before.xyz, axis=0))
+    added = truth.inverse().apply(after.xyz[source == 1])
+    low, high = trial.object.points.min(0), trial.object.points.max(0)
+    assert ((added > low - 0.05 * (high - low)) & (added < high + 0.05 * (high - low))).all()
+    assert set(read_cloud(folder / "fused_scene.ply").fields["evidence"]) == {0}  # no photo was asked
+
+
+def test_what_was_not_made_is_said_in_words(project):
+    results = project.path / "results"
+    text = " ".join((results / "summary/summary.txt").read_text().split())
+    assert "given as a cloud, yard.laz, without photos; coordinates: EPSG:32632" in text
+    assert "given as a cloud, house.ply, without photos" in text and "1 of 1 objects registered" in text
+    assert "by the clouds alone: no photos link object and scene (shape, colours)" in text
+    assert "surface that none of them confirms is not looked for" in text and "photos registered" not in text
+    page = (results / "summary/report.html").read_text()
+    assert 'aria-label="3D view of scene yard"' in page and 'aria-label="3D view of house"' in page
+    drawn = {path.name for path in (results / "objects/house/figures").glob("*.png")}
+    assert {"before_after.png", "provenance.png", "registration.png", "object.png"} <= drawn
+    assert "missing.png" not in drawn
+    assert json.loads((results / "objects/house/metrics.json").read_text())["completion"]
+
+
+def test_only_a_change_of_a_cloud_reruns_its_import(project):
+    assert "Nothing to be done" in project("-n").stdout
+    house = project.path / "house.ply"
+    before = house.read_bytes()
+    write_cloud(house, Cloud(read_cloud(house).points))
+    os.utime(house, (1e9, 1e9))
+    rules = planned(project("-n").stdout)
+    house.write_bytes(before)
+    os.utime(house, (1e9, 1e9))
+    assert {"import_object_cloud", "register_finely", "complete_scene"} <= rules
+    assert not {"import_scene_cloud", "crop_scene"} & rules
+
+
+@pytest.mark.parametrize(
+    "target, sentence",
+    [
+        ("results/scenes/yard/photos.json", "scene 'yard' is given as a cloud: nothing is made from photos of it"),
+        ("results/objects/house/masks.json", "object 'house' is given as a cloud: nothing is made from photos of it"),
+    ],
+)
+def test_what_needs_photos_is_refused_in_one_sentence(project, target, sentence):
+    refused = project("-n", target)
+    assert refused.returncode != 0 and sentence in refused.stdout
+
+
+def test_a_cloud_that_is_not_there_is_one_sentence(project, tmp_path, snakemake):
+    for name in ("objects.tsv", "mine.yaml", "house.ply", "points.tsv"):
+        shutil.copy(project.path / name, tmp_path)
+    (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\tyrad.laz\n")
+    refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
+    assert refused.returncode != 0
+    assert "scenes.tsv, scene 'yard': the cloud yrad.laz does not exist" in refused.stdout

@@ -1,0 +1,154 @@
+"""Clouds in the place of photos: their frame, their coordinates, and what does without photos."""
+
+import numpy as np
+import pytest
+from support.cloud_files import UTM, write_e57
+
+from scenefuse.fusion.fuse_object import possible
+from scenefuse.fusion.modes import FusionSettings
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.io.import_cloud import import_object_cloud, import_scene_cloud, near_origin
+from scenefuse.registration.crop.crop_scene import points_in
+from scenefuse.registration.frame_ledger import write_frame_ledger
+from scenefuse.sfm.geodesy import scene_frame
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+
+
+@pytest.fixture
+def cloud():
+    """A patch of 40 m with colours, at UTM coordinates."""
+    rng = np.random.default_rng(0)
+    points = UTM + rng.uniform(0, 40, (500, 3)) * [1, 1, 0.2]
+    return Cloud(points, None, rng.integers(0, 256, (500, 3)).astype(np.uint8))
+
+
+def imported_scene(path, source):
+    """The scene's cloud, report and georeference."""
+    files = {
+        "cloud": path / "dense.ply",
+        "report": path / "dense.json",
+        "georeference_json": path / "georeference.json",
+    }
+    import_scene_cloud(source=source, **files)
+    return read_cloud(files["cloud"]), read_json(files["report"]), read_json(files["georeference_json"])
+
+
+def write_as(path, cloud):
+    """The cloud as a file of the path's kind."""
+    if path.suffix == ".laz":
+        write_laz(path, Cloud(cloud.points - UTM, None, cloud.colors), UTM, "EPSG:32632")
+    elif path.suffix == ".e57":
+        write_e57(path, [(cloud.points, cloud.colors, np.array([1.0, 0, 0, 0]), np.zeros(3))])
+    elif path.suffix == ".ply":
+        write_cloud(path, cloud)
+    else:
+        np.savetxt(path, np.c_[cloud.points, cloud.colors], fmt=["%.6f"] * 3 + ["%d"] * 3)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.e57", "a.ply", "a.xyz"])
+def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path, cloud, name):
+    found, report, georeference = imported_scene(tmp_path, write_as(tmp_path / name, cloud))
+    assert np.abs(found.points).max() < 100 and np.array_equal(found.colors, cloud.colors)
+    assert np.allclose(scene_frame(georeference).in_crs(found.points), cloud.points, atol=6e-4)
+    in_float32 = found.points.astype(np.float32) + value(georeference, "origin_in_crs")
+    assert np.allclose(in_float32, cloud.points, atol=6e-4)
+    assert value(report, "points") == 500 and value(report, "source") == name
+
+
+def test_a_crs_is_kept_and_gives_the_unit_and_latitudes(tmp_path, cloud):
+    georeference = imported_scene(tmp_path, write_as(tmp_path / "a.laz", cloud))[2]
+    assert (value(georeference, "crs"), value(georeference, "length_unit")) == ("EPSG:32632", "m")
+    latitude, longitude, height = scene_frame(georeference).inverse(np.zeros((1, 3)))[0]
+    assert latitude == pytest.approx(50.3, abs=0.01) and longitude == pytest.approx(9.0, abs=0.01)
+    assert height == value(georeference, "origin_in_crs")[2]
+
+
+def test_without_a_crs_nothing_is_called_metres(tmp_path, cloud):
+    georeference = imported_scene(tmp_path, write_as(tmp_path / "a.ply", cloud))[2]
+    assert (value(georeference, "crs"), value(georeference, "length_unit")) == (None, "scene units")
+
+
+def test_feet_are_called_by_their_name(tmp_path, cloud):
+    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), UTM, "EPSG:2263")
+    assert value(imported_scene(tmp_path, tmp_path / "a.laz")[2], "length_unit") == "US survey foot"
+
+
+def test_clouds_near_zero_keep_their_coordinates_at_any_size():
+    points = np.random.default_rng(0).normal(size=(1000, 3)) + [2, 0, -1]
+    assert np.array_equal(near_origin(points), np.zeros(3)) and np.array_equal(near_origin(1e-4 * points), np.zeros(3))
+
+
+def test_rows_without_a_position_and_unused_columns_are_recorded(tmp_path, cloud):
+    points = cloud.points.copy()
+    points[:3, 1] = np.nan
+    write_cloud(tmp_path / "a.ply", Cloud(points, None, None, {"intensity": np.zeros(500, np.float32)}))
+    found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
+    assert len(found) == 497 and found.fields == {} and value(report, "columns_not_used") == ["intensity"]
+    assert value(report, "notes") == ["3 rows without a finite position were left out"]
+
+
+def test_normals_that_are_none_are_left_out_and_that_is_said(tmp_path, cloud):
+    write_cloud(tmp_path / "a.ply", Cloud(cloud.points, np.zeros((500, 3), np.float32)))
+    found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
+    assert found.normals is None and "not all of unit length" in value(report, "notes")[0]
+
+
+@pytest.mark.parametrize(
+    "name, content, sentence",
+    [
+        ("a.xyz", "", "holds no points"),
+        ("a.xyz", "1 2 3\n" * 300, "only 1 different positions among its 300 points; 200 or more are needed"),
+        ("a.xyz", "nan nan nan\n" * 300, "no point with a finite position"),
+        ("a.dwg", "", r"'\.dwg' is no known ending"),
+        ("a.laz", "LASF", "not a readable LAZ cloud"),
+    ],
+    ids=["empty", "one point", "NaN", "unknown ending", "cut short"],
+)
+def test_a_bad_cloud_is_one_sentence_and_leaves_nothing(tmp_path, name, content, sentence):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(StageError, match=sentence):
+        imported_scene(tmp_path, tmp_path / name)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_points_of_an_objects_own_file_reach_the_world_by_the_ledger(tmp_path, cloud):
+    imported_scene(tmp_path, write_as(tmp_path / "a.laz", cloud))
+    moved = Cloud(cloud.points / 3 + [7000.0, 0, 0])
+    write_cloud(tmp_path / "b.ply", moved)
+    import_object_cloud(source=tmp_path / "b.ply", cloud=tmp_path / "object.ply", report=tmp_path / "object.json")
+    obj, scene = read_cloud(tmp_path / "object.ply").points, read_cloud(tmp_path / "dense.ply").points
+    pose = np.eye(4)
+    pose[:3, :3] *= 3
+    pose[:3, 3] = scene[0] - 3 * obj[0]
+    fine = {"scene_from_object": quantity(pose, ""), "status": quantity("registered", "")}
+    write_json(tmp_path / "fine.json", fine)
+    write_frame_ledger(
+        object_json=tmp_path / "object.json",
+        fine_json=tmp_path / "fine.json",
+        georeference_json=tmp_path / "georeference.json",
+        report=tmp_path / "frames.json",
+    )
+    matrix = np.array(value(read_json(tmp_path / "frames.json"), "world_from_file"))
+    assert np.allclose(moved.points @ matrix[:3, :3].T + matrix[:3, 3], cloud.points, atol=1e-3)
+
+
+def test_fiducials_of_a_cloud_are_in_its_own_coordinates_and_clicks_are_refused(tmp_path, cloud):
+    found = imported_scene(tmp_path, write_as(tmp_path / "a.laz", cloud))[0]
+    rows = "".join(f"p{k}\t{x}\t{y}\t{z}\n" for k, (x, y, z) in enumerate(cloud.points[:5].tolist()))
+    (tmp_path / "marks.tsv").write_text("point\tx\ty\tz\n" + rows)
+    names, points = points_in(tmp_path / "marks.tsv", tmp_path / "georeference.json")
+    assert names == ["p0", "p1", "p2", "p3", "p4"] and np.allclose(points, found.points[:5], atol=1e-3)
+    (tmp_path / "clicks.tsv").write_text("point\tphoto\tx_px\ty_px\nroof\t1.jpg\t3\t4\n")
+    with pytest.raises(StageError, match="clicks.tsv holds clicks in photos, and the scene is a cloud without photos"):
+        points_in(tmp_path / "clicks.tsv", tmp_path / "georeference.json")
+
+
+def test_fusion_does_what_the_photos_that_there_are_allow():
+    wanted = FusionSettings()
+    assert possible(wanted, True, False) == possible(wanted, True, True) == (wanted, [])
+    settings, notes = possible(wanted, False, True)
+    assert (settings.mode, settings.nerf_only) == ("evidence", True) and "the object has no photos" in notes[0]
+    settings, notes = possible(wanted, False, False)
+    assert settings.mode == "fill" and "neither side has photos" in notes[0]
+    assert possible(FusionSettings(mode="replace"), False, False)[0].mode == "replace"
