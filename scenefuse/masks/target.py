@@ -1,6 +1,6 @@
 """Where an object is, by the sparse model and a few points on it: box, ground, and which sparse points are its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +85,23 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
     return Target(box, ground, found, points, grow, _parts(points, PART_EDGE * box.diagonal), sparse, kind)
 
 
+def target_from_votes(kind: NDArray[np.int8], photos: Workspace, up: Array, seed: int) -> Target:
+    """Box and ground around the sparse points whose kind (P,) is 1, as the photos' masks voted; other arguments as in
+    `target_from_points`.
+
+    Raises:
+        StageError: fewer than ten points are on the object.
+    """
+    own = photos.points[kind > 0]
+    if len(own) < LEAST_OWN:
+        raise StageError(
+            f"only {len(own)} sparse points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in a"
+            " photo that shows more of the object, or in several"
+        )
+    target = target_from_points(_without_outermost(own, up), photos, up, seed)
+    return replace(target, kind=np.where(kind, kind, target.kind), parts=np.empty((0, 4), dtype=np.intp))
+
+
 def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
     """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
 
@@ -102,6 +119,11 @@ def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"
         )
+    return _without_outermost(own, up)
+
+
+def _without_outermost(own: Array, up: Array) -> Array:
+    """The (N, 3) points without the outermost half per cent at each side: some are mismatched."""
     x = upright_box(own, up, 0.0).to_box(own)
     low, high = np.percentile(x, [0.5, 99.5], axis=0)
     return own[((x >= low) & (x <= high)).all(1)]
