@@ -147,12 +147,12 @@ def _make(
 def _asked(
     ask: Ask, photos: Workspace, k: int, inside: tuple[Array, Array], outside: tuple[Array, Array], box: Array | None
 ) -> _Voter:
-    """The best of the masks for pixels that were clicked and pixels that were carried on, without parts of no prompt."""
+    """The best of the masks for pixels clicked and pixels carried on, without parts that hold none of them."""
     on, off = np.concatenate(inside), np.concatenate(outside)
     masks, quality = ask(photos.views[k], inside, outside, box)
     masks = [_prompted_parts(cleaned(mask), on, off) for mask in masks]
     agreement = [_share(mask, on, 1.0) - _share(mask, off, 0.0) for mask in masks]
-    best = int(np.argmax(np.array(agreement) + QUALITY_WEIGHT * quality))
+    best = int(np.argmax([a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]))
     return _voter(photos, k, masks[best], float(quality[best]), agreement[best])
 
 

@@ -57,11 +57,12 @@ def make_masks(
 ) -> None:
     """Write a mask of the object for every undistorted photo (method K1, K3).
 
-    Clicks inside and outside the object in one photo give its mask, whose sparse points prompt the next photos. Points
-    clicked in several photos give an upright box; the sparse points in it and above the ground seed GrabCut in each photo, whose masks
-    carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with all points and the box
-    around them, and again with the hull's box where it disagrees. Supplied masks are undistorted, never changed. A
-    photo without a usable mask, or whose mask disagrees with the hull, is left out. `keep` is applied last.
+    Clicks inside and outside the object in one photo give its mask, whose sparse points prompt the next photos. Or
+    points clicked in several photos give an upright box; the sparse points in it and above the ground seed GrabCut in
+    each photo, whose masks carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with
+    all points and the box around them, and again with the hull's box where it disagrees. Supplied masks are
+    undistorted, never changed. A photo without a usable mask, or whose mask disagrees with the hull, is left out.
+    `keep` is applied last.
 
     Args:
         inputs: see MaskInputs.

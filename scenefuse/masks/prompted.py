@@ -9,10 +9,10 @@ from scenefuse.masks.carry import Ask, carry
 from scenefuse.masks.clicks import clicks_per_photo
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
-from scenefuse.masks.segmentation import MaskSettings, recut, segment_again, segment_by_grabcut, segment_by_sam2
+from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.mvs.visual_hull import Mask
-from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, read_points, triangulate_consistent
+from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, triangulate_consistent
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import Workspace, read_model
@@ -68,8 +68,10 @@ def masks_from_prompts(
         ask: Ask = partial(ask_sam2, network) if network else partial(ask_grabcut, settings.grabcut_width_px)
         carried = carry(ask, photos, clicked, settings.max_click_residual_px)
         target = target_from_votes(carried.kind, photos, up, seed)
-        again = segment_again(network, target, carried.masks, photos, settings) if network else None
-        masks = recut(target, carried.masks, photos, settings) if again is None else again
+        if network:
+            masks = segment_again(network, target, carried.masks, photos, settings)
+        else:
+            masks = segment_by_grabcut(target, photos, settings)
         return Prompted(masks, target, carried.reasons, carried.left_out)
     points, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = target_from_points(points, photos, up, seed)
@@ -82,8 +84,9 @@ def _points(
     marked: Clicks | ScenePoints, sparse: Path, sizes: Mapping[str, tuple[int, int]], max_residual_px: float
 ) -> tuple[Array, list[str]]:
     """(N, 3) prompts in the object's frame, and the points whose clicks contradict each other."""
+    left_out: list[str] = []
     if isinstance(marked, ScenePoints):
-        names, points, left_out = marked.points, marked.positions, []
+        names, points = marked.points, marked.positions
     else:
         names, points, _, left_out = triangulate_consistent(marked, read_model(sparse), max_residual_px, sizes)
     if len(points) < LEAST_POINTS:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
-from scenefuse.masks.target import Target
+from scenefuse.masks.target import Target, far_apart
 from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError, sha256
 from scenefuse.transforms import Array
@@ -218,18 +218,9 @@ def ask_sam2(
     low, high = around.min(0), around.max(0)
     reach = NEAR * (high - low).max()
     near = outside[1][((outside[1] > low - reach) & (outside[1] < high + reach)).all(1)]
-    on = _far_apart(inside[0], inside[1], MOST_INSIDE)
-    off = _far_apart(outside[0], near if len(near) else outside[1], MOST_OUTSIDE)
+    on = far_apart(inside[0], inside[1], MOST_INSIDE)
+    off = far_apart(outside[0], near if len(near) else outside[1], MOST_OUTSIDE)
     return network.masks(network.encode(view.pixels), (view.height, view.width), on, box_px, off)
-
-
-def _far_apart(first: Array, others: Array, count: int) -> Array:
-    """The first (N, 2) points, and of the others the farthest from all before, `count` in all unless the first are more."""
-    chosen = first if len(first) else others[:1]
-    while len(chosen) < count and len(chosen) < len(first) + len(others):
-        gaps = np.linalg.norm(others[:, None] - chosen, axis=2).min(1)
-        chosen = np.vstack([chosen, others[gaps.argmax()]])
-    return chosen
 
 
 def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:

@@ -42,8 +42,8 @@ class MaskSettings:
     min_agreement: float = setting(0.6, least=0, most=1)
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
-    """Largest reprojection error of a clicked prompt, and how far a click inside or outside may lie on the wrong side of
-    its mask's outline; others are left out and named."""
+    """Largest reprojection error of a clicked prompt, and how far a click inside or outside may lie on the wrong side
+    of its mask's outline; others are left out and named."""
     min_photos: int = 5
     """Fewest good masks to go on with."""
     hull_voxels: int = 96
@@ -71,11 +71,7 @@ class ScoredMasks:
 
 def segment_by_grabcut(target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
     """GrabCut photo by photo, then twice more along the visual hull: masks (H, W) of V views with RGB pixels."""
-    return recut(target, first_cuts(target, photos, settings.grabcut_width_px), photos, settings)
-
-
-def recut(target: Target, masks: list[Mask], photos: Workspace, settings: MaskSettings) -> list[Mask]:
-    """Masks (H, W) cut twice more by GrabCut, along their visual hull."""
+    masks = first_cuts(target, photos, settings.grabcut_width_px)
     for tolerance in (FIRST_TOLERANCE, HULL_TOLERANCE):
         hull = carve_trusted(target, photos.views, masks, settings, tolerance)
         masks = second_cuts(target, masks, photos, hull, settings.band_px)

@@ -181,7 +181,8 @@ def triangulate_consistent(
             off = np.linalg.norm(np.array([image.project_point(position) for image in seen]) - pixels, axis=1)
             where = ", ".join(f"{name} {px:.1f} px" for (name, _), px in zip(observed, off))
             left_out.append(
-                f"the clicks on point {point} miss each other by {residual:.1f} px (limit {max_residual_px:g} px): {where}"
+                f"the clicks on point {point} miss each other by {residual:.1f} px"
+                f" (limit {max_residual_px:g} px): {where}"
             )
         else:
             names.append(point)
