@@ -129,7 +129,8 @@ def _make(
         on, off = clicks.pixels[keep & clicks.inside], clicks.pixels[keep & ~clicks.inside]
         if len(inside) < LEAST_KNOWN and not len(on) and clicks.box is None:
             break
-        voter = _asked(ask, photos, k, (on, inside), (off, outside), clicks.box)
+        found = _asked(ask, view, (on, inside), (off, outside), clicks.box, tolerance_px)
+        voter = _voter(photos, k, *found)
         x, y = _pixel(clicks.pixels, voter.mask)
         miss = np.where(clicks.inside, _distance(voter.mask)[y, x], _distance(~voter.mask)[y, x])
         wrong = keep & (miss > tolerance_px)
@@ -145,15 +146,30 @@ def _make(
 
 
 def _asked(
-    ask: Ask, photos: Workspace, k: int, inside: tuple[Array, Array], outside: tuple[Array, Array], box: Array | None
-) -> _Voter:
-    """The best of the masks for pixels clicked and pixels carried on, without parts that hold none of them."""
+    ask: Ask,
+    view: View,
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    box: Array | None,
+    tolerance_px: float,
+) -> tuple[Mask, float, float]:
+    """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement."""
+    masks, quality = ask(view, inside, outside, box)
     on, off = np.concatenate(inside), np.concatenate(outside)
-    masks, quality = ask(photos.views[k], inside, outside, box)
     masks = [_prompted_parts(cleaned(mask), on, off) for mask in masks]
-    agreement = [_share(mask, on, 1.0) - _share(mask, off, 0.0) for mask in masks]
+    agreement = []
+    for mask in masks:
+        held = np.concatenate([_held(mask, inside[0], tolerance_px), _held(mask, inside[1], 0)])
+        spared = np.concatenate([_held(~mask, outside[0], tolerance_px), _held(~mask, outside[1], 0)])
+        agreement.append((held.mean() if len(held) else 1.0) - ((~spared).mean() if len(spared) else 0.0))
     best = int(np.argmax([a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]))
-    return _voter(photos, k, masks[best], float(quality[best]), agreement[best])
+    return masks[best], float(quality[best]) * bool(masks[best].any()), float(agreement[best])
+
+
+def _held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:
+    """(N,) whether (N, 2) pixels lie in a mask, or no farther off it than the tolerance."""
+    u, v = _pixel(pixels, mask)
+    return mask[v, u] if tolerance_px == 0 or not len(pixels) else _distance(mask)[v, u] <= tolerance_px
 
 
 def _voter(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float) -> _Voter:

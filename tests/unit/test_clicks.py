@@ -88,7 +88,9 @@ def test_one_click_goes_round_both_ways(photos):
     network = PlantedNetwork()
     carried = carry(network, photos, {3: clicks([MIDDLE, (70, 45)])}, 2)
     assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
-    assert network.asked[0] == "f03.png" and set(network.asked[1:3]) == {"f02.png", "f04.png"}
+    assert network.asked[0] == "f03.png" and network.asked[1] in ("f02.png", "f04.png")
+    # Both ways: the last one is opposite.
+    assert network.asked[-1] in ("f08.png", "f09.png", "f10.png")
     assert len(network.asked) == PHOTOS and not carried.reasons and not carried.left_out
     counted = np.bincount(np.concatenate(photos.seen), minlength=1200) >= 5
     assert (carried.kind[:600][counted[:600]] >= 0).all() and (carried.kind[600:] <= 0).all()

@@ -73,7 +73,7 @@ def test_error_sentences_name_the_point(model, tmp_path):
         triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0)
     with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
         triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
-    with pytest.raises(StageError, match=r"point door miss each other by .* px \(limit 5 px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
+    with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
         triangulate(with_click(clicks, 3, pixel=clicks.pixels[3] + [0, 60]), model, 5.0)
     single = clicked(model, tmp_path, photos=("2.jpg",))
     with pytest.raises(StageError, match="in which point roof is clicked is 1; two or more are needed"):
