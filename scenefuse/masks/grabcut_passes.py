@@ -51,6 +51,33 @@ def first_cuts(target: Target, photos: Workspace, width_px: int) -> list[Mask]:
     return masks
 
 
+def ask_grabcut(
+    width_px: int, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+) -> tuple[list[Mask], Array]:
+    """One mask (H, W) of a photo by GrabCut, and its quality: 1, or 0 where it is empty or all of the photo.
+
+    Args:
+        width_px: photos are cut at most this wide.
+        view: the photo, with RGB pixels.
+        inside: (N, 2) pixels clicked on the object and (M, 2) carried on to it; what they span is likely object.
+        outside: the same off the object.
+        box_px: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
+    """
+    on, off = np.concatenate(inside), np.concatenate(outside)
+    trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)
+    if box_px is not None:
+        (left, top), (right, bottom) = box_px.astype(int)
+        trimap[:], trimap[top : bottom + 1, left : right + 1] = cv2.GC_BGD, cv2.GC_PR_FGD
+    elif len(on) >= 3:
+        fill_hull(trimap, on, cv2.GC_PR_FGD)
+    radius = max(1, round(SEED_RADIUS * view.width))
+    for pixels, label in ((off, cv2.GC_BGD), (on, cv2.GC_FGD)):
+        for x, y in pixels.astype(int):
+            cv2.circle(trimap, (int(x), int(y)), radius, label, -1)
+    mask = cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS))
+    return [mask], np.array([float(mask.any() and not mask.all())])
+
+
 def second_cuts(target: Target, masks: list[Mask], photos: Workspace, hull: Hull, band_px: float) -> list[Mask]:
     """GrabCut once more, where a photo's mask and the hull do not agree.
 

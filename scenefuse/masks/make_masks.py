@@ -11,18 +11,13 @@ from numpy.typing import NDArray
 from scenefuse.io.pictures import write_picture
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.contact_sheet import draw_contact_sheet
+from scenefuse.masks.prompted import Prompted, masks_from_prompts
 from scenefuse.masks.sam2 import load_network
-from scenefuse.masks.segmentation import (
-    MaskSettings,
-    ScoredMasks,
-    score_masks,
-    segment_by_grabcut,
-    segment_by_sam2,
-)
+from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.masks.target import Target, points_in_masks, target_from_points
+from scenefuse.masks.target import points_in_masks, target_from_points
 from scenefuse.mvs.visual_hull import Mask
-from scenefuse.sfm.fiducials import locate
+from scenefuse.sfm.fiducials import read_points
 from scenefuse.sfm.frames import original_sizes
 from scenefuse.stage import (
     StageError,
@@ -35,7 +30,6 @@ from scenefuse.stage import (
     value,
     write_json,
 )
-from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace, read_workspace
 
 
@@ -52,8 +46,8 @@ class MaskInputs:
     photos_json: Path
     """JSON list of the frames, with the sizes of the photos they were made from: clicks are in their pixels."""
     prompts: Path | None = None
-    """For grabcut and sam2: TSV of pixels clicked in two or more photos, or of points in the object's frame, on the
-    object and spanning it."""
+    """For grabcut and sam2: TSV of pixels labelled inside, outside or box in one photo or more; or of points on the
+    object and spanning it, each clicked in two or more photos or in the object's frame."""
     supplied: Path | None = None
     """For supplied: folder of masks named like the photos, with or without `_mask`; non-zero on the object."""
 
@@ -63,10 +57,12 @@ def make_masks(
 ) -> None:
     """Write a mask of the object for every undistorted photo (method K1, K3).
 
-    Prompts give an upright box; the sparse points in it and above the ground seed GrabCut in each photo, whose masks
-    carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with all points and the box
-    around them, and again with the hull's box where it disagrees. Supplied masks are undistorted, never changed. A
-    photo without a usable mask, or whose mask disagrees with the hull, is left out. `keep` is applied last.
+    Clicks inside and outside the object in one photo give its mask, whose sparse points prompt the next photos. Or
+    points clicked in several photos give an upright box; the sparse points in it and above the ground seed GrabCut in
+    each photo, whose masks carve a visual hull, along which they are cut again. SAM 2 is prompted in each photo with
+    all points and the box around them, and again with the hull's box where it disagrees. Supplied masks are
+    undistorted, never changed. A photo without a usable mask, or whose mask disagrees with the hull, is left out.
+    `keep` is applied last.
 
     Args:
         inputs: see MaskInputs.
@@ -82,7 +78,9 @@ def make_masks(
     cv2.setNumThreads(threads())
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
-    made, target, weights = _make(inputs, photos, settings, seed)
+    made, found, weights = _make(inputs, photos, settings, seed)
+    for sentence in found.left_out:
+        print(f"left out of {inputs.prompts}: {sentence}", flush=True)
     for name, reason in sorted(made.dropped.items()):
         print(f"{name} left out: {reason}", flush=True)
     kept = [view.name for view in photos.views if view.name not in made.dropped]
@@ -97,32 +95,40 @@ def make_masks(
         files = manifest(folder)
     with atomic_file(contact_sheet) as path:
         write_picture(path, _sheet(photos.views, made))
-    content = _report(made, target, len(photos.views), kept, settings)
+    content = _report(made, found, len(photos.views), kept, settings)
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
     write_json(report, content | ({"weights": quantity(weights, "")} if weights else {}) | {"files": files})
 
 
-def _make(inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int) -> tuple[ScoredMasks, Target, str]:
-    """Masks of all photos that have one, where the object is, and which weights segmented them."""
+def _make(
+    inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int
+) -> tuple[ScoredMasks, Prompted, str]:
+    """Masks of all photos that have one, what they were made from, and which weights segmented them."""
     up = np.array(value(read_json(inputs.workspace_json), "up_in_camera_frame"), dtype=np.float64)
     unusable: dict[str, str] = {}
-    masks: list[Mask] = []
+    weights = ""
     if settings.method == "supplied":
         masks, photos, unusable = _supplied(inputs, photos)
-        points = points_in_masks(photos, masks, up)
+        target = target_from_points(points_in_masks(photos, masks, up), photos, up, seed)
+        found = Prompted(masks, target, {}, [])
     else:
-        points = _prompt_points(inputs, settings)
-    target, weights = target_from_points(points, photos, up, seed), ""
-    print(f"{np.sum(target.kind > 0)} sparse points on the object, {np.sum(target.kind < 0)} not", flush=True)
-    if settings.method == "sam2":
-        checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
-        encoder, decoder = Path(settings.sam2_encoder), Path(settings.sam2_decoder)
-        network, weights = load_network(encoder, decoder, checkpoint, threads())
-        masks = segment_by_sam2(network, target, photos, settings)
-    elif settings.method == "grabcut":
-        masks = segment_by_grabcut(target, photos, settings)
-    made = _kept(score_masks(masks, target, photos.views, settings), settings.keep, inputs.sparse, photos.views)
-    return replace(made, dropped=unusable | made.dropped), target, weights
+        if inputs.prompts is None:
+            raise StageError(
+                "masks from prompts need a prompts file; set its path in config/objects.tsv, or supply masks"
+            )
+        marked, sizes, network = read_points(inputs.prompts), original_sizes(read_json(inputs.photos_json)), None
+        if settings.method == "sam2":
+            checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
+            encoder, decoder = Path(settings.sam2_encoder), Path(settings.sam2_decoder)
+            network, weights = load_network(encoder, decoder, checkpoint, threads())
+        found = masks_from_prompts(marked, inputs.sparse, sizes, photos, up, network, settings, seed)
+    own = found.target.kind
+    print(f"{np.sum(own > 0)} sparse points on the object, {np.sum(own < 0)} not", flush=True)
+    scored = score_masks(found.masks, found.target, photos.views, settings)
+    for name in set(scored.dropped) & set(found.reasons):
+        scored.dropped[name] += f"; {found.reasons[name]}"
+    made = _kept(scored, settings.keep, inputs.sparse, photos.views)
+    return replace(made, dropped=unusable | made.dropped), found, weights
 
 
 def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Workspace, dict[str, str]]:
@@ -133,19 +139,6 @@ def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Worksp
     missing = {view.name: "no mask was supplied" for view in photos.views if view.name not in found}
     photos = photos.subset([k for k, view in enumerate(photos.views) if view.name in found])
     return [found[view.name] for view in photos.views], photos, missing | unusable
-
-
-def _prompt_points(inputs: MaskInputs, settings: MaskSettings) -> Array:
-    """(N, 3) prompts in the object's frame."""
-    if inputs.prompts is None:
-        raise StageError("masks from prompts need a prompts file; set its path in config/objects.tsv, or supply masks")
-    sizes = original_sizes(read_json(inputs.photos_json))
-    names, points, _ = locate(inputs.prompts, inputs.sparse, settings.max_click_residual_px, sizes)
-    if len(points) < 3:
-        raise StageError(
-            f"{inputs.prompts} holds {len(names)} points on the object, three or more are needed; mark some at its ends"
-        )
-    return points
 
 
 def _kept(made: ScoredMasks, keep: str, sparse: Path, views: list[View]) -> ScoredMasks:
@@ -169,7 +162,7 @@ def _sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
     return draw_contact_sheet(views, masks, notes, [view.name in made.dropped for view in views])
 
 
-def _report(made: ScoredMasks, target: Target, photos: int, kept: list[str], settings: MaskSettings) -> dict[str, Any]:
+def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], settings: MaskSettings) -> dict[str, Any]:
     """What the stage found, without its files."""
     per_photo = {
         name: {"area": round(float(mask.mean()), 5), "agreement": round(float(made.scores[name]), 4)}
@@ -182,7 +175,8 @@ def _report(made: ScoredMasks, target: Target, photos: int, kept: list[str], set
         "photos": quantity(photos, "1"),
         "photos_left_out": quantity(sorted(made.dropped), ""),
         "median_agreement": quantity(float(np.median([made.scores[name] for name in kept])), "1"),
-        "ground": quantity("measured" if target.ground_found else "not found; bottom of the box", ""),
+        "ground": quantity("measured" if found.target.ground_found else "not found; bottom of the box", ""),
+        "clicks_left_out": quantity(found.left_out, ""),
         "hull_voxel": quantity(made.hull.voxel, "object units"),
         "dropped": made.dropped,
         "per_photo": per_photo,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
-from scenefuse.masks.target import Target
+from scenefuse.masks.target import Target, far_apart
 from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError, sha256
 from scenefuse.transforms import Array
@@ -24,6 +24,11 @@ LOGITS_PX = 256
 """Side of the masks it gives and takes."""
 BOX_GROWTH = 0.05
 """Growth of the box around the prompts, as a share of its longer side."""
+MOST_INSIDE, MOST_OUTSIDE = 10, 6
+"""Points carried on from other photos that prompt a photo at most: far apart, they say as much as hundreds."""
+NEAR = 0.3
+"""Points off the object prompt only this near the box around those on it, as a share of its longer side."""
+NONE = np.zeros((0, 2))
 
 
 class Sam2(Protocol):
@@ -32,7 +37,9 @@ class Sam2(Protocol):
     def encode(self, image: NDArray[np.uint8]) -> Any:
         """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts."""
 
-    def masks(self, features: Any, size: tuple[int, int], points_px: Array, box_px: Array) -> tuple[list[Mask], Array]:
+    def masks(
+        self, features: Any, size: tuple[int, int], points_px: Array, box_px: Array | None, outside_px: Array = NONE
+    ) -> tuple[list[Mask], Array]:
         """Three masks (H, W), a part, a larger part and the whole, and how good the network thinks they are, (3,).
 
         Args:
@@ -40,6 +47,7 @@ class Sam2(Protocol):
             size: its (height, width).
             points_px: (P, 2) pixels on the object.
             box_px: (2, 2) corners of a box around it, upper left first.
+            outside_px: (Q, 2) pixels not on it.
         """
 
 
@@ -64,10 +72,15 @@ class Sam2Onnx:
         return dict(zip(names, outputs))
 
     def masks(
-        self, features: dict[str, NDArray[np.float32]], size: tuple[int, int], points_px: Array, box_px: Array
+        self,
+        features: dict[str, NDArray[np.float32]],
+        size: tuple[int, int],
+        points_px: Array,
+        box_px: Array | None,
+        outside_px: Array = NONE,
     ) -> tuple[list[Mask], Array]:
         """See Sam2."""
-        points, labels = _prompts(size, points_px, box_px)
+        points, labels = _prompts(size, points_px, box_px, outside_px)
         inputs = features | {
             "point_coords": points[None],
             "point_labels": labels[None],
@@ -111,10 +124,16 @@ class Sam2Transformers:
             return self._network.get_image_embeddings(torch.from_numpy(_blob(image)).to(self._device))
 
     def masks(
-        self, features: list[torch.Tensor], size: tuple[int, int], points_px: Array, box_px: Array
+        self,
+        features: list[torch.Tensor],
+        size: tuple[int, int],
+        points_px: Array,
+        box_px: Array | None,
+        outside_px: Array = NONE,
     ) -> tuple[list[Mask], Array]:
         """See Sam2."""
-        points, labels = (torch.from_numpy(a)[None, None].to(self._device) for a in _prompts(size, points_px, box_px))
+        prompts = _prompts(size, points_px, box_px, outside_px)
+        points, labels = (torch.from_numpy(a)[None, None].to(self._device) for a in prompts)
         with torch.inference_mode():
             found = self._network(
                 image_embeddings=features, input_points=points, input_labels=labels.int(), multimask_output=True
@@ -130,11 +149,17 @@ def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     return np.ascontiguousarray(normalised.transpose(2, 0, 1)[None], dtype=np.float32)
 
 
-def _prompts(size: tuple[int, int], points_px: Array, box_px: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Points and the box's corners (P + 2, 2) in the network's pixels, and their labels: 1, 2 and 3."""
+def _prompts(
+    size: tuple[int, int], points_px: Array, box_px: Array | None, outside_px: Array
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Pixels in the network's own, and their labels: 1 on the object, 0 off it, the box's corners 2 and 3.
+
+    Where there is no box, a point labelled -1 stands for it, as the network was trained.
+    """
     height, width = size
-    points = np.concatenate([points_px, box_px]) * [SIDE_PX / width, SIDE_PX / height]
-    labels = [1.0] * len(points_px) + [2.0, 3.0]
+    corners, names = (np.zeros((1, 2)), [-1.0]) if box_px is None else (box_px, [2.0, 3.0])
+    points = np.concatenate([points_px, outside_px, corners]) * [SIDE_PX / width, SIDE_PX / height]
+    labels = [1.0] * len(points_px) + [0.0] * len(outside_px) + names
     return points.astype(np.float32), np.array(labels, dtype=np.float32)
 
 
@@ -175,6 +200,27 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None) -> 
     if outline is not None:
         quality = np.array([mask_iou(m, outline) for m in found])
     return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))])
+
+
+def ask_sam2(
+    network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+) -> tuple[list[Mask], Array]:
+    """SAM 2's three masks (H, W) of a photo and its own opinion of them (3,).
+
+    Args:
+        network: SAM 2.
+        view: the photo, with RGB pixels.
+        inside: (N, 2) pixels clicked on the object, and (M, 2) carried on to it, of which a few far apart count.
+        outside: the same off the object; of those carried on, the near ones.
+        box_px: (2, 2) corners of a box around it, upper left first, or None.
+    """
+    around = np.concatenate(inside) if box_px is None else box_px
+    low, high = around.min(0), around.max(0)
+    reach = NEAR * (high - low).max()
+    near = outside[1][((outside[1] > low - reach) & (outside[1] < high + reach)).all(1)]
+    on = far_apart(inside[0], inside[1], MOST_INSIDE)
+    off = far_apart(outside[0], near if len(near) else outside[1], MOST_OUTSIDE)
+    return network.masks(network.encode(view.pixels), (view.height, view.width), on, box_px, off)
 
 
 def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:

@@ -42,7 +42,8 @@ class MaskSettings:
     min_agreement: float = setting(0.6, least=0, most=1)
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
-    """Largest reprojection error of a clicked prompt."""
+    """Largest reprojection error of a clicked prompt, and how far a click inside or outside may lie on the wrong side
+    of its mask's outline; others are left out and named."""
     min_photos: int = 5
     """Fewest good masks to go on with."""
     hull_voxels: int = 96
@@ -80,6 +81,14 @@ def segment_by_grabcut(target: Target, photos: Workspace, settings: MaskSettings
 def segment_by_sam2(network: Sam2, target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
     """SAM 2 photo by photo, and once more, with the visual hull's box, where a mask disagrees with the hull."""
     masks = [segment(network, target, view, None) for view in photos.views]
+    return segment_again(network, target, masks, photos, settings)
+
+
+def segment_again(
+    network: Sam2, target: Target, masks: list[Mask], photos: Workspace, settings: MaskSettings
+) -> list[Mask]:
+    """SAM 2 once more, with the visual hull's box, where one of the masks (H, W) disagrees with the hull."""
+    masks = list(masks)
     hull = carve_trusted(target, photos.views, masks, settings, FIRST_TOLERANCE)
     for k, view in enumerate(photos.views):
         outline = silhouette(hull, view)

@@ -1,6 +1,6 @@
 """Where an object is, by the sparse model and a few points on it: box, ground, and which sparse points are its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,8 @@ scatters."""
 PART_EDGE = 0.12
 """Longest edge between prompts that enclose a part of the object, as a share of the box's diagonal: close clicks mark
 the corners of a small part."""
+MOST_SPANNING = 64
+"""Sparse points, far apart, that stand for the object where masks voted for thousands."""
 LEAST_OWN = 10
 """Sparse points on the object that supplied masks have to hold: fewer do not tell its extent."""
 
@@ -85,6 +87,43 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
     return Target(box, ground, found, points, grow, _parts(points, PART_EDGE * box.diagonal), sparse, kind)
 
 
+def target_from_votes(kind: NDArray[np.int8], photos: Workspace, up: Array, seed: int) -> Target:
+    """Where the object is, by the sparse points that the photos' masks vote for: those whose kind (P,) is 1.
+
+    What these points do not decide is decided as in `target_from_points`, whose other arguments they are: a vote
+    against a point says less, as a part of the object that one mask lacks is missing from the next ones too.
+
+    Raises:
+        StageError: fewer than ten points are on the object.
+    """
+    own = photos.points[kind > 0]
+    if len(own) < LEAST_OWN:
+        raise StageError(
+            f"only {len(own)} sparse points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
+            " a photo that shows more of the object, or in several"
+        )
+    target = target_from_points(_without_outermost(own, up), photos, up, seed)
+    spanning = far_apart(np.empty((0, 3)), target.spanning, MOST_SPANNING)
+    return replace(
+        target,
+        spanning=spanning,
+        kind=np.where(kind > 0, kind, target.kind).astype(np.int8),
+        parts=np.empty((0, 4), dtype=np.intp),
+    )
+
+
+def far_apart(first: Array, others: Array, count: int) -> Array:
+    """The first (N, D) points, and of the others those farthest from all before, up to `count` together."""
+    chosen = list(first) if len(first) else list(others[:1])
+    gaps = np.full(len(others), np.inf)
+    for point in chosen:
+        gaps = np.minimum(gaps, np.linalg.norm(others - point, axis=1))
+    while len(chosen) < count and gaps.max(initial=0) > 0:
+        chosen.append(others[gaps.argmax()])
+        gaps = np.minimum(gaps, np.linalg.norm(others - chosen[-1], axis=1))
+    return np.array(chosen).reshape(-1, others.shape[1])
+
+
 def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
     """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
 
@@ -102,6 +141,11 @@ def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"
         )
+    return _without_outermost(own, up)
+
+
+def _without_outermost(own: Array, up: Array) -> Array:
+    """The (N, 3) points without the outermost half per cent at each side: some are mismatched."""
     x = upright_box(own, up, 0.0).to_box(own)
     low, high = np.percentile(x, [0.5, 99.5], axis=0)
     return own[((x >= low) & (x <= high)).all(1)]

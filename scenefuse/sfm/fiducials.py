@@ -1,4 +1,4 @@
-"""Points that a person marked: clicks in photos, triangulated through the cameras, or points in the scene frame."""
+"""What a person marked: clicks on points, triangulated through the cameras, points in the scene frame, or labels."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -14,6 +14,8 @@ from scenefuse.workspace import read_model
 Array = NDArray[np.float64]
 CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
 POINT_COLUMNS = ["point", "x", "y", "z"]
+LABEL_COLUMNS = ["label", "photo", "x_px", "y_px"]
+LABELS = ("inside", "outside", "box")
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,29 @@ class ScenePoints:
     positions: Array
 
 
-def read_points(path: Path) -> Clicks | ScenePoints:
-    """Read a tab-separated file of clicks (point, photo, x_px, y_px) or of scene points (point, x, y, z).
+@dataclass(frozen=True)
+class Labels:
+    """Pixels of photos labelled as on or off an object.
+
+    Attributes:
+        path: the file they come from, for messages.
+        labels: N of inside, outside and box; a box has two lines, opposite corners.
+        photos: N photo names.
+        pixels: (N, 2) as in Clicks.
+    """
+
+    path: Path
+    labels: list[str]
+    photos: list[str]
+    pixels: Array
+
+
+def read_points(path: Path) -> Clicks | ScenePoints | Labels:
+    """Read a tab-separated file of clicks (point, photo, x_px, y_px), scene points (point, x, y, z) or labelled
+    pixels (label, photo, x_px, y_px).
 
     Raises:
-        StageError: the file is missing or empty, its header is neither of the two, or a line is not well formed.
+        StageError: the file is missing or empty, its header is none of these, or a line is not well formed.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -62,14 +82,14 @@ def read_points(path: Path) -> Clicks | ScenePoints:
         raise StageError(f"{path} is no text; save the marked points as tab-separated text (UTF-8)") from None
     rows = [(n, line.split("\t")) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
     header = [cell.strip() for cell in rows[0][1]] if rows else []
-    if header not in (CLICK_COLUMNS, POINT_COLUMNS):
+    if header not in (CLICK_COLUMNS, POINT_COLUMNS, LABEL_COLUMNS):
         raise StageError(
-            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z', "
-            f"not with '{' '.join(header)}'"
+            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' (or, for "
+            f"prompts, 'label photo x_px y_px'), not with '{' '.join(header)}'"
         )
     if len(rows) == 1:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
-    texts = 2 if header == CLICK_COLUMNS else 1
+    texts = 1 if header == POINT_COLUMNS else 2
     names: list[list[str]] = []
     numbers: list[list[float]] = []
     for number, cells in rows[1:]:
@@ -85,6 +105,10 @@ def read_points(path: Path) -> Clicks | ScenePoints:
             ) from None
         names.append([cell.strip() for cell in cells[:texts]])
         numbers.append(values)
+        if header == LABEL_COLUMNS and names[-1][0] not in LABELS:
+            raise StageError(f"{path}, line {number}: the label is {', '.join(LABELS)}, not '{names[-1][0]}'")
+    if header == LABEL_COLUMNS:
+        return _labels(path, names, numbers)
     keys = [tuple(entry) for entry in names]
     for key in keys:
         if keys.count(key) > 1:
@@ -92,6 +116,17 @@ def read_points(path: Path) -> Clicks | ScenePoints:
     if header == POINT_COLUMNS:
         return ScenePoints(path, [n[0] for n in names], np.array(numbers))
     return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
+
+
+def _labels(path: Path, names: list[list[str]], numbers: list[list[float]]) -> Labels:
+    """Labelled pixels, each given once."""
+    places = [(photo, *pixel) for (_, photo), pixel in zip(names, numbers)]
+    for (photo, x, y), (label, _) in zip(places, names):
+        if places.count((photo, x, y)) > 1:
+            raise StageError(
+                f"{path}: ({x:g}, {y:g}) in {photo} is clicked more than once ({label}); keep one line of it"
+            )
+    return Labels(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
 
 
 def triangulate(
@@ -114,10 +149,52 @@ def triangulate(
         Point names in order of appearance, (P, 3) positions, (P,) RMS reprojection errors in pixels.
 
     Raises:
+        StageError: as `triangulate_consistent`, and rays that are parallel or miss each other: all points at once.
+    """
+    names, positions, residuals, left_out = triangulate_consistent(clicks, model, max_residual_px, sizes)
+    if left_out:
+        raise StageError(f"{clicks.path}: {'; '.join(left_out)}; correct these clicks, or delete them")
+    return names, positions, residuals
+
+
+def triangulate_consistent(
+    clicks: Clicks,
+    model: pycolmap.Reconstruction,
+    max_residual_px: float,
+    sizes: Mapping[str, tuple[int, int]] | None = None,
+) -> tuple[list[str], Array, Array, list[str]]:
+    """As `triangulate`, but points whose clicks contradict each other are left out and named in the fourth result.
+
+    Raises:
         StageError: a photo that the model does not hold, a click outside its photo, a point with fewer than two clicks
-            in registered photos, rays that are parallel or miss each other. Each message names the point.
+            in registered photos. Each message names the point.
     """
     images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    positions, residuals, names, left_out = [], [], [], []
+    for point, observed in _sightings(clicks, images, sizes).items():
+        seen, pixels = [images[name] for name, _ in observed], np.array([p for _, p in observed])
+        position, residual = _intersect(seen, pixels)
+        if position is None:
+            where = ", ".join(name for name, _ in observed)
+            left_out.append(f"the rays to point {point} from {where} are parallel or meet behind a camera")
+        elif residual > max_residual_px:
+            off = np.linalg.norm(np.array([image.project_point(position) for image in seen]) - pixels, axis=1)
+            where = ", ".join(f"{name} {px:.1f} px" for (name, _), px in zip(observed, off))
+            left_out.append(
+                f"the clicks on point {point} miss each other by {residual:.1f} px"
+                f" (limit {max_residual_px:g} px): {where}"
+            )
+        else:
+            names.append(point)
+            positions.append(position)
+            residuals.append(residual)
+    return names, np.array(positions).reshape(-1, 3), np.array(residuals), left_out
+
+
+def _sightings(
+    clicks: Clicks, images: Mapping[str, pycolmap.Image], sizes: Mapping[str, tuple[int, int]] | None
+) -> dict[str, list[tuple[str, Array]]]:
+    """The registered photos and their pixels where each point was clicked, two or more."""
     seen: dict[str, list[tuple[str, Array]]] = {}
     lost: dict[str, list[str]] = {}
     for point, photo, pixel in zip(clicks.points, clicks.photos, clicks.pixels):
@@ -138,23 +215,7 @@ def triangulate(
                 f"{clicks.path}: the number of registered photos in which point {point} is clicked is "
                 f"{len(observed)}{why}; two or more are needed, click it in another one"
             )
-    positions, residuals = [], []
-    for point, observed in seen.items():
-        where = ", ".join(name for name, _ in observed)
-        position, residual = _intersect([images[name] for name, _ in observed], np.array([p for _, p in observed]))
-        if position is None:
-            raise StageError(
-                f"{clicks.path}: the rays to point {point} from {where} are parallel or meet behind a camera; "
-                f"correct the clicks, or click it in photos taken from more different places"
-            )
-        if residual > max_residual_px:
-            raise StageError(
-                f"{clicks.path}: the clicks on point {point} miss each other by {residual:.1f} px (limit "
-                f"{max_residual_px:g} px); check that it is the same spot in {where}"
-            )
-        positions.append(position)
-        residuals.append(residual)
-    return list(seen), np.array(positions), np.array(residuals)
+    return seen
 
 
 def locate(
@@ -168,6 +229,8 @@ def locate(
     marked = read_points(path)
     if isinstance(marked, ScenePoints):
         return marked.points, marked.positions, np.zeros(len(marked.points))
+    if isinstance(marked, Labels):
+        raise StageError(f"{path} holds labels, which are for prompts; mark points here ('point photo x_px y_px')")
     return triangulate(marked, read_model(model), max_residual_px, sizes)
 
 

@@ -2,7 +2,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate
+from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
 from scenefuse.stage import StageError
 
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
@@ -73,11 +73,21 @@ def test_error_sentences_name_the_point(model, tmp_path):
         triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0)
     with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
         triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
-    with pytest.raises(StageError, match=r"point door miss each other by .* px \(limit 5 px\).*1\.jpg, 2\.jpg, 3\.jpg"):
+    with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
         triangulate(with_click(clicks, 3, pixel=clicks.pixels[3] + [0, 60]), model, 5.0)
     single = clicked(model, tmp_path, photos=("2.jpg",))
     with pytest.raises(StageError, match="in which point roof is clicked is 1; two or more are needed"):
         triangulate(single, model, 5.0)
+
+
+def test_all_points_whose_clicks_miss_each_other_are_named_at_once_or_left_out(model, tmp_path):
+    clicks = clicked(model, tmp_path, points=POINTS | {"step": [0.0, 0.3, 0.0]})
+    clicks = with_click(with_click(clicks, 0, pixel=[300, 200]), 3, pixel=clicks.pixels[3] + [0, 60])
+    with pytest.raises(StageError, match="point roof miss each other by .*; the clicks on point door .* 3.jpg .* px; "):
+        triangulate(clicks, model, 5.0)
+    names, positions, _, left_out = triangulate_consistent(clicks, model, 5.0)
+    assert names == ["step"] and len(left_out) == 2 and "1.jpg 39.1 px" in left_out[1]
+    np.testing.assert_allclose(positions, [[0.0, 0.3, 0.0]], atol=1e-7)
 
 
 def test_a_click_in_a_photo_that_was_not_registered_is_left_out(model, tmp_path):

@@ -146,6 +146,17 @@ def test_grabcut_finds_the_ball(capture, tmp_path):
     assert cv2.imread(str(tmp_path / "sheet.png")).shape[1] == 8 * 240
 
 
+def test_clicks_in_one_photo_find_the_ball_and_a_contradictory_one_is_reported(capture, tmp_path):
+    (x, y), *_ = view(0).project(CENTRE[None])[0]
+    rows = [("inside", x, y), ("inside", x - 9, y), ("inside", x + 9, y), ("outside", x, y + 35), ("outside", x + 3, y)]
+    text = "".join(f"{label}\tf0.png\t{column}\t{row}\n" for label, column, row in rows)
+    (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + text)
+    run_stage(capture, tmp_path, prompts=tmp_path / "clicks.tsv")
+    assert min(iou_with_truth(capture, tmp_path)) > 0.93
+    (left_out,) = value(read_json(tmp_path / "masks.json"), "clicks_left_out")
+    assert left_out.startswith("the click outside at") and "f0.png" in left_out
+
+
 def test_a_photo_that_shows_nothing_is_left_out_for_disagreeing_with_the_hull_and_no_other(capture, tmp_path):
     grey = tmp_path / "capture"
     shutil.copytree(capture, grey)

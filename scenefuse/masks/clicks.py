@@ -1,0 +1,91 @@
+"""Clicks that say what is the object in single photos: inside, outside, or the corners of a box."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenefuse.sfm.fiducials import Labels
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, posed_images, read_model
+
+
+@dataclass(frozen=True)
+class PhotoClicks:
+    """What a person clicked in one photo.
+
+    Attributes:
+        pixels: (N, 2) of the undistorted photo.
+        inside: (N,) True on the object, False off it.
+        box: (2, 2) corners of a box around the object, upper left first; None where there is none.
+    """
+
+    pixels: Array
+    inside: np.ndarray
+    box: Array | None = None
+
+
+def clicks_per_photo(
+    labels: Labels, sparse: Path, views: list[View], sizes: Mapping[str, tuple[int, int]]
+) -> dict[int, PhotoClicks]:
+    """The clicks of each clicked photo, by its row in `views`, in pixels of the undistorted photo.
+
+    Args:
+        labels: the file, in pixels of the original photos.
+        sparse: COLMAP model of the photos before undistortion.
+        views: undistorted photos.
+        sizes: photo name -> (width, height) of the photos clicked in, of all photos, also those without a camera.
+
+    Raises:
+        StageError: a photo that does not exist or has no camera, a click outside its photo, a box that is not two
+            corners, only clicks outside.
+    """
+    images = {image.name: image for image in posed_images(read_model(sparse))}
+    rows = {view.name: k for k, view in enumerate(views)}
+    found: dict[int, list[tuple[str, Array]]] = {}
+    for label, photo, pixel in zip(labels.labels, labels.photos, labels.pixels):
+        if photo not in images or photo not in rows:
+            known = "has no camera (it could not be registered)" if photo in sizes else "is not among the photos"
+            some = ", ".join(sorted(images)[:3])
+            raise StageError(
+                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) is in {photo}, which {known}; "
+                f"click in one of the {len(images)} photos with a camera ({some}, ...)"
+            )
+        camera, view = images[photo].camera, views[rows[photo]]
+        assert camera is not None
+        width, height = sizes.get(photo, (camera.width, camera.height))
+        if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+            raise StageError(
+                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) lies outside {photo}, which has "
+                f"{width} x {height} pixels; correct the click"
+            )
+        ray = camera.cam_from_img(pixel * [camera.width / width, camera.height / height])
+        undistorted = (view.intrinsics @ [*np.asarray(ray).ravel(), 1.0])[:2]
+        edge = np.array([view.width, view.height]) - 1e-3
+        if label == "box":
+            undistorted = np.clip(undistorted, 0, edge)
+        elif (undistorted < 0).any() or (undistorted > edge).any():
+            raise StageError(
+                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) in {photo} is cut away with the "
+                "photo's edge when its lens distortion is removed; click farther from the edge"
+            )
+        found.setdefault(rows[photo], []).append((label, undistorted))
+    clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
+    if not any(c.inside.any() or c.box is not None for c in clicked.values()):
+        raise StageError(f"{labels.path} holds only clicks outside the object; add a few inside it, or a box around it")
+    return clicked
+
+
+def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array]]) -> PhotoClicks:
+    """The clicks of one photo, its two box corners sorted."""
+    corners = np.array([pixel for label, pixel in clicks if label == "box"]).reshape(-1, 2)
+    if len(corners) not in (0, 2) or (len(corners) and (np.ptp(corners, axis=0) < 2).any()):
+        raise StageError(f"{path}: a box in {photo} needs two lines, two opposite corners; there are {len(corners)}")
+    points = [(label == "inside", pixel) for label, pixel in clicks if label != "box"]
+    return PhotoClicks(
+        np.array([pixel for _, pixel in points]).reshape(-1, 2),
+        np.array([inside for inside, _ in points], dtype=bool),
+        np.stack([corners.min(0), corners.max(0)]) if len(corners) else None,
+    )

@@ -1,0 +1,98 @@
+"""Masks from prompts: points triangulated from several photos, or clicks in one, carried on to the others."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from scenefuse.masks.carry import Ask, carry
+from scenefuse.masks.clicks import clicks_per_photo
+from scenefuse.masks.grabcut_passes import ask_grabcut
+from scenefuse.masks.sam2 import Sam2, ask_sam2
+from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
+from scenefuse.masks.target import Target, target_from_points, target_from_votes
+from scenefuse.mvs.visual_hull import Mask
+from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, triangulate_consistent
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+from scenefuse.workspace import Workspace, read_model
+
+LEAST_POINTS = 3
+"""Prompts that span an object."""
+
+
+@dataclass(frozen=True)
+class Prompted:
+    """What prompts lead to.
+
+    Attributes:
+        masks: (H, W) per photo, empty where there is none.
+        target: where the object is.
+        reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
+        left_out: clicks that contradict the others, a sentence each.
+    """
+
+    masks: list[Mask]
+    target: Target
+    reasons: dict[str, str]
+    left_out: list[str]
+
+
+def masks_from_prompts(
+    marked: Clicks | ScenePoints | Labels,
+    sparse: Path,
+    sizes: Mapping[str, tuple[int, int]],
+    photos: Workspace,
+    up: Array,
+    network: Sam2 | None,
+    settings: MaskSettings,
+    seed: int,
+) -> Prompted:
+    """Masks of all photos by SAM 2, or by GrabCut where there is no network.
+
+    Args:
+        marked: the prompts.
+        sparse: COLMAP model of the photos before undistortion.
+        sizes: photo name -> (width, height) of the photos clicked in.
+        photos: views with RGB pixels.
+        up: (3,) the direction against gravity.
+        network: SAM 2, or None.
+        settings: see MaskSettings.
+        seed: seed of the ground's RANSAC.
+
+    Raises:
+        StageError: the prompts are wrong or too few, or lead to no mask.
+    """
+    if isinstance(marked, Labels):
+        clicked = clicks_per_photo(marked, sparse, photos.views, sizes)
+        ask: Ask = partial(ask_sam2, network) if network else partial(ask_grabcut, settings.grabcut_width_px)
+        carried = carry(ask, photos, clicked, settings.max_click_residual_px)
+        target = target_from_votes(carried.kind, photos, up, seed)
+        if network:
+            masks = segment_again(network, target, carried.masks, photos, settings)
+        else:
+            masks = segment_by_grabcut(target, photos, settings)
+        return Prompted(masks, target, carried.reasons, carried.left_out)
+    points, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
+    target = target_from_points(points, photos, up, seed)
+    if network:
+        return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out)
+    return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out)
+
+
+def _points(
+    marked: Clicks | ScenePoints, sparse: Path, sizes: Mapping[str, tuple[int, int]], max_residual_px: float
+) -> tuple[Array, list[str]]:
+    """(N, 3) prompts in the object's frame, and the points whose clicks contradict each other."""
+    left_out: list[str] = []
+    if isinstance(marked, ScenePoints):
+        names, points = marked.points, marked.positions
+    else:
+        names, points, _, left_out = triangulate_consistent(marked, read_model(sparse), max_residual_px, sizes)
+    if len(points) < LEAST_POINTS:
+        wrong = f" ({'; '.join(left_out)})" if left_out else ""
+        raise StageError(
+            f"{marked.path} holds {len(names)} points on the object that can be used, three or more are needed{wrong};"
+            " mark some at its ends"
+        )
+    return points, left_out

@@ -1,0 +1,263 @@
+"""Masks from clicks in one photo: a planted ball, sparse points on it and around it, photos on a circle."""
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from scenefuse.masks.carry import carry
+from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.grabcut_passes import ask_grabcut
+from scenefuse.masks.sam2 import ask_sam2
+from scenefuse.masks.target import far_apart
+from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.sfm.fiducials import Labels, locate, read_points
+from scenefuse.stage import StageError
+from scenefuse.workspace import View, Workspace, write_model
+
+WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 12
+INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+HEADER = "label\tphoto\tx_px\ty_px\n"
+NONE = np.zeros((0, 2))
+
+
+def planted_view(k):
+    """A camera on a circle, five away from the unit ball at the origin, with the true mask as its photo."""
+    angle = 2 * np.pi * k / PHOTOS
+    position = np.array([5 * np.cos(angle), 5 * np.sin(angle), 0.0])
+    forward = -position / 5
+    right = np.cross(forward, [0, 0, 1.0])
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ position
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    # All pixels that the ball touches: its limb holds many points.
+    ball = np.hypot(u - WIDTH / 2, v - HEIGHT / 2) < FOCAL / np.sqrt(24) + 1
+    pixels = np.where(ball[..., None], [190, 60, 50], [70, 130, 60]).astype(np.uint8)
+    return View(f"f{k:02}.png", INTRINSICS, pose, WIDTH, HEIGHT, pixels)
+
+
+def true_mask(view):
+    return view.pixels[..., 0] > 100
+
+
+@pytest.fixture(scope="module")
+def photos():
+    """Each photo sees the points of the ball that face it, and those of a distant shell that the ball does not hide."""
+    generator = np.random.default_rng(0)
+    sphere = generator.normal(size=(1200, 3))
+    sphere /= np.linalg.norm(sphere, axis=1, keepdims=True)
+    points = np.concatenate([sphere[:600], 12 * sphere[600:]])
+    views = [planted_view(k) for k in range(PHOTOS)]
+    seen, seen_at = [], []
+    for view in views:
+        rows, at, _ = view.visible(points)
+        facing = ((points[rows] - view.centre) * points[rows]).sum(1) < 0
+        own = rows < 600
+        keep = np.where(own, facing, ~true_mask(view)[at[:, 1], at[:, 0]])
+        seen.append(rows[keep])
+        seen_at.append(view.project(points[rows[keep]])[0])
+    return Workspace(Path(), views, points, seen, seen_at)
+
+
+def clicks(inside, outside=(), box=None):
+    pixels = np.array([*inside, *outside], float).reshape(-1, 2)
+    return PhotoClicks(pixels, np.arange(len(pixels)) < len(inside), None if box is None else np.array(box, float))
+
+
+MIDDLE = (60.0, 45.0)
+
+
+class PlantedNetwork:
+    """Answers with the true mask and half of it, or with all the rest for photos that it is to get wrong."""
+
+    def __init__(self, wrong=(), quality=0.9):
+        self.wrong, self.quality, self.asked = dict.fromkeys(wrong, 0), quality, []
+
+    def __call__(self, view, inside, outside, box):
+        self.asked.append(view.name)
+        mask = true_mask(view)
+        if view.name in self.wrong:
+            return [~mask], np.array([self.quality])
+        half = mask & (np.arange(WIDTH) < WIDTH / 2)
+        return [half, mask], np.array([0.9, 0.8])
+
+
+def test_one_click_goes_round_both_ways(photos):
+    network = PlantedNetwork()
+    carried = carry(network, photos, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
+    assert network.asked[0] == "f03.png" and network.asked[1] in ("f02.png", "f04.png")
+    # Both ways: the last one is opposite.
+    assert network.asked[-1] in ("f08.png", "f09.png", "f10.png")
+    assert len(network.asked) == PHOTOS and not carried.reasons and not carried.left_out
+    counted = np.bincount(np.concatenate(photos.seen), minlength=1200) >= 5
+    assert (carried.kind[:600][counted[:600]] >= 0).all() and (carried.kind[600:] <= 0).all()
+    assert (carried.kind[:600] == 1).sum() > 300 and (carried.kind[600:] == -1).sum() > 50
+
+
+@pytest.mark.parametrize("quality", [0.95, 0.2])
+def test_a_mask_that_is_bad_or_disagrees_does_not_vote_and_the_round_goes_on(photos, quality):
+    network = PlantedNetwork(wrong=["f05.png"], quality=quality)
+    carried = carry(network, photos, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert list(carried.reasons) == ["f05.png"] and not carried.masks[5].any()
+    assert network.asked.count("f05.png") == 2
+    for k in set(range(PHOTOS)) - {5}:
+        assert mask_iou(carried.masks[k], true_mask(photos.views[k])) == 1
+    assert (carried.kind[600:] <= 0).all()
+
+
+def test_a_bad_mask_of_low_quality_does_not_vote_although_it_holds_its_prompts(photos):
+    def ask(view, inside, outside, box):
+        mask = true_mask(view)
+        return ([mask], np.array([0.9])) if view.name != "f04.png" else ([mask], np.array([0.3]))
+
+    carried = carry(ask, photos, {3: clicks([MIDDLE])}, 2)
+    assert list(carried.reasons) == ["f04.png"] and "quality 0.30" in carried.reasons["f04.png"]
+
+
+def test_parts_without_a_prompt_are_not_the_object(photos):
+    def ask(view, inside, outside, box):
+        mask = true_mask(view)
+        mask[5:25, 5:25] = True
+        return [mask], np.ones(1)
+
+    carried = carry(ask, photos, {0: clicks([MIDDLE])}, 2)
+    assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
+
+
+def test_contradictory_clicks_are_named_all_at_once_and_left_out(photos):
+    wrong = clicks([MIDDLE, (70, 45), (100, 45), (60, 80)], [(50, 45)])
+    carried = carry(PlantedNetwork(), photos, {3: wrong}, 2)
+    assert len(carried.left_out) == 3
+    assert "click inside at (100, 45) of the undistorted f03.png is 18 px" in carried.left_out[0]
+    assert "click inside at (60, 80)" in carried.left_out[1] and "click outside at (50, 45)" in carried.left_out[2]
+    assert mask_iou(carried.masks[3], true_mask(photos.views[3])) == 1
+    # Within the tolerance nothing contradicts.
+    assert not carry(PlantedNetwork(), photos, {3: clicks([MIDDLE, (84, 45)])}, 4).left_out
+
+
+def test_too_few_clicks_left_is_an_error_that_names_them(photos):
+    with pytest.raises(StageError, match=r"no clicked photo has a good mask .*f03\.png: quality .*\(100, 45\)"):
+        carry(PlantedNetwork(), photos, {3: clicks([(100, 45), (10, 10)])}, 2)
+
+
+def test_clicks_in_a_further_photo_prompt_that_photo(photos):
+    told = {}
+
+    def ask(view, inside, outside, box):
+        told[view.name] = inside[0], outside[0]
+        return [true_mask(view)], np.ones(1)
+
+    carry(ask, photos, {3: clicks([MIDDLE, (70, 45)]), 8: clicks([(55, 40)], [(10, 10)])}, 2)
+    assert told["f08.png"][0].tolist() == [[55, 40]] and told["f08.png"][1].tolist() == [[10, 10]]
+    assert len(told["f03.png"][0]) == 2 and not len(told["f07.png"][0])
+
+
+@pytest.mark.parametrize(
+    "prompts", [clicks([MIDDLE, (50, 35), (70, 55)], [(100, 45)]), clicks([], [], [[36, 21], [84, 69]])]
+)
+def test_grabcut_goes_round_from_clicks_or_a_box(photos, prompts):
+    carried = carry(lambda *asked: ask_grabcut(120, *asked), photos, {0: prompts}, 3)
+    assert min(mask_iou(m, true_mask(v)) for m, v in zip(carried.masks, photos.views)) > 0.95
+
+
+def test_sam2_is_told_every_click_and_a_few_carried_points_near_the_object(photos):
+    class Network:
+        def encode(self, image):
+            return None
+
+        def masks(self, features, size, points_px, box_px, outside_px):
+            self.told = points_px, box_px, outside_px
+            return [], np.zeros(0)
+
+    network, generator = Network(), np.random.default_rng(0)
+    clicked, carried = generator.uniform(40, 60, (12, 2)), generator.uniform(40, 60, (50, 2))
+    off = np.concatenate([generator.uniform(62, 64, (20, 2)), [[119.0, 89.0]]])
+    ask_sam2(network, photos.views[0], (clicked, carried), (NONE, off), None)
+    assert np.array_equal(network.told[0], clicked) and network.told[1] is None
+    assert len(network.told[2]) == 6 and network.told[2].max() < 65
+    ask_sam2(network, photos.views[0], (clicked[:3], carried), (NONE, off), None)
+    assert len(network.told[0]) == 10 and np.array_equal(network.told[0][:3], clicked[:3])
+
+
+def test_far_apart_points_stop_when_all_are_chosen():
+    points = np.array([[0, 0], [1, 0], [10, 0], [1, 0.0]])
+    assert far_apart(NONE, points, 2).tolist() == [[0, 0], [10, 0]]
+    assert len(far_apart(NONE, points, 9)) == 3
+    assert far_apart(points[:1], NONE, 3).tolist() == [[0, 0]]
+
+
+@pytest.fixture
+def model(tmp_path, photos):
+    (tmp_path / "sparse").mkdir()
+    write_model(tmp_path / "sparse", photos.views)
+    return tmp_path / "sparse"
+
+
+def read(tmp_path, rows):
+    path = tmp_path / "prompts.tsv"
+    path.write_text(HEADER + "".join("\t".join(map(str, row)) + "\n" for row in rows))
+    return read_points(path)
+
+
+SIZES = {"f00.png": (2 * WIDTH, 2 * HEIGHT), "lost.png": (WIDTH, HEIGHT)}
+
+
+def test_clicks_come_in_pixels_of_the_original_and_boxes_as_two_corners(tmp_path, model, photos):
+    rows = [("inside", "f00.png", 100, 60), ("outside", "f00.png", 20, 10), ("box", "f01.png", 80, 20)]
+    found = clicks_per_photo(read(tmp_path, [*rows, ("box", "f01.png", 30, 70)]), model, photos.views, SIZES)
+    assert list(found) == [0, 1]
+    np.testing.assert_allclose(found[0].pixels, [[50, 30], [10, 5]])
+    assert found[0].inside.tolist() == [True, False] and found[0].box is None
+    np.testing.assert_allclose(found[1].box, [[30, 20], [80, 70]])
+
+
+@pytest.mark.parametrize(
+    "rows, sentence",
+    [
+        (
+            [("inside", "f00.png", 241, 10)],
+            r"the click inside at \(241, 10\) lies outside f00\.png, which has 240 x 180",
+        ),
+        ([("inside", "lost.png", 5, 5)], r"in lost\.png, which has no camera"),
+        ([("inside", "none.png", 5, 5)], r"in none\.png, which is not among the photos; click in one of the 12"),
+        ([("outside", "f00.png", 5, 5)], "holds only clicks outside the object"),
+        ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
+        (
+            [("inside", "f00.png", 5, 5), ("outside", "f00.png", 5, 5)],
+            r"\(5, 5\) in f00\.png is clicked more than once",
+        ),
+        ([("inside", "f00.png", 5, 5)] * 2, "is clicked more than once"),
+        ([("Inside", "f00.png", 5, 5)], "line 2: the label is inside, outside, box, not 'Inside'"),
+        ([("inside", "f00.png", 5, "x")], "line 2: expected label photo x_px y_px"),
+        ([], "holds no points below its header"),
+    ],
+)
+def test_bad_clicks_are_named(tmp_path, model, photos, rows, sentence):
+    with pytest.raises(StageError, match=sentence):
+        clicks_per_photo(read(tmp_path, rows), model, photos.views, SIZES)
+
+
+def test_labels_are_not_fiducials(tmp_path):
+    assert isinstance(read(tmp_path, [("inside", "f00.png", 5, 5)]), Labels)
+    with pytest.raises(StageError, match="holds labels, which are for prompts; mark points here"):
+        locate(tmp_path / "prompts.tsv", tmp_path, 5)
+
+
+def test_a_click_is_undistorted(tmp_path, photos):
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", FOCAL, WIDTH, HEIGHT)
+    camera.params = [FOCAL, WIDTH / 2, HEIGHT / 2, 0.2]
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name="f00.png", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(photos.views[0].cam_from_world[:3]))
+    (tmp_path / "bent").mkdir()
+    model.write(tmp_path / "bent")
+    seen = model.images[1].project_point(np.array([0, 0.5, 0.5]))
+    labels = read(tmp_path, [("inside", "f00.png", *seen)])
+    found = clicks_per_photo(labels, tmp_path / "bent", photos.views, {})
+    straight = photos.views[0].project(np.array([[0, 0.5, 0.5]]))[0]
+    assert np.linalg.norm(seen - straight[0]) > 0.05
+    np.testing.assert_allclose(found[0].pixels, straight, atol=1e-6)
