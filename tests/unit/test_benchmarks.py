@@ -64,6 +64,7 @@ def case(points) -> completed_scene.Case:
         cloud,
         cloud,
         pose,
+        None,
         Sim3.identity(),
         known,
         points,
