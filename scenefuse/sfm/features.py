@@ -9,11 +9,9 @@ import numpy as np
 import pycolmap
 
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.photos import Photo, check_unchanged, read_photos
+from scenefuse.sfm.photos import SHAPE_TOLERANCE, Photo, check_unchanged, read_photos
 from scenefuse.stage import StageError, atomic_file, setting, threads
 
-# A calibration and its photos differ in shape by no more than what rounding to whole pixels does.
-SHAPE_TOLERANCE = 0.01
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
 FEW_FEATURES = 100
 

@@ -14,7 +14,7 @@ from scipy import ndimage
 from scenefuse.io.mask_files import mask_files, matte_of
 from scenefuse.io.pictures import write_picture
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.sfm.photos import JPEG_QUALITY
+from scenefuse.sfm.photos import JPEG_QUALITY, SHAPE_TOLERANCE
 from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
 from scenefuse.stage import StageError, atomic_directory, quantity, write_json
@@ -24,8 +24,6 @@ from scenefuse.workspace import View, write_model
 Picture = NDArray[np.uint8]
 Lens = tuple[pycolmap.Camera, View]
 
-# Photos and cameras differ in shape by no more than what rounding to whole pixels does.
-SHAPE_TOLERANCE = 0.01
 # Transparent pixels up to this far from others take their colour: farther than resampling reaches.
 BLEED_PX = 16
 

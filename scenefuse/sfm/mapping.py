@@ -71,8 +71,11 @@ def map_photos(
     drop_outliers(ranked[0])
     choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
     model = choice.lens.fit(ranked[0], TOLERANCE)
+    notes: list[str] = []
     if choice.lens not in (HELD, KNOWN):
-        ranked = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed)) or ranked
+        again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed))
+        notes = [] if again else ["a second mapping with the calibrated lens registers fewer photos; the first is kept"]
+        ranked = again or ranked
         model = choice.lens.fit(ranked[0], TOLERANCE)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(choice, model)
@@ -89,6 +92,8 @@ def map_photos(
         }
         for m in ranked[1:]
     ]
+    for note in notes:
+        print(f"note: {note}", flush=True)
     for entry in left_out:
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
     with atomic_directory(sparse) as temporary:
@@ -97,6 +102,7 @@ def map_photos(
         **summary,
         "mean_reprojection_error_before_last_adjustment_px": quantity(before_px, "px"),
         "models_left_out": quantity(left_out, ""),
+        "notes": quantity(notes, ""),
         "seed": quantity(seed, "1"),
     }
     write_json(report, content)
@@ -132,10 +138,8 @@ def _mapped_again(
                 known.has_prior_focal_length = True
                 opened.update_camera(known)
         again = _models(calibrated, folder, sparse, options)
-    if not again or again[0].num_reg_images() < model.num_reg_images():
-        print("note: a second mapping with the calibrated lens registers fewer photos; the first is kept", flush=True)
-        return []
-    return again
+    fewer = not again or again[0].num_reg_images() < model.num_reg_images()
+    return [] if fewer else again
 
 
 def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:

@@ -15,6 +15,8 @@ from PIL.ExifTags import GPS, IFD, Base
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
+# Photos and cameras differ in shape by no more than what rounding to whole pixels does.
+SHAPE_TOLERANCE = 0.01
 # Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
 # What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.

@@ -105,6 +105,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
             best, best_errors, beyond = lens, errors, None
         elif beyond is None:
             beyond = lens
+        # Without distortion a free principal point may not help, and help with it: the third lens is always tried.
         if lens is not lenses[1] and problem is not None:
             break
     return Choice(best, beyond, trials)

@@ -74,7 +74,7 @@ def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Pa
         sparse: COLMAP model.
         sparse_json: JSON of the mapping stage, for the lens.
         spread: output, NPZ of a `Spread`, in the model's frame.
-        report: output, JSON: the models, standard deviations of the calibration, photos left out of each.
+        report: output, JSON: number of models and points, standard deviations of the calibration.
     """
     known = read_json(sparse_json)
     model = read_model(sparse)
