@@ -52,6 +52,8 @@ chance. These are as many as a plane has within this share of the diagonal, at l
 """
 NORMAL_POINTS = 16
 """Neighbours that a missing normal is fitted to."""
+MOST_CHECKED = 1_000_000
+"""Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow."""
 
 
 @dataclass(frozen=True)
@@ -102,6 +104,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
         nerf_only: whether points of the object that no photo confirms are added where the scene has none.
         certain: how certain the registration was; see `settle`.
     """
+    if len(scene.cloud) > MOST_CHECKED:
+        return _weigh_some(obj, scene, nerf_only, certain)
     obj, scene = replace(obj, cloud=with_normals(obj.cloud)), replace(scene, cloud=with_normals(scene.cloud))
     diagonal = obj.cloud.diagonal
     of_obj, of_scene = _own(obj, scene), _own(scene, obj)
@@ -133,6 +137,19 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
         settled, moved, with_evidence(obj.cloud, of_obj, on_obj, NERF_ONLY), added, contradicted,
         with_evidence(scene.cloud, sure, on_scene, STEREO_ONLY), reason, _notes(obj, scene, on_obj, moved),
     )  # fmt: skip
+
+
+def _weigh_some(obj: Side, scene: Side, nerf_only: bool, certain: float | None) -> Weighed:
+    """`weigh` with MOST_CHECKED points of the scene; each of the others shares the fate of the nearest of these."""
+    count = len(scene.cloud)
+    chosen = np.sort(np.random.default_rng(0).choice(count, MOST_CHECKED, replace=False))
+    some = weigh(obj, replace(scene, cloud=scene.cloud[chosen]), nerf_only, certain)
+    nearest = cKDTree(scene.cloud.points[chosen]).query(scene.cloud.points, workers=threads())[1]
+    fields = {name: values[nearest] for name, values in some.scene.fields.items()}
+    note = f"of {count} points of the scene near the object {MOST_CHECKED} were checked; the others follow the nearest"
+    return replace(
+        some, scene=replace(scene.cloud, fields=fields), reason=some.reason[nearest], notes=(*some.notes, note)
+    )
 
 
 def _notes(obj: Side, scene: Side, on_obj: NDArray[np.bool_], moved: float | None) -> tuple[str, ...]:

@@ -156,6 +156,16 @@ def _correlate(patch, weight, mean, variance, other):
 
 
 @njit(error_model="numpy")
+def _turned(p, x, y, z):
+    """A vector in the homogeneous pixels of a camera p (3, 4)."""
+    return (
+        p[0, 0] * x + p[0, 1] * y + p[0, 2] * z,
+        p[1, 0] * x + p[1, 1] * y + p[1, 2] * z,
+        p[2, 0] * x + p[2, 1] * y + p[2, 2] * z,
+    )
+
+
+@njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def _match(
     pixels, start, width, height, p, centre, point, across, down, step, patch, weight, mean, variance, samples, ncc
 ):
@@ -165,24 +175,42 @@ def _match(
     step being the unit.
     """
     # A patch moved along the ray is scaled about the reference's centre, which leaves it as it is in the reference.
-    base = p[:, 0] * centre[0] + p[:, 1] * centre[1] + p[:, 2] * centre[2] + p[:, 3]
-    ray, spread = point - centre, 0.0
+    cx, cy, cz = centre
+    rx, ry, rz = point[0] - cx, point[1] - cy, point[2] - cz
+    base_x = p[0, 0] * cx + p[0, 1] * cy + p[0, 2] * cz + p[0, 3]
+    base_y = p[1, 0] * cx + p[1, 1] * cy + p[1, 2] * cz + p[1, 3]
+    base_z = p[2, 0] * cx + p[2, 1] * cy + p[2, 2] * cz + p[2, 3]
+    ray_x, ray_y, ray_z = _turned(p, rx, ry, rz)
+    across_x, across_y, across_z = _turned(p, across[0], across[1], across[2])
+    down_x, down_y, down_z = _turned(p, down[0], down[1], down[2])
+    # Middle of the outermost pixel, and a little more: the corners are compared before the division, rounded otherwise.
+    spread, least = 0.0, 0.5001
     for j in range(_STEPS):
         scale = 1.0 + (j - OFFSETS) * step
-        k, inside = 0, True
-        for b in range(-RADIUS, RADIUS + 1):
-            for a in range(-RADIUS, RADIUS + 1):
-                qx = scale * (ray[0] + a * across[0] + b * down[0])
-                qy = scale * (ray[1] + a * across[1] + b * down[1])
-                qz = scale * (ray[2] + a * across[2] + b * down[2])
-                z = base[2] + p[2, 0] * qx + p[2, 1] * qy + p[2, 2] * qz
-                x = (base[0] + p[0, 0] * qx + p[0, 1] * qy + p[0, 2] * qz) / z
-                y = (base[1] + p[1, 0] * qx + p[1, 1] * qy + p[1, 2] * qz) / z
-                samples[j, k] = _sample(pixels, start, width, height, x, y)
-                inside &= samples[j, k] >= 0
-                k += 1
+        mx, my, mz = base_x + scale * ray_x, base_y + scale * ray_y, base_z + scale * ray_z
+        ax, ay, az = scale * across_x, scale * across_y, scale * across_z
+        bx, by, bz = scale * down_x, scale * down_y, scale * down_z
+        # A plane patch is a convex quadrilateral in a photo: where its corners are inside, all of it is.
+        inside = True
+        for corner in range(4):
+            a, b = RADIUS * (2 * (corner & 1) - 1), RADIUS * ((corner & 2) - 1)
+            z = mz + a * az + b * bz
+            x, y = mx + a * ax + b * bx, my + a * ay + b * by
+            inside &= z > 0.0 and min(x, y) > least * z and x < (width - least) * z and y < (height - least) * z
         ncc[j] = -1.0
         if inside:
+            for k in range(_SAMPLES):
+                a, b = k % _SIDE - RADIUS, k // _SIDE - RADIUS
+                nearness = 1.0 / (mz + a * az + b * bz)
+                px = (mx + a * ax + b * bx) * nearness - 0.5
+                py = (my + a * ay + b * by) * nearness - 0.5
+                x0, y0 = int(px), int(py)
+                fx, fy = np.float32(px - x0), np.float32(py - y0)
+                at = start + y0 * width + x0
+                upper = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
+                at += width
+                lower = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
+                samples[j, k] = upper * (np.float32(1.0) - fy) + lower * fy
             ncc[j], square = _correlate(patch, weight, mean, variance, samples[j])
             if j == OFFSETS:
                 spread = square

@@ -209,7 +209,9 @@ def _spread(found: Fields) -> str:
     if scale is None or turn is None or shift is None:
         return ""
     unit = _short(unit_of(found, "fine.translation_sd"))
-    return f"; one sd {_three(100 * scale)} % of scale, {_three(turn)} degrees, {_three(shift)} {unit}"
+    unknown = [name for name in ("object", "scene") if name not in (find(found, "fine.bending_known_of") or [])]
+    beside = f"; how far the {' and the '.join(unknown)} may be bent is not known" if unknown else ""
+    return f"; one sd {_three(100 * scale)} % of scale, {_three(turn)} degrees, {_three(shift)} {unit}{beside}"
 
 
 def _three(item: float | int | None) -> str:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
+from scenefuse.fusion import evidence
 from scenefuse.fusion.evidence import (
     ENCLOSED,
     FIELDS,
@@ -95,6 +96,17 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     last = np.arange(len(obj)) >= len(obj) - len(floating)
     last &= np.abs(obj.points[:, 1]) < 0.6
     assert not found.added[last].any() and found.contradicted[last].all()
+
+
+def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
+    floating = sheet(-0.2, 0.2, 0.03, z=0.3)
+    obj, scene = sheet(-0.8, 0.4, 0.03), concatenate([sheet(-0.8, 0.8, 0.02), floating])
+    whole = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    monkeypatch.setattr(evidence, "MOST_CHECKED", len(scene) // 2)
+    some = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    assert len(some.reason) == len(some.scene) == len(scene) and set(some.scene.fields) == set(FIELDS)
+    assert (some.reason == whole.reason).mean() > 0.97 and (some.added == whole.added).mean() > 0.97
+    assert any(f"{len(scene) // 2} were checked" in note for note in some.notes) and some.notes[:-1] == whole.notes
 
 
 def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far):

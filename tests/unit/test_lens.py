@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from scenefuse.registration.uncertainty import Uncertainty, with_bending
+from scenefuse.sfm.bundle import spread as bundle
 from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.bundle.lens import BROWN, CENTRED, HELD, choose_lens, enrich
 from scenefuse.sfm.bundle.spread import Spread, read_spread, spread_of, write_spread
@@ -87,11 +88,26 @@ def test_the_spread_covers_a_wrong_lens_and_survives_a_file(tmp_path):
         read_spread(tmp_path / "broken.npz")
 
 
+@pytest.mark.parametrize("few", ["three photos", "on one line"])
+def test_photos_of_which_none_can_be_left_out_do_not_say_how_far_their_model_may_be_bent(few, monkeypatch):
+    monkeypatch.setattr(bundle, "adjust", lambda model, freedom, tolerance: None)
+    model = photographed([700, 700, 500, 400, 0, 0, 0, 0])
+    for place, image in enumerate(sorted(model.reg_image_ids())):
+        frame = model.frame(model.images[image].frame_id)
+        if few == "on one line":
+            turn = frame.rig_from_world.rotation
+            frame.rig_from_world = pycolmap.Rigid3d(turn, -turn.matrix() @ np.array([10.0 * place, 0, 0]))
+        elif place >= 3:
+            model.deregister_frame(frame.frame_id)
+    unknown, _ = spread_of(model, HELD, None)
+    assert unknown.covariance_at(np.zeros(3)) is None
+
+
 def test_the_spread_at_a_place_is_the_motion_there():
     rng = np.random.default_rng(0)
     points = rng.normal(size=(500, 3)) * [100, 100, 1]
     bowl = points + 1e-4 * (points[:, :2] ** 2).sum(1)[:, None] * [0, 0, 1]
-    spread = Spread(points, bowl[None], np.array([True]))
+    spread = Spread(points, np.stack([bowl, points, points]), np.array([True, False, False]))
     assert np.sqrt(spread.covariance_at(np.array([150.0, 0, 0]))[5, 5]) > 1.5
     assert np.sqrt(spread.covariance_at(np.zeros(3))[5, 5]) < 0.5
 

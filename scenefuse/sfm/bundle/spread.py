@@ -44,11 +44,12 @@ class Spread:
     moved: Array
     whole: NDArray[np.bool_]
 
-    def covariance_at(self, place: Array) -> Array:
+    def covariance_at(self, place: Array) -> Array | None:
         """(7, 7) covariance of the model around a place (3,): rotation vector (radians), shift, log scale about it.
 
         Each model's similarity of the 200 points nearest to the place is a deviation; those of a jackknife of K groups
-        add (K - 1) / K times the squares about their mean, the others their squares.
+        add (K - 1) / K times the squares about their mean, the others their squares. None where no photos could be left
+        out: three at most, or all on one line.
         """
         near = np.argsort(np.linalg.norm(self.points - place, axis=1))[:NEAREST]
         deviations, whole = [], []
@@ -60,11 +61,11 @@ class Spread:
                 deviations.append([*turn, *(motion.apply(place) - place), np.log(motion.scale)])
                 whole.append(counts_whole)
         deviation, counts = np.array(deviations).reshape(-1, 7), np.array(whole, dtype=bool)
-        left_out, covariance = deviation[~counts], deviation[counts].T @ deviation[counts]
-        if len(left_out):
-            about = left_out - left_out.mean(0)
-            covariance = covariance + (len(left_out) - 1) / len(left_out) * about.T @ about
-        return np.asarray(covariance, np.float64)
+        left_out, richer = deviation[~counts], deviation[counts]
+        if len(left_out) == 0:
+            return None
+        about = left_out - left_out.mean(0)
+        return np.asarray(richer.T @ richer + (len(left_out) - 1) / len(left_out) * about.T @ about)
 
 
 def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Path) -> None:
@@ -110,11 +111,12 @@ def spread_of(
         for _, image in names[group::groups]:
             fewer.deregister_frame(fewer.images[image].frame_id)
         adjust(fewer, lens.freedom, ROUGH_TOLERANCE)
-        moved.append(_moved(fewer, model, ids))
-        whole.append(False)
+        if (found := _moved(fewer, model, ids)) is not None:
+            moved.append(found)
+            whole.append(False)
         parameters.append([camera.params for _, camera in sorted(fewer.cameras.items())])
-    if beyond is not None:
-        moved.append(_moved(beyond.fit(model, ROUGH_TOLERANCE), model, ids))
+    if beyond is not None and (found := _moved(beyond.fit(model, ROUGH_TOLERANCE), model, ids)) is not None:
+        moved.append(found)
         whole.append(True)
     kept = np.array(moved).reshape(-1, len(ids), 3)
     return Spread(points, kept, np.array(whole, dtype=bool)), _calibration_sd(model, parameters)
@@ -139,11 +141,17 @@ def read_spread(path: Path) -> Spread:
         raise StageError(f"{path} is no spread of a model; delete it and run the workflow again") from error
 
 
-def _moved(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction, ids: list[int]) -> Array:
-    """(P, 3) a model's points in another, brought into its frame by the cameras; not a number where they are gone."""
+def _moved(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction, ids: list[int]) -> Array | None:
+    """(P, 3) a model's points in another, brought into its frame by the cameras; not a number where they are gone.
+
+    None where fewer than three cameras are shared, or their centres lie on one line.
+    """
     shared = [i for i in other.reg_image_ids() if model.images[i].has_pose]
     centres = [np.array([m.images[i].projection_center() for i in shared]) for m in (other, model)]
-    frame = fit_sim3(centres[0], centres[1])
+    try:
+        frame = fit_sim3(np.reshape(centres[0], (-1, 3)), np.reshape(centres[1], (-1, 3)))
+    except ValueError:
+        return None
     missing = np.full(3, np.nan)
     there = np.array([other.points3D[p].xyz if p in other.points3D else missing for p in ids])
     return frame.apply(there)
