@@ -208,7 +208,7 @@ def with_pose_uncertainty(cloud: Cloud, covariance: Array, centre: Array) -> Clo
 def unchecked(cloud: Cloud) -> Cloud:
     """The cloud with the same fields, empty: no photo was asked."""
     nothing, none = np.full(len(cloud), np.nan), np.zeros(len(cloud), np.int64)
-    return with_evidence(cloud, Matches(nothing, none, none, *[nothing] * 3), none > 0, UNCHECKED)
+    return with_evidence(cloud, Matches(nothing, nothing, none, none, *[nothing] * 3), none > 0, UNCHECKED)
 
 
 def with_normals(cloud: Cloud) -> Cloud:

@@ -27,6 +27,8 @@ MOST_DEVIATION = 2.0
 measure nothing, sky and blank walls above all."""
 MOST_PHOTOS = 64
 """Photos of one side that points are checked in at most: from the most different directions."""
+HALVINGS = 1
+"""How often a point that photos match nowhere near is tried again in photos of half the size."""
 SEEN_SHARE = 0.02
 """A photo that has less of an object in its picture is not asked."""
 PIXEL_ERROR = 0.15
@@ -85,6 +87,12 @@ def pack(views: list[View]) -> Photos:
     return Photos([replace(view, pixels=None) for view in views], pixels, starts)
 
 
+def unpacked(photos: Photos) -> list[View]:
+    """The views with their pixels (H, W)."""
+    parts = np.split(photos.pixels, photos.starts[1:])
+    return [replace(v, pixels=part.reshape(v.height, v.width)) for v, part in zip(photos.views, parts)]
+
+
 def read_photos(workspace: Workspace, points: Array) -> Photos:
     """The photos of a workspace that have points (N, 3; its frame) in their picture, packed for the kernel."""
     sample = points[:: max(1, len(points) // 2000)]
@@ -113,6 +121,7 @@ class Matches:
 
     Attributes:
         match: (N,) mean score of the best photos at the point, -1..1; -1 where fewer than three photos see it.
+        best: (N,) the same at the offset along the ray where it is largest.
         photos: (N,) photos that confirm the point.
         tested: (N,) photos that it was matched in, its reference not counted.
         deviation: (N,) standard deviation of its place, unit of the points; infinite where no photo confirms it.
@@ -121,6 +130,7 @@ class Matches:
     """
 
     match: Array
+    best: Array
     photos: NDArray[np.int64]
     tested: NDArray[np.int64]
     deviation: Array
@@ -134,7 +144,27 @@ class Matches:
 
 
 def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
-    """Match points (N, 3) with unit normals (N, 3), towards the photos, in photos of the same frame."""
+    """Match points (N, 3) with unit normals (N, 3), towards the photos, in photos of the same frame.
+
+    Where photos match nowhere along the ray, they are asked again at half their size: faint texture that noise or blur
+    hides in single pixels may show there, and less exactly.
+    """
+    found = _match(points, normals, photos)
+    for _ in range(HALVINGS):
+        photos, rest = halved(photos), np.flatnonzero(~found.measured & (found.best < MIN_MATCH))
+        coarse = _match(points[rest], None if normals is None else normals[rest], photos)
+        for kept, tried in zip(vars(found).values(), vars(coarse).values()):
+            kept[rest[coarse.measured]] = tried[coarse.measured]
+    return found
+
+
+def halved(photos: Photos) -> Photos:
+    """The photos at half their size."""
+    return pack([view.resized(view.width // 2, view.height // 2) for view in unpacked(photos)])
+
+
+def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
+    """`match_in` at one size of the photos."""
     count = len(points)
     curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
     tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)
@@ -146,7 +176,8 @@ def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Mat
             curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
         )  # fmt: skip
     deviation = np.sqrt((_peak(curve) * step) ** 2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
-    return Matches(curve[:, OFFSETS], confirming, tested, np.where(confirming > 0, deviation, np.inf), texture, step)
+    deviation = np.where(confirming > 0, deviation, np.inf)
+    return Matches(curve[:, OFFSETS], curve.max(1), confirming, tested, deviation, texture, step)
 
 
 def _peak(curve: Array) -> Array:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
+from scenefuse.fusion import photo_check
 from scenefuse.fusion.photo_check import match_in, moved_photos, pack, read_photos
 from scenefuse.fusion.visibility import see
 from scenefuse.io.clouds import Cloud
@@ -53,6 +54,25 @@ def test_the_standard_deviation_covers_the_error_and_grows_with_the_distance(pho
     found = match_in(points, up(points), photos)
     inside = np.abs(points[found.measured, 2]) <= 2 * found.deviation[found.measured]
     assert inside.mean() > 0.9 and found.measured.mean() < 0.7
+
+
+def test_texture_that_noise_hides_in_single_pixels_measures_less_exactly_in_photos_of_half_the_size(monkeypatch):
+    rng = np.random.default_rng(2)
+
+    def faint(view):
+        grey = 128 + 0.08 * (view.pixels - 128.0) + rng.normal(0, 3, view.pixels.shape)
+        return replace(view, pixels=np.clip(np.rint(grey), 0, 255).astype(np.uint8))
+
+    photos, points = pack([faint(view) for view in photographs(8, 3.0)]), grid(-1, 1)
+    found = match_in(points, up(points), photos)
+    off = match_in(grid(-1, 1, z=0.15), up(points), photos)
+    blank = grid(BLANK + 0.15, BLANK + 0.5)
+    assert not match_in(blank, up(blank), photos).measured.any() and off.measured.mean() < 0.1
+    monkeypatch.setattr(photo_check, "HALVINGS", 0)
+    full = match_in(points, up(points), photos)
+    assert full.measured.mean() < 0.6 and found.measured.mean() > full.measured.mean() + 0.2
+    more = found.measured & ~full.measured
+    assert np.median(found.deviation[more]) > 1.2 * np.median(full.deviation[full.measured])
 
 
 def test_one_wrong_camera_and_one_covered_lens_do_no_harm(photos):
