@@ -46,7 +46,7 @@ SAMPLES = 60000
 SHIFT, NOISE, MOVED = 0.02, 0.01, 0.1
 SCALES = (1.03, 1 / 1.03)
 # Of the scene near the object, to time the fusion.
-COST_POINTS = 1_000_000
+COST_POINTS = (1_000_000, 10_000_000)
 # The modes that are shown at the scene's spacing and at the object's own; any other has its own density.
 THINNED = ("fill", "append", "replace")
 # Rows that are no fusion.
@@ -252,19 +252,25 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
 
 
 def cost_rows(case: Case) -> Iterator[dict[str, Any]]:
-    """The rows of the fourth table: the fusion with the scene near the object as it is, and with COST_POINTS."""
+    """The rows of the fourth table: the fusion with the scene near the object as it is, and with COST_POINTS there."""
     near = around(case.scene, case.object.transformed(case.pose))
-    own, step, rng = case.scene[near], spacing(case.scene.points[near]), np.random.default_rng(0)
-    dense = own[rng.integers(0, len(own), COST_POINTS)]
-    dense = replace(dense, points=dense.points + rng.normal(0, 0.3 * step, dense.points.shape))
-    for scene in (case.scene, concatenate([case.scene[~near], dense])):
+    own, step = case.scene[near], spacing(case.scene.points[near])
+    for count in (None, *COST_POINTS):
+        scene = case.scene
+        if count is not None:
+            rng = np.random.default_rng(0)
+            dense = own[rng.integers(0, len(own), count)]
+            dense = replace(dense, points=dense.points + rng.normal(0, 0.3 * step, dense.points.shape))
+            scene = concatenate([case.scene[~near], dense])
         start = time.perf_counter()
-        fuse(replace(case, scene=scene), FusionSettings())
+        completed = fuse(replace(case, scene=scene), FusionSettings())
+        seconds = time.perf_counter() - start
         yield {
             "scene_points_near": int(around(scene, case.object.transformed(case.pose)).sum()),
             "object_points": len(case.object),
-            "seconds": time.perf_counter() - start,
+            "seconds": seconds,
             "peak_gb_so_far": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6,
+            **scores(case, completed),
         }
 
 
