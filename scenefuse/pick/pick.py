@@ -56,7 +56,16 @@ def pick(
     app.on_startup(session.start)
     app.on_startup(announce)
     app.on_shutdown(lambda: [print(sentence, flush=True) for sentence in session.close()])
-    ui.run(host=HOST, port=port, show=False, reload=False, show_welcome_message=False, title="scenefuse", favicon="🖱")
+    ui.run(
+        host=HOST,
+        port=port,
+        show=False,
+        reload=False,
+        show_welcome_message=False,
+        title="scenefuse",
+        favicon="🖱",
+        timeout_graceful_shutdown=1,
+    )
 
 
 def _free_port(host: str) -> int:
