@@ -364,6 +364,7 @@ class Page:
             if wanted is not None:
                 asyncio.get_running_loop().create_task(self._lay_carried(picture))
         if shows and any(row.label != "outside" for row in own):
+            self.mask_note = "Making it ..."
             asyncio.get_running_loop().create_task(self._segment(picture, self.mask_request))
         else:
             self.mask_note = ""

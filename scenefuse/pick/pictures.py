@@ -19,8 +19,10 @@ from scenefuse.stage import StageError, atomic_file
 TILE_PX = 256
 THUMB_PX = 320
 """Longer side of a thumbnail."""
-PYRAMIDS = 3
-"""Photos kept decoded: this one and its neighbours; 200 MB each at 50 megapixels."""
+COARSE_PX = 1280
+"""Tiles of levels no larger than this are cut from a copy that a JPEG gives ten times as fast as itself."""
+PYRAMIDS, COARSE_PYRAMIDS = 2, 30
+"""Photos kept decoded, 200 MB each at 50 megapixels, and coarse copies, 5 MB each."""
 JPEG_QUALITY = 88
 BACKGROUND = 32
 """Grey value beyond the photo's edges, as the page has it."""
@@ -49,6 +51,11 @@ class Picture:
     def depth(self) -> int:
         """Zoom at which a pixel of the file is one of the screen, where the whole world of zoom 0 is one tile."""
         return max(0, math.ceil(math.log2(max(self.width, self.height) * self.scale / TILE_PX)))
+
+    def size_at(self, level: int) -> tuple[int, int]:
+        """Width and height of the file's picture halved so often."""
+        sides = (round(self.width * self.scale) / 2**level, round(self.height * self.scale) / 2**level)
+        return max(1, math.ceil(sides[0])), max(1, math.ceil(sides[1]))
 
     def place(self, x: float, y: float) -> tuple[float, float]:
         """Latitude and longitude (degrees) of a pixel, in Web Mercator: the map widget's own coordinates, which make a
@@ -104,15 +111,13 @@ def at_most(pixels: Pixels, side_px: int) -> Pixels:
 
 
 class Tiles:
-    """Tiles of photos, cut from pyramids of the few that were looked at last."""
+    """Tiles of photos, cut from pyramids of those that were looked at last."""
 
     def __init__(self) -> None:
-        self._pyramids: OrderedDict[Path, list[Pixels]] = OrderedDict()
-        self._lock = threading.Lock()
-        self._reading: dict[Path, threading.Lock] = {}
+        self._fine, self._coarse = _Kept(PYRAMIDS), _Kept(COARSE_PYRAMIDS)
 
     def tile(self, picture: Picture, zoom: int, column: int, row: int) -> bytes:
-        """A tile of 256 x 256 pixels, or less at the right and lower edge, as JPEG.
+        """A tile of 256 x 256 pixels, as JPEG; grey beyond the photo's right and lower edge.
 
         Raises:
             IndexError: the photo has no such tile.
@@ -120,30 +125,43 @@ class Tiles:
         """
         if not 0 <= zoom <= picture.depth or column < 0 or row < 0:
             raise IndexError
-        level = self.pyramid(picture)[picture.depth - zoom]
-        part = level[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX]
-        if not part.size:
+        level = picture.depth - zoom
+        width, height = picture.size_at(level)
+        if column * TILE_PX >= width or row * TILE_PX >= height:
             raise IndexError
+        first = next(k for k in range(picture.depth + 1) if max(picture.size_at(k)) <= COARSE_PX or k == picture.depth)
+        if level >= first > 0:
+            pixels = self._coarse.get(picture, first)[level - first]
+        else:
+            pixels = self._fine.get(picture, 0)[level]
+        part = pixels[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX]
         full = np.full((TILE_PX, TILE_PX, 3), BACKGROUND, dtype=np.uint8)
         full[: part.shape[0], : part.shape[1]] = part
         return jpeg(full)
 
-    def pyramid(self, picture: Picture) -> list[Pixels]:
-        """The photo at full size, at half of it, and so on."""
+
+class _Kept:
+    """Pyramids of the photos that were asked for last; each is read once, whoever asks."""
+
+    def __init__(self, most: int) -> None:
+        self._most, self._lock = most, threading.Lock()
+        self._pyramids: OrderedDict[Path, list[Pixels]] = OrderedDict()
+        self._reading: dict[Path, threading.Lock] = {}
+
+    def get(self, picture: Picture, first: int) -> list[Pixels]:
+        """A photo at its size halved `first` times, and so on down to a tile."""
         with self._lock:
-            if picture.path in self._pyramids:
-                self._pyramids.move_to_end(picture.path)
-                return self._pyramids[picture.path]
             reading = self._reading.setdefault(picture.path, threading.Lock())
         with reading:
-            if (known := self._pyramids.get(picture.path)) is not None:
-                return known
-            levels = [read_upright(picture.path)]
-            for _ in range(picture.depth):
-                levels.append(_halved(levels[-1]))
+            levels = self._pyramids.get(picture.path)
+            if levels is None:
+                levels = [_resized(read_upright(picture.path, max(picture.size_at(first))), picture.size_at(first))]
+                for level in range(first + 1, picture.depth + 1):
+                    levels.append(_resized(levels[-1], picture.size_at(level)))
             with self._lock:
                 self._pyramids[picture.path] = levels
-                while len(self._pyramids) > PYRAMIDS:
+                self._pyramids.move_to_end(picture.path)
+                while len(self._pyramids) > self._most:
                     self._pyramids.popitem(last=False)
             return levels
 
@@ -167,9 +185,9 @@ class Thumbnails:
             pixels = read_upright(picture.path, 4 * THUMB_PX)
             sharp = sharpness(np.ascontiguousarray(pixels[..., ::-1]))
             path = self._folder / f"{key}_{sharp:.2f}.jpg"
-            with atomic_file(path) as temporary:
-                temporary.write_bytes(jpeg(at_most(pixels, THUMB_PX)))
             with self._lock:
+                with atomic_file(path) as temporary:
+                    temporary.write_bytes(jpeg(at_most(pixels, THUMB_PX)))
                 self._known[key] = path
         return self._known[key], float(self._known[key].stem.split("_")[1])
 
@@ -198,6 +216,5 @@ def jpeg(pixels: Pixels) -> bytes:
     return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), options)[1].tobytes()
 
 
-def _halved(pixels: Pixels) -> Pixels:
-    size = (max(1, math.ceil(pixels.shape[1] / 2)), max(1, math.ceil(pixels.shape[0] / 2)))
+def _resized(pixels: Pixels, size: tuple[int, int]) -> Pixels:
     return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8)

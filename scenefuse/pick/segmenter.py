@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 KEPT = 24
 """Photos whose features are kept; 17 MB each, and the photo."""
+IDLE_S = 4.0
+"""Without a click for so long, photos that are not shown are prepared."""
 AHEAD = 6
 """Photos whose features are computed before anybody clicks in them."""
 
@@ -63,7 +65,7 @@ class Segmenter:
         self._network: _Remembering | None = None
         self._ask: Callable[..., Any] | None = None
         self._busy = threading.Lock()
-        self._waiting = 0
+        self._waiting, self._asked_at = 0, -IDLE_S
         self.method = self.trouble = ""
         self._closed = False
 
@@ -92,12 +94,16 @@ class Segmenter:
             self._ask, self.method = partial(ask_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
 
     def compute_ahead(self, wanted: Callable[[], list[Picture]]) -> None:
-        """Compute features until closed, in the order wanted, giving way to clicks; run in a thread of its own."""
+        """Compute features until closed, in the order wanted; run in a thread of its own.
+
+        Only those of the first photo are computed while a person clicks.
+        """
         self.load()
         while not self._closed:
-            missing = [p for p in wanted()[:AHEAD] if p.name not in self._photos] if self._network else []
+            photos = wanted()[: AHEAD if self.is_idle() else 1] if self._network else []
+            missing = [p for p in photos if p.name not in self._photos]
             if self._waiting or not missing:
-                time.sleep(0.1)
+                time.sleep(0.2)
                 continue
             with self._busy:
                 try:
@@ -107,13 +113,13 @@ class Segmenter:
                     print(error, flush=True)
                     self._photos[missing[0].name] = np.zeros((1, 1, 3), dtype=np.uint8)
 
+    def is_idle(self) -> bool:
+        """Whether nobody has clicked for some seconds, so that work in the background does not make a person wait."""
+        return not self._waiting and time.monotonic() - self._asked_at > IDLE_S
+
     def close(self) -> None:
         """End `compute_ahead`."""
         self._closed = True
-
-    def is_ready(self, picture: Picture) -> bool:
-        """Whether a click in a photo need not wait for its features."""
-        return bool(self.method) and (self._network is None or picture.name in self._photos)
 
     def mask(self, picture: Picture, rows: Rows) -> tuple[Mask, list[str]]:
         """(H, W) mask of a photo from its own clicks, at most `side_px` large, and what is wrong with it.
@@ -126,6 +132,7 @@ class Segmenter:
 
         self.load()
         self._waiting += 1
+        self._asked_at = time.monotonic()
         try:
             with self._busy:
                 pixels = self._pixels(picture)

@@ -3,6 +3,7 @@
 import itertools
 import secrets
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
@@ -136,6 +137,8 @@ class Session:
     def _make_thumbnails(self) -> None:
         for board in self.boards:
             for picture in board.source.pictures.values():
+                while not self._closed and not self.segmenter.is_idle():
+                    time.sleep(0.2)
                 if self._closed:
                     return
                 try:
