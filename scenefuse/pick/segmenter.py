@@ -141,9 +141,13 @@ class Segmenter:
                 view = View(picture.name, np.eye(3), np.eye(4), width, height, pixels)
                 assert self._ask is not None
                 tolerance_px = self._settings["max_click_residual_px"]
-                mask, quality, agreement, notes = one_photo(self._ask, view, clicks, tolerance_px)
+                mask, quality, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
         finally:
             self._waiting -= 1
+        notes = []
+        if left_out:
+            clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
+            notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
         if quality < LEAST_QUALITY:
             notes.append(f"its quality is {quality:.2f}, at least {LEAST_QUALITY} is needed: add clicks")
         elif agreement < LEAST_AGREEMENT:
