@@ -71,7 +71,7 @@ class PhotoStrip:
         for name, thumb in self._thumbs.items():
             if name == picture.name:
                 thumb.classes(add="here")
-                ui.run_javascript(f"getHtmlElement({thumb.id})?.scrollIntoView({{block: 'nearest'}});")
+                ui.run_javascript(f"getHtmlElement({thumb.id})?.scrollIntoView({{block: 'center'}});")
             elif "here" in thumb.classes:
                 thumb.classes(remove="here")
 
