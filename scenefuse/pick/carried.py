@@ -34,6 +34,8 @@ class CarriedMasks:
             accepted: JSON where accepted masks are noted, by the hash of each.
         """
         self._results, self._accepted = results, accepted
+        self._digests: dict[str, str] = {}
+        self._known = _read_accepted(accepted)
         self.agreement: dict[str, float] = {}
         self.dropped: dict[str, str] = {}
         self._cameras: tuple[dict, dict] | None = None
@@ -71,21 +73,27 @@ class CarriedMasks:
 
     def accept(self, photo: str) -> None:
         """Note that a person has looked at a photo's mask, and that it is right."""
-        known = self._read_accepted() | {photo: digest(self._path(photo))}
-        write_json(self._accepted, known)
+        self._known = _read_accepted(self._accepted) | {photo: self._digest(photo)}
+        write_json(self._accepted, self._known)
 
     def is_accepted(self, photo: str) -> bool:
-        """Whether a person has accepted the mask that the photo has now."""
-        return self._path(photo).is_file() and self._read_accepted().get(photo) == digest(self._path(photo))
+        """Whether a person has accepted the mask that the photo had when the results were read."""
+        return photo in self._known and self._known[photo] == self._digest(photo)
+
+    def _digest(self, photo: str) -> str:
+        if photo not in self._digests:
+            self._digests[photo] = digest(self._path(photo))
+        return self._digests[photo]
 
     def _path(self, photo: str) -> Path:
         return self._results / "masks" / f"{Path(photo).stem}.png"
 
-    def _read_accepted(self) -> dict[str, str]:
-        try:
-            return json.loads(self._accepted.read_text())
-        except (OSError, ValueError):
-            return {}
+
+def _read_accepted(path: Path) -> dict[str, str]:
+    try:
+        return json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
 
 
 def carried_masks(results: Path, accepted: Path) -> tuple[CarriedMasks, str]:

@@ -2,18 +2,19 @@
 
 import asyncio
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 from nicegui import ui
 
-from scenefuse.pick.clicks import Kind, problems, with_box, with_label, with_point, without_nearest
+from scenefuse.pick.clicks import Kind, Rows, with_box, with_label, with_point, without_nearest
 from scenefuse.pick.document import FileChanged
-from scenefuse.pick.next_run import as_text, command, planned_rules
 from scenefuse.pick.overlays import CARRIED, CLICKED, overlay
 from scenefuse.pick.photo_map import PhotoMap
 from scenefuse.pick.photo_strip import PhotoStrip
 from scenefuse.pick.pictures import Picture
 from scenefuse.pick.session import Board, Session
+from scenefuse.pick.side_panel import SidePanel
 from scenefuse.stage import StageError
 
 STYLE = """
@@ -65,7 +66,8 @@ class Page:
         self.tool, self.point, self.shows_masks = "inside", "", True
         self.picture: Picture | None = None
         self.seen_version = -1
-        self.mask_request = 0
+        self.mask_asked: Any = None
+        self.segmenting = asyncio.Lock()
         self.mask_note = self.method = ""
         self.seen_results = session.results_state
         self.carried_shown: Any = None
@@ -96,7 +98,7 @@ class Page:
             self.strip = PhotoStrip(self.session, self.open_photo)
             with ui.element("div").classes("h-full").style("flex: 1 1 0; min-width: 0"):
                 self.map = PhotoMap(self.clicked, self.remove, self.box_drawn)
-            self.side = ui.column().classes("side h-full no-wrap")
+            self.side = SidePanel(self)
         self._build_help()
         ui.keyboard(on_key=self.key, ignore=["input", "textarea"], repeating=False)
         ui.timer(POLL_S, self.poll)
@@ -127,7 +129,7 @@ class Page:
 
     def open_photo(self, picture: Picture) -> None:
         """Show a photo."""
-        self.picture, self.carried_shown = picture, None
+        self.picture, self.carried_shown, self.mask_asked = picture, None, None
         number = list(self.board.source.pictures).index(picture.name)
         self.map.stop_drawing()
         self.map.show(picture, f"/tile/{self.board_number}/{number}/{{z}}/{{x}}/{{y}}?v={self.session.key}")
@@ -139,39 +141,37 @@ class Page:
 
     # What a person does
 
-    def clicked(self, x: float, y: float) -> None:
-        """A click into the photo: of the tool that is chosen."""
-        picture, document, sizes = self.picture, self.board.document, self.board.source.sizes
-        assert picture is not None
-        if document.kind == "points" and not self.point:
-            self.say("Name a point first, at the right; then click it.")
-            return
+    def edit(self, changed: Callable[[], Rows]) -> None:
+        """Change the table, or say why it cannot be changed so."""
         try:
-            if document.kind == "points":
-                document.change(with_point(document.rows, self.point, picture.name, x, y, sizes))
-            else:
-                tool = "outside" if self.tool == "outside" else "inside"
-                document.change(with_label(document.rows, tool, picture.name, x, y, sizes))
+            self.board.document.change(changed())
         except StageError as error:
             self.say(str(error))
         self.refresh()
+
+    def clicked(self, x: float, y: float) -> None:
+        """A click into the photo: of the tool that is chosen."""
+        assert self.picture is not None
+        name, document, sizes = self.picture.name, self.board.document, self.board.source.sizes
+        tool = "outside" if self.tool == "outside" else "inside"
+        if document.kind == "labels":
+            self.edit(lambda: with_label(document.rows, tool, name, x, y, sizes))
+        elif self.point:
+            self.edit(lambda: with_point(document.rows, self.point, name, x, y, sizes))
+        else:
+            self.say("Name a point first, at the right; then click it.")
 
     def remove(self, x: float, y: float) -> None:
         """Remove the click under the pointer."""
         assert self.picture is not None
-        document = self.board.document
-        document.change(without_nearest(document.rows, self.picture.name, x, y, self.map.reach_px()))
-        self.refresh()
+        name, rows = self.picture.name, self.board.document.rows
+        self.edit(lambda: without_nearest(rows, name, x, y, self.map.reach_px()))
 
     def box_drawn(self, corners: list[tuple[float, float]]) -> None:
         """A box was dragged."""
         assert self.picture is not None
-        document = self.board.document
-        try:
-            ends = corners[0], corners[1]
-            document.change(with_box(document.rows, self.picture.name, ends, self.board.source.sizes))
-        except StageError as error:
-            self.say(str(error))
+        name, rows, ends = self.picture.name, self.board.document.rows, (corners[0], corners[1])
+        self.edit(lambda: with_box(rows, name, ends, self.board.source.sizes))
         self.choose("inside")
 
     def choose(self, tool: str) -> None:
@@ -252,10 +252,15 @@ class Page:
     def save(self) -> None:
         """Save the table that is clicked now."""
         try:
-            self.say(self.board.document.save(), "positive")
-            self.refresh()
+            self.attempt(self.board.document.save)
         except FileChanged as error:
             self.ask_about_changes(str(error))
+        self.refresh()
+
+    def attempt(self, save: Callable[[], str]) -> None:
+        """Save, and say what happened."""
+        try:
+            self.say(save(), "positive")
         except StageError as error:
             self.say(str(error), "negative")
 
@@ -273,7 +278,7 @@ class Page:
             elif how == "theirs":
                 document.read()
             else:
-                self.say(document.keep_mine(), "positive")
+                self.attempt(document.keep_mine)
             self.refresh()
 
         with ui.dialog().props("persistent") as self.dialog, ui.card():
@@ -284,14 +289,6 @@ class Page:
                 for how, text in choices.items():
                     ui.button(text, on_click=lambda how=how: decide(how)).props("no-caps dense padding='2px 10px'")
         self.dialog.open()
-
-    async def plan(self) -> None:
-        """Ask the workflow what it will run."""
-        self.planned.set_text("Asking the workflow; some seconds ...")
-        words = command(self.session.configfile, f"results/objects/{self.session.name}/fused.ply")
-        rules, trouble = await asyncio.to_thread(planned_rules, words)
-        jobs = ", ".join(f"{rule}{f' ({count})' if count > 1 else ''}" for rule, count in rules.items())
-        self.planned.set_text(trouble or f"Will run: {jobs or 'nothing'}.")
 
     def say(self, text: str, kind: str = "warning") -> None:
         """A notice at the lower edge."""
@@ -336,9 +333,7 @@ class Page:
         self.strip.count(Counter(row.photo for row in document.rows))
         self.state.set_text("● not saved" if document.unsaved else "saved" if document.path.exists() else "no file yet")
         self.state.classes(replace="text-sm " + ("text-red-700" if document.unsaved else "text-gray-600"))
-        self.side.clear()
-        with self.side:
-            self._fill_side()
+        self.side.fill()
 
     def _draw_points(self) -> None:
         assert self.picture is not None
@@ -354,7 +349,6 @@ class Page:
 
     def _show_masks(self, picture: Picture) -> None:
         """Have the clicks' mask made, and the workflow's laid over the photo where it is not there yet."""
-        self.mask_request += 1
         own = [row for row in self.board.document.rows if row.photo == picture.name]
         shows = self.board_number == 0 and self.board.document.kind == "labels" and self.shows_masks
         wanted = (picture.name, self.session.results_state) if shows and self.session.carried else None
@@ -363,11 +357,13 @@ class Page:
             self.map.lay("carried", None)
             if wanted is not None:
                 asyncio.get_running_loop().create_task(self._lay_carried(picture))
-        if shows and any(row.label != "outside" for row in own):
-            self.mask_note = "Making it ..."
-            asyncio.get_running_loop().create_task(self._segment(picture, self.mask_request))
+        asked = (picture.name, *own) if shows and any(row.label != "outside" for row in own) else None
+        if asked == self.mask_asked:
+            return
+        self.mask_asked, self.mask_note = asked, "Making it ..." if asked else ""
+        if asked:
+            asyncio.get_running_loop().create_task(self._segment(picture, asked))
         else:
-            self.mask_note = ""
             self.map.lay("clicked", None)
 
     async def _lay_carried(self, picture: Picture) -> None:
@@ -381,94 +377,22 @@ class Page:
         if mask is not None and wanted == self.carried_shown:
             self.map.lay("carried", f"/overlay/{self.session.overlay(overlay(mask, CARRIED))}")
 
-    async def _segment(self, picture: Picture, request: int) -> None:
+    async def _segment(self, picture: Picture, asked: Any) -> None:
         """Make the mask of a photo's clicks, unless others have come in the meantime."""
-        rows = self.board.document.rows
         address, note = None, ""
         try:
-            mask, notes = await asyncio.to_thread(self.session.segmenter.mask, picture, rows)
+            async with self.segmenting:
+                if asked != self.mask_asked:
+                    return
+                mask, notes = await asyncio.to_thread(self.session.segmenter.mask, picture, asked[1:])
             note = " ".join(f"{sentence[0].upper()}{sentence[1:]}." for sentence in notes)
             address = f"/overlay/{self.session.overlay(overlay(mask, CLICKED))}"
         except StageError as error:
             note = str(error)
-        if request == self.mask_request:
-            with self.side:
-                self.map.lay("clicked", address)
-                self.mask_note = note
-                self._show_note()
-
-    def _fill_side(self) -> None:
-        board, document = self.board, self.board.document
-        ui.label(board.source.advice[document.kind]).classes("text-sm text-gray-700")
-        for text in filter(None, (document.trouble, document.fixed, *board.notes[:3])):
-            ui.label(text).classes("text-xs text-red-700")
-        if self.board_number and not document.rows:
-            kinds = {"labels": "In one photo", "points": "Named points"}
-            kind = ui.toggle(kinds, value=document.kind, on_change=lambda e: self.choose_kind(e.value))
-            kind.props("no-caps dense unelevated spread padding='3px 8px'").classes("w-full")
-        if document.kind == "labels":
-            self._fill_tools()
-        else:
-            self._fill_points()
-        ui.separator()
-        self._fill_next()
-
-    def _fill_tools(self) -> None:
-        tools = {"inside": "Inside (i)", "outside": "Outside (o)", "box": "Box (b)"}
-        toggle = ui.toggle(tools, value=self.tool, on_change=lambda e: self.choose(e.value))
-        toggle.props("no-caps dense unelevated spread padding='3px 8px'").classes("w-full")
-        self.note = ui.label().classes("text-xs")
-        if self.board_number == 0:
-            self._show_note()
-            if self.session.segmenter.trouble:
-                ui.label(self.session.segmenter.trouble).classes("text-xs text-orange-900")
-            self._fill_carried()
-
-    def _show_note(self) -> None:
-        segmenter = self.session.segmenter
-        method = f"Mask by {segmenter.method}." if segmenter.method else "Loading the network ..."
-        self.note.set_text(f"{method} {self.mask_note}")
-
-    def _fill_carried(self) -> None:
-        carried = self.session.carried
-        if not carried or self.picture is None:
-            return
-        name = self.picture.name
-        accepted = sum(carried.is_accepted(photo) for photo in carried.agreement)
-        ui.separator()
-        ui.label(f"The workflow's masks (orange): {accepted} of {len(carried.agreement)} accepted").classes("text-sm")
-        if name in carried.dropped:
-            ui.label(f"Left out: {carried.dropped[name]}. Add clicks here.").classes("text-xs text-red-700")
-        elif name in carried.agreement:
-            text = f"Agreement with the others here: {carried.agreement[name]:.2f}"
-            ui.label(text + (" · accepted" if carried.is_accepted(name) else "")).classes("text-xs")
-        ui.button("Accept, next (a)", icon="check", on_click=self.accept).props("dense outline padding='2px 10px'")
-
-    def _fill_points(self) -> None:
-        document, cameras = self.board.document, self.board.cameras
-        entry = ui.input("New point: a name, then Enter").props("dense outlined").classes("w-full")
-        entry.on("keydown.enter", lambda: self.choose_point(entry.value))
-        names = list(dict.fromkeys(row.label for row in document.rows))
-        if self.point and self.point not in names:
-            names.append(self.point)
-        for name in names:
-            rows = [row for row in document.rows if row.label == name]
-            off = cameras.residuals(rows) if cameras else {}
-            worst = f" · {max(off.values()):.1f} px" if off else ""
-            plural = "photo" if len(rows) == 1 else "photos"
-            look = "unelevated color=amber-6 text-color=black" if name == self.point else "flat color=grey-9"
-            button = ui.button(
-                f"{name} · {len(rows)} {plural}{worst}", on_click=lambda name=name: self.choose_point(name)
-            )
-            button.props(f"dense {look} align=left padding='1px 8px'").classes("w-full")
-            if name == self.point:
-                for row in rows:
-                    text = f"{row.photo}: {off[row.photo]:.1f} px off" if row.photo in off else row.photo
-                    link = ui.label(text).classes("text-xs text-blue-800 cursor-pointer pl-3")
-                    link.on("click", lambda row=row: self.go(row.photo))
-        if cameras is None:
-            text = "Cross-hairs come once the workflow knows the cameras of these photos."
-            ui.label(text).classes("text-xs text-gray-600")
+        if asked == self.mask_asked:
+            self.map.lay("clicked", address)
+            self.mask_note = note
+            self.side.show_note()
 
     def go(self, photo: str) -> None:
         """Show a photo by its name."""
@@ -476,25 +400,7 @@ class Page:
         if picture is not None:
             self.open_photo(picture)
 
-    def _fill_next(self) -> None:
-        board, document = self.board, self.board.document
-        ui.label("What the workflow will make of it").classes("text-sm font-bold")
-        found = problems(document.rows, document.kind, board.source.sizes, board.source.least_inside)
-        for problem in found[:6]:
-            ui.label(problem).classes("text-xs text-orange-900")
-        if any(row.photo not in board.source.pictures for row in document.rows):
-            ui.button("Remove clicks in missing photos", on_click=self.remove_lost).props("dense outline")
-        if document.rows and not board.source.listed:
-            text = f"Write {document.path} into the column {board.source.column} of the table of objects."
-            ui.label(text).classes("text-xs text-orange-900")
-        target = "masks.png" if board.source.column == "prompts" else "fused.ply"
-        words = command(self.session.configfile, f"results/objects/{self.session.name}/{target}")
-        ui.label(as_text(words)).classes("code w-full").mark("command")
-        ui.button("What will run?", icon="playlist_play", on_click=self.plan).props("dense outline padding='2px 10px'")
-        self.planned = ui.label().classes("text-xs")
-
     def remove_lost(self) -> None:
         """Remove clicks in photos that are no longer there."""
-        document, known = self.board.document, self.board.source.pictures
-        document.change(tuple(row for row in document.rows if row.photo in known))
-        self.refresh()
+        rows, known = self.board.document.rows, self.board.source.pictures
+        self.edit(lambda: tuple(row for row in rows if row.photo in known))

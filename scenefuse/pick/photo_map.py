@@ -1,5 +1,6 @@
 """The photo that is clicked in, as a map to zoom and pan, with what lies over it."""
 
+import html
 import json
 from collections.abc import Awaitable, Callable, Iterable
 from typing import Any
@@ -176,7 +177,9 @@ class PhotoMap:
         self._add("circleMarker", [self._place(click.x, click.y), options | {"interactive": False}])
         if text:
             layer = self._over[-1]
-            layer.run_method("bindTooltip", text, {"permanent": True, "direction": "right", "offset": [8, 0]})
+            layer.run_method(
+                "bindTooltip", html.escape(text), {"permanent": True, "direction": "right", "offset": [8, 0]}
+            )
 
     def _add(self, name: str, args: list[Any]) -> None:
         self._over.append(self.widget.generic_layer(name=name, args=args))

@@ -123,4 +123,4 @@ def test_an_accepted_mask_is_so_until_it_changes(results):
     again = CarriedMasks(results, results / "pick/accepted.json")
     assert again.is_accepted("2.jpg") and not again.is_accepted("1.jpg")
     cv2.imwrite(str(results / "masks/2.png"), np.zeros((480, 640), dtype=np.uint8))
-    assert not again.is_accepted("2.jpg")
+    assert not CarriedMasks(results, results / "pick/accepted.json").is_accepted("2.jpg")
