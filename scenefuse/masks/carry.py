@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,6 +116,14 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
         voter = made[k]
         print(f"{photos.views[k].name} again: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
     return _carried(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
+
+
+def one_photo(ask: Ask, view: View, clicks: PhotoClicks, tolerance_px: float) -> tuple[Mask, float, float, list[str]]:
+    """The mask (H, W) of a photo from its own clicks alone, with which `carry` begins; its quality, its agreement with
+    the clicks, and the clicks that contradict it, a sentence each. Arguments as of `carry`; the view has RGB pixels."""
+    nothing = np.zeros((0, 3)), [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2))]
+    voter, left_out = _make(ask, Workspace(Path(), [view], *nothing), 0, clicks, {}, tolerance_px)
+    return voter.mask, voter.quality, voter.agreement, left_out
 
 
 def _make(

@@ -6,6 +6,9 @@ import shutil
 import pytest
 from support.user_project import Project, planned
 
+from scenefuse.pick.clicks import Click
+from scenefuse.pick.document import Document
+
 CROP, MASKS = "results/objects/shed/registration/full/crop.json", "results/objects/shed/masks.json"
 
 
@@ -75,6 +78,16 @@ def test_an_older_photo_of_the_object_reruns_its_frames(plan):
 @pytest.mark.parametrize("name, rule", [("prompts.tsv", "make_masks"), ("clicks.tsv", "crop_scene")])
 def test_older_clicks_rerun_what_reads_them_and_nothing_else(plan, name, rule):
     assert plan(replace(name)) == {rule}
+
+
+def test_a_correction_that_the_page_saves_reruns_the_masks_and_nothing_else(plan):
+    def correct(path):
+        (path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t30\t20\n")
+        document = Document(path / "prompts.tsv", "labels")
+        document.change((*document.rows, Click("outside", "1.jpg", 3, 4)))
+        document.save()
+
+    assert plan(correct) == {"make_masks"}
 
 
 def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed(plan):

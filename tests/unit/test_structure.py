@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 # In the order in which data flow; each imports only itself and what stands before it.
 PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
-PACKAGES += ["metrics", "report"]
+PACKAGES += ["metrics", "report", "pick"]
 # Shared by all, and importing no package.
 SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records"]
 # The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.

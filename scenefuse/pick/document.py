@@ -1,0 +1,227 @@
+"""A table of clicks on disk: read, changed, and saved without losing what others wrote."""
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, merged
+from scenefuse.sfm.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
+from scenefuse.stage import StageError, atomic_file
+
+HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS}
+
+
+class FileChanged(Exception):
+    """The file is no longer what was read; the message says what differs."""
+
+
+class Document:
+    """One table: the rows as edited, as last read or saved, and what is wrong with the file.
+
+    Attributes:
+        path: of the file, which need not exist.
+        kind: what its rows are; that of the file where it exists.
+        history: the rows, with undo.
+        saved: the rows that the file held when it was last read or written.
+        trouble: why the file cannot be read; it is then kept under another name when this is saved. "" where it can.
+        fixed: why the file cannot be edited here; "" where it can.
+        version: counts changes, so that every open page notices those of others.
+    """
+
+    def __init__(self, path: Path, kind: Kind) -> None:
+        self.path, self.kind = path, kind
+        self.version = 0
+        self.read()
+        self._restore()
+
+    def read(self) -> None:
+        """Take the rows that the file holds, and forget all others."""
+        self.trouble = self.fixed = ""
+        self._digest = digest(self.path)
+        self._comments: list[str] = []
+        try:
+            self.saved = self._rows()
+        except StageError as error:
+            self.saved, self.trouble = (), str(error)
+        self.history = History(self.saved)
+        self.version += 1
+
+    @property
+    def rows(self) -> Rows:
+        """The rows as edited."""
+        return self.history.rows
+
+    @property
+    def unsaved(self) -> bool:
+        """Whether they differ from the file's."""
+        return set(self.rows) != set(self.saved)
+
+    def change(self, rows: Rows) -> None:
+        """Edit the rows."""
+        if self.fixed:
+            raise StageError(self.fixed)
+        self.history.change(rows)
+        self.version += 1
+
+    def choose_kind(self, kind: Kind) -> None:
+        """Hold rows of the other kind; StageError where there are rows already."""
+        if kind != self.kind and (self.rows or self.fixed):
+            raise StageError(f"{self.path} holds {self.kind}; remove them all to begin with {kind}")
+        self.kind = kind
+        self.history = History(self.rows)
+        self.version += 1
+
+    def undo(self) -> bool:
+        """One change back."""
+        self.version += 1
+        return self.history.undo()
+
+    def redo(self) -> bool:
+        """One change forward again."""
+        self.version += 1
+        return self.history.redo()
+
+    def changed_on_disk(self) -> bool:
+        """Whether somebody else wrote, made or removed the file since it was read."""
+        return digest(self.path) != self._digest
+
+    def save(self) -> str:
+        """Write the file; what happened, for a person.
+
+        Raises:
+            FileChanged: somebody else did; nothing is written.
+            StageError: it holds something that cannot be edited here, or cannot be written.
+        """
+        if self.fixed:
+            raise StageError(self.fixed)
+        with _locked(self.path.parent):
+            if self.changed_on_disk():
+                raise FileChanged(self._what_changed())
+            message = f"{len(self.rows)} rows saved in {self.path}"
+            if self.trouble:
+                message += f"; the unreadable file is kept as {_set_aside(self.path).name}"
+            lines = ["\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
+            _write(self.path, "\n".join([*self._comments, *lines]) + "\n")
+            self._digest = digest(self.path)
+        self.saved, self.trouble = self.rows, ""
+        self._draft.unlink(missing_ok=True)
+        self.version += 1
+        return message
+
+    def merge(self) -> None:
+        """Take what the file holds now, with the own changes laid over it, still unsaved."""
+        base, mine = self.saved, self.rows
+        self.read()
+        if self.trouble or self.fixed:
+            self.history.change(mine)
+        else:
+            self.history.change(merged(base, mine, self.saved))
+
+    def keep_mine(self) -> str:
+        """Save the own rows; the file as somebody else left it is kept under another name."""
+        kept = _set_aside(self.path).name if self.path.exists() else ""
+        self._digest, self.trouble = digest(self.path), ""
+        return self.save() + (f"; the other version is kept as {kept}" if kept else "")
+
+    def keep_draft(self) -> Path | None:
+        """Write unsaved rows beside the file, for the next time; None where there are none."""
+        if not self.unsaved:
+            return None
+        _write(self._draft, "\n".join(["\t".join(HEADERS[self.kind]), *map(_line, self.rows)]) + "\n")
+        return self._draft
+
+    @property
+    def _draft(self) -> Path:
+        return self.path.with_name(f"{self.path.stem}.unsaved{self.path.suffix}")
+
+    def _restore(self) -> None:
+        """Take up the unsaved rows of the last time."""
+        if not self._draft.is_file() or self.fixed:
+            return
+        try:
+            marked = read_points(self._draft)
+            self.kind = "labels" if isinstance(marked, Labels) else "points"
+            self.history.change(_rows_of(marked))
+        except StageError:
+            self.history.change(())  # a draft without rows: everything was removed
+
+    def _rows(self) -> Rows:
+        if not self.path.exists():
+            return ()
+        if not self._holds_rows():
+            return ()
+        marked = read_points(self.path)
+        self._comments = [
+            line for line in self.path.read_text(encoding="utf-8-sig").splitlines() if line.startswith("#")
+        ]
+        if not isinstance(marked, Labels | Clicks):
+            self.fixed = f"{self.path} holds points by their coordinates, which are not clicked; edit it as text"
+            return ()
+        self.kind = "labels" if isinstance(marked, Labels) else "points"
+        return _rows_of(marked)
+
+    def _holds_rows(self) -> bool:
+        """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
+        try:
+            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
+        except (OSError, UnicodeDecodeError):
+            return True
+        cells = [line.split("\t") for line in lines if line.strip() and not line.startswith("#")]
+        return len(cells) > 1 or (len(cells) == 1 and cells[0] not in HEADERS.values())
+
+    def _what_changed(self) -> str:
+        try:
+            return f"{self.path} was changed by someone else: {difference(self.saved, self._rows())}"
+        except StageError as error:
+            return f"{self.path} was changed by someone else, and is no longer readable: {error}"
+
+
+def digest(path: Path) -> str:
+    """SHA-256 of a file's bytes; "" where there is none."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    except OSError:
+        return ""
+
+
+def _rows_of(marked: object) -> Rows:
+    names = marked.labels if isinstance(marked, Labels) else marked.points  # type: ignore[attr-defined]
+    pixels = marked.pixels.tolist()  # type: ignore[attr-defined]
+    return tuple(Click(n, p, *xy) for n, p, xy in zip(names, marked.photos, pixels))  # type: ignore[attr-defined]
+
+
+def _line(click: Click) -> str:
+    return f"{click.label}\t{click.photo}\t{click.x:.10g}\t{click.y:.10g}"
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        # A link stays one: what it points to is replaced.
+        with atomic_file(path.resolve()) as temporary:
+            temporary.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StageError(f"{path} cannot be written ({error.strerror}); check its folder's permissions") from None
+
+
+def _set_aside(path: Path) -> Path:
+    """Rename a file to the first free name beside it."""
+    number = 1
+    while (other := path.with_name(f"{path.stem}.kept-{number}{path.suffix}")).exists():
+        number += 1
+    os.rename(path, other)
+    return other
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold a folder, so that of two pages one after the other looks at the file and writes it."""
+    folder.mkdir(parents=True, exist_ok=True)
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(handle)

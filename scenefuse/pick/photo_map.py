@@ -1,0 +1,194 @@
+"""The photo that is clicked in, as a map to zoom and pan, with what lies over it."""
+
+import html
+import json
+from collections.abc import Awaitable, Callable, Iterable
+from typing import Any
+
+import numpy as np
+from nicegui import ui
+from nicegui.elements.leaflet.leaflet_layer import Layer
+
+from scenefuse.pick.clicks import Click
+from scenefuse.pick.pictures import Picture
+from scenefuse.transforms import Array
+
+MAGNIFIED = 4
+"""Zoom steps beyond the photo's own pixels."""
+COLOURS = {"inside": "#00c853", "outside": "#ff1744", "box": "#2979ff"}
+POINT, ACTIVE, EXPECTED = "#2979ff", "#ffd600", "#ff9100"
+NEAR_PX = 14
+"""A click is meant by a pointer this near, on the screen."""
+
+Handler = Callable[[float, float], Awaitable[None] | None]
+
+
+class PhotoMap:
+    """A photo with its clicks; tells where it is clicked."""
+
+    def __init__(
+        self, on_click: Handler, on_remove: Handler, on_box: Callable[[list[tuple[float, float]]], Any]
+    ) -> None:
+        """Build the map inside the current element, without a photo."""
+        options = {
+            "attributionControl": False,
+            "doubleClickZoom": False,
+            "keyboard": False,
+            "boxZoom": False,
+            "zoomSnap": 0.1,
+            "zoomDelta": 1,
+            "wheelPxPerZoomLevel": 100,
+            "maxBoundsViscosity": 0.8,
+        }
+        rectangle = {"showArea": False, "shapeOptions": {"color": COLOURS["box"], "weight": 2, "fill": False}}
+        none = dict.fromkeys(("polyline", "polygon", "circle", "marker", "circlemarker"), False)
+        self.widget = ui.leaflet(
+            (0, 0), 2, options=options, draw_control={"draw": none | {"rectangle": rectangle}}, hide_drawn_items=True
+        ).classes("photo")
+        self.widget.clear_layers()  # the widget's own background comes from the internet
+        self._rectangle = rectangle
+        self._picture: Picture | None = None
+        self._over: list[Layer] = []
+        self._masks: dict[str, Layer] = {}
+        self._drawing = False
+
+        async def clicked(event: Any, handler: Handler) -> None:
+            if self._picture is not None and not self._drawing:
+                found = handler(*self._picture.pixel(event.args["latlng"]["lat"], event.args["latlng"]["lng"]))
+                if found is not None:
+                    await found
+
+        def drawn(event: Any) -> None:
+            self._drawing = False
+            if self._picture is not None:
+                corners = event.args["layer"]["_latlngs"][0]
+                on_box([self._picture.pixel(corner["lat"], corner["lng"]) for corner in (corners[0], corners[2])])
+
+        self.widget.on("map-click", lambda event: clicked(event, on_click))
+        self.widget.on("map-contextmenu", lambda event: clicked(event, on_remove))
+        self.widget.on("draw:created", drawn)
+        self.widget.on("draw:drawstop", lambda: setattr(self, "_drawing", False), args=[])
+
+    def show(self, picture: Picture, tiles: str) -> None:
+        """Show another photo, whole.
+
+        Args:
+            picture: the photo.
+            tiles: address of its tiles with {z}, {x} and {y}.
+        """
+        self._picture = picture
+        self.widget.clear_layers()
+        self._over, self._masks = [], {}
+        bounds = self._bounds()
+        self.widget.tile_layer(
+            url_template=tiles,
+            options={
+                "maxNativeZoom": picture.depth,
+                "maxZoom": picture.depth + MAGNIFIED,
+                "minZoom": 0,
+                "noWrap": True,
+                "bounds": bounds,
+                "updateWhenZooming": False,
+                "keepBuffer": 1,
+            },
+        )
+        self.widget.run_map_method("setMaxBounds", None)
+        self.widget.run_map_method("setMinZoom", 0)
+        self.widget.run_map_method("setMaxZoom", picture.depth + MAGNIFIED)
+        self.fit()
+
+    def fit(self) -> None:
+        """Show the whole photo."""
+        if self._picture is not None:
+            self.widget.run_map_method("fitBounds", self._bounds(), {"animate": False, "padding": [4, 4]})
+
+    def zoom(self, steps: int) -> None:
+        """Zoom in by steps, or out where they are negative."""
+        self.widget.run_map_method("zoomIn" if steps > 0 else "zoomOut", abs(steps))
+
+    def reach_px(self) -> float:
+        """How many pixels of the photo a pointer may miss a click by."""
+        picture = self._picture
+        zoom = float(self.widget.zoom)
+        return 0.0 if picture is None else NEAR_PX / picture.scale * 2 ** (picture.depth - zoom)
+
+    def lay(self, name: str, address: str | None) -> None:
+        """Lay a mask over the photo in the place of the former one of this name; None takes it away."""
+        former = self._masks.pop(name, None)
+        if address is not None and self._picture is not None:
+            self._masks[name] = self.widget.image_overlay(
+                url=address, bounds=self._bounds(), options={"interactive": False}
+            )
+        if former is not None:
+            self.widget.remove_layer(former)
+
+    def draw_box(self) -> None:
+        """Let a box be dragged."""
+        self._drawing = True
+        ui.run_javascript(
+            f"const map = getElement({self.widget.id}).map; window.boxTool?.disable();"
+            f"window.boxTool = new L.Draw.Rectangle(map, {json.dumps(self._rectangle)}); window.boxTool.enable();"
+        )
+
+    def stop_drawing(self) -> None:
+        """Give up the box."""
+        if self._drawing:
+            ui.run_javascript("window.boxTool?.disable();")
+        self._drawing = False
+
+    def clear(self) -> None:
+        """Take away clicks and lines."""
+        for layer in self._over:
+            self.widget.remove_layer(layer)
+        self._over = []
+
+    def draw_labels(self, clicks: Iterable[Click]) -> None:
+        """Draw clicks inside and outside, and boxes."""
+        corners: list[Click] = []
+        for click in clicks:
+            if click.label == "box":
+                corners.append(click)
+            else:
+                self._dot(click, COLOURS[click.label], "")
+        if len(corners) == 2:
+            ends = [self._place(c.x, c.y) for c in corners]
+            self._add("rectangle", [ends, {"color": COLOURS["box"], "weight": 2, "fill": False, "interactive": False}])
+
+    def draw_point(self, click: Click, active: bool) -> None:
+        """Draw a named point."""
+        self._dot(click, ACTIVE if active else POINT, click.label)
+
+    def draw_expected(self, pixels: Array, name: str) -> None:
+        """Draw where a point is to be expected: a cross-hair for one pixel, a line for more."""
+        style = {"color": EXPECTED, "weight": 2, "opacity": 0.9, "interactive": False, "dashArray": "6 5"}
+        if len(pixels) == 1:
+            x, y = pixels[0]
+            picture = self._picture
+            assert picture is not None
+            arm = 0.02 * max(picture.width, picture.height)
+            for dx, dy in ((arm, 0.0), (0.0, arm)):
+                line = [self._place(x - dx, y - dy), self._place(x + dx, y + dy)]
+                self._add("polyline", [line, style | {"dashArray": ""}])
+        elif len(pixels):
+            self._add("polyline", [[self._place(*pixel) for pixel in np.asarray(pixels).tolist()], style])
+
+    def _dot(self, click: Click, colour: str, text: str) -> None:
+        options = {"radius": 6, "color": "#ffffff", "weight": 2, "fillColor": colour, "fillOpacity": 1}
+        self._add("circleMarker", [self._place(click.x, click.y), options | {"interactive": False}])
+        if text:
+            layer = self._over[-1]
+            layer.run_method(
+                "bindTooltip", html.escape(text), {"permanent": True, "direction": "right", "offset": [8, 0]}
+            )
+
+    def _add(self, name: str, args: list[Any]) -> None:
+        self._over.append(self.widget.generic_layer(name=name, args=args))
+
+    def _place(self, x: float, y: float) -> tuple[float, float]:
+        assert self._picture is not None
+        return self._picture.place(x, y)
+
+    def _bounds(self) -> list[list[float]]:
+        picture = self._picture
+        assert picture is not None
+        return [list(picture.place(0, picture.height)), list(picture.place(picture.width, 0))]

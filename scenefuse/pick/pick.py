@@ -1,0 +1,74 @@
+"""The command that opens the page."""
+
+import secrets
+import socket
+import threading
+import webbrowser
+from pathlib import Path
+
+import tyro
+
+from scenefuse.pick.session import Session
+from scenefuse.stage import StageError
+
+
+def pick(
+    *, object: str, configfile: Path | None = None, port: int = 0, no_browser: tyro.conf.UseCounterAction[int] = 0
+) -> None:
+    """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
+
+    The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects. Run
+    it in the working directory of the workflow, with the same settings file; Ctrl-C ends it.
+
+    Args:
+        object: name of the object, as in the table of objects.
+        configfile: settings, as given to snakemake; the shipped ones where it is left out.
+        port: of the page on this machine; 0 takes a free one.
+        no_browser: print the address only.
+
+    Raises:
+        StageError: settings, tables or photos are wrong, or the page's packages are not installed.
+    """
+    session = Session(object, configfile)
+    try:
+        from nicegui import app, ui
+
+        from scenefuse.pick.page import Page
+        from scenefuse.pick.server import HOST, Guard, add_pictures
+    except ImportError as error:
+        raise StageError(f"the page needs NiceGUI ({error}): pip install -r envs/requirements.txt") from None
+    port, token = port or _free_port(HOST), secrets.token_urlsafe(16)
+    address = f"http://{HOST}:{port}/?token={token}"
+    app.add_middleware(Guard, token=token, port=port)
+    add_pictures(app, session)
+
+    @ui.page("/", title=f"{object}: click")
+    async def page() -> None:
+        opened = Page(session)
+        await ui.context.client.connected()
+        await opened.begin()
+
+    def announce() -> None:
+        print(f"{address}\nOpen this address in a browser of this machine; Ctrl-C ends the page.", flush=True)
+        if not no_browser:
+            threading.Thread(target=webbrowser.open, args=(address,), daemon=True).start()
+
+    app.on_startup(session.start)
+    app.on_startup(announce)
+    app.on_shutdown(lambda: [print(sentence, flush=True) for sentence in session.close()])
+    ui.run(
+        host=HOST,
+        port=port,
+        show=False,
+        reload=False,
+        show_welcome_message=False,
+        title="scenefuse",
+        favicon="🖱",
+        timeout_graceful_shutdown=1,
+    )
+
+
+def _free_port(host: str) -> int:
+    with socket.socket() as probe:
+        probe.bind((host, 0))
+        return probe.getsockname()[1]

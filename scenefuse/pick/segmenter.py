@@ -1,0 +1,179 @@
+"""The mask that the workflow makes of a photo from its clicks, at once: features are computed ahead."""
+
+import threading
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.pick.clicks import Rows
+from scenefuse.pick.pictures import Picture, at_most, read_upright
+from scenefuse.stage import StageError, threads
+
+if TYPE_CHECKING:
+    from scenefuse.masks.clicks import PhotoClicks
+
+Mask = NDArray[np.bool_]
+KEPT = 24
+"""Photos whose features are kept; 17 MB each, and the photo."""
+IDLE_S = 4.0
+"""Without a click for so long, photos that are not shown are prepared."""
+AHEAD = 6
+"""Photos whose features are computed before anybody clicks in them."""
+
+
+class _Remembering:
+    """SAM 2 that encodes each photo once."""
+
+    def __init__(self, network: Any) -> None:
+        self._network = network
+        self._features: OrderedDict[int, tuple[Any, Any]] = OrderedDict()
+        self.masks = network.masks
+
+    def encode(self, image: NDArray[np.uint8]) -> Any:
+        """Features of a photo; by its identity, so that it has to be the same array."""
+        if id(image) not in self._features:
+            # The array is kept, too: another one would get its identity.
+            self._features[id(image)] = image, self._network.encode(image)
+            while len(self._features) > KEPT:
+                self._features.popitem(last=False)
+        return self._features[id(image)][1]
+
+
+class Segmenter:
+    """Masks of single photos from their clicks, as the masks' stage makes those of clicked photos.
+
+    Attributes:
+        method: what segments, for a person; "" until it is loaded.
+        trouble: why it is not what the settings ask for, or why there is nothing; "" where all is well.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], side_px: int) -> None:
+        """Nothing is loaded yet.
+
+        Args:
+            settings: `object.masks`.
+            side_px: longer side of the photos that masks are made in.
+        """
+        self._settings, self._side_px = settings, side_px
+        self._photos: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
+        self._network: _Remembering | None = None
+        self._ask: Callable[..., Any] | None = None
+        self._busy = threading.Lock()
+        self._waiting, self._asked_at = 0, -IDLE_S
+        self.method = self.trouble = ""
+        self._closed = False
+
+    def load(self) -> None:
+        """Load the network, or GrabCut where the settings say so or there are no weights; seconds."""
+        from scenefuse.masks.grabcut_passes import ask_grabcut
+
+        settings = self._settings
+        with self._busy:
+            if self.method:
+                return
+            if settings["method"] == "sam2":
+                from scenefuse.masks.sam2 import ask_sam2, load_network
+
+                checkpoint = settings["sam2_checkpoint"]
+                encoder, decoder = Path(settings["sam2_encoder"]), Path(settings["sam2_decoder"])
+                try:
+                    network, _ = load_network(encoder, decoder, checkpoint and Path(checkpoint), threads())
+                    self._network = _Remembering(network)
+                    self._ask, self.method = partial(ask_sam2, self._network), "SAM 2"
+                    return
+                except StageError as error:
+                    self.trouble = f"Masks are shown by GrabCut, not by SAM 2 as the workflow will: {error}"
+            from scenefuse.masks.segmentation import MaskSettings
+
+            self._ask, self.method = partial(ask_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
+
+    def compute_ahead(self, wanted: Callable[[], list[Picture]]) -> None:
+        """Compute features until closed, in the order wanted; run in a thread of its own.
+
+        Only those of the first photo are computed while a person clicks.
+        """
+        self.load()
+        while not self._closed:
+            photos = wanted()[: AHEAD if self.is_idle() else 1] if self._network else []
+            missing = [p for p in photos if p.name not in self._photos]
+            if self._waiting or not missing:
+                time.sleep(0.2)
+                continue
+            with self._busy:
+                try:
+                    assert self._network is not None
+                    self._network.encode(self._pixels(missing[0]))
+                except StageError as error:
+                    print(error, flush=True)
+                    self._photos[missing[0].name] = np.zeros((1, 1, 3), dtype=np.uint8)
+
+    def is_idle(self) -> bool:
+        """Whether nobody has clicked for some seconds, so that work in the background does not make a person wait."""
+        return not self._waiting and time.monotonic() - self._asked_at > IDLE_S
+
+    def close(self) -> None:
+        """End `compute_ahead`."""
+        self._closed = True
+
+    def mask(self, picture: Picture, rows: Rows) -> tuple[Mask, list[str]]:
+        """(H, W) mask of a photo from its own clicks, at most `side_px` large, and what is wrong with it.
+
+        Raises:
+            StageError: the photo cannot be read.
+        """
+        from scenefuse.masks.carry import LEAST_AGREEMENT, LEAST_QUALITY, one_photo
+        from scenefuse.workspace import View
+
+        self.load()
+        self._waiting += 1
+        self._asked_at = time.monotonic()
+        try:
+            with self._busy:
+                pixels = self._pixels(picture)
+                height, width = pixels.shape[:2]
+                clicks = _clicks_of(picture, rows, width, height)
+                view = View(picture.name, np.eye(3), np.eye(4), width, height, pixels)
+                assert self._ask is not None
+                tolerance_px = self._settings["max_click_residual_px"]
+                mask, quality, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
+        finally:
+            self._waiting -= 1
+        notes = []
+        if left_out:
+            clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
+            notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
+        if quality < LEAST_QUALITY:
+            notes.append(f"its quality is {quality:.2f}, at least {LEAST_QUALITY} is needed: add clicks")
+        elif agreement < LEAST_AGREEMENT:
+            notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {LEAST_AGREEMENT} is needed")
+        return mask, notes
+
+    def _pixels(self, picture: Picture) -> NDArray[np.uint8]:
+        """The photo as the network sees it; always the same array while it is kept."""
+        if picture.name not in self._photos:
+            pixels = at_most(read_upright(picture.path, self._side_px), self._side_px)
+            self._photos[picture.name] = np.ascontiguousarray(pixels)
+            while len(self._photos) > KEPT:
+                self._photos.popitem(last=False)
+        return self._photos[picture.name]
+
+
+def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":
+    """The clicks of one photo, in pixels of a copy of it of another size."""
+    from scenefuse.masks.clicks import PhotoClicks
+
+    own = [row for row in rows if row.photo == picture.name]
+    scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3
+    points = [row for row in own if row.label != "box"]
+    at, box = (
+        np.clip(np.array([(row.x, row.y) for row in part]).reshape(-1, 2) * scale, 0, edge)
+        for part in (points, [row for row in own if row.label == "box"])
+    )
+    inside = np.array([row.label == "inside" for row in points], dtype=bool)
+    return PhotoClicks(at, inside, np.stack([box.min(0), box.max(0)]) if len(box) == 2 else None)

@@ -1,0 +1,136 @@
+"""What an object's tables and photos are, by the settings and results of the workflow."""
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from scenefuse.io.project import Project
+from scenefuse.pick.clicks import Kind, Sizes
+from scenefuse.pick.pictures import Picture, upright_size
+from scenefuse.sfm.frames import thin_out
+from scenefuse.sfm.photos import photo_names
+from scenefuse.stage import StageError, read_json
+
+OF_OBJECT: dict[Kind, str] = {
+    "labels": "Click each part of the object, and beside it where something like it touches it. One photo is enough to"
+    " begin with.",
+    "points": "Mark at least four points on the object that span it, each in two or more photos.",
+}
+ONLY_IF = "Needed only where the photos of object and scene share too few features. "
+OF_SCENE: dict[Kind, str] = {
+    "labels": ONLY_IF + "Click the object's ends, top and foot in one photo, and what it touches as outside.",
+    "points": ONLY_IF + "Mark at least four points that bound the object, each in two or more photos.",
+}
+
+
+@dataclass(frozen=True)
+class Source:
+    """A table that can be clicked, and the photos to click in.
+
+    Attributes:
+        column: of the table of objects.
+        title: for the page.
+        advice: what to do, by the kind of the table.
+        path: of the table, which need not exist.
+        kind: what a new table holds.
+        pictures: the photos, by name.
+        models: folders where a COLMAP model of these photos may lie, the best first.
+        listed: whether the table of objects names the path.
+        least_inside: labels: fewest clicks inside.
+    """
+
+    column: str
+    title: str
+    advice: dict[Kind, str]
+    path: Path
+    kind: Kind
+    pictures: dict[str, Picture]
+    models: tuple[Path, ...]
+    listed: bool
+    least_inside: int = 1
+
+    @property
+    def sizes(self) -> Sizes:
+        """Photo name -> (width, height)."""
+        return {name: (p.width, p.height) for name, p in self.pictures.items()}
+
+
+def sources_of(project: Project, name: str) -> list[Source]:
+    """The tables of an object: its prompts, and fiducials in the scene's photos where it has any.
+
+    Raises:
+        StageError: there is no such object, or no photos.
+    """
+    if name not in project.objects:
+        known = ", ".join(project.objects) or "none"
+        raise StageError(f"unknown object '{name}'; {project.settings['objects']} lists: {known}")
+    row, found = project.objects[name], []
+    if row.get("photos"):
+        results = Path("results/objects") / name
+        pictures = object_pictures(Path(row["photos"]), results, project.settings["object"]["frames"])
+        path, listed = _table(project, row, name, "prompts")
+        models: tuple[Path, ...] = (results / "sparse",)
+        found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed))
+    scene = project.scenes[row["scene"]]
+    if scene.get("photos"):
+        results = Path("results/scenes") / row["scene"]
+        pictures = scene_pictures(Path(scene["photos"]), results)
+        path, listed = _table(project, row, name, "fiducials")
+        models = (results / "georeferenced", results / "sparse")
+        found.append(Source("fiducials", "In the scene", OF_SCENE, path, "labels", pictures, models, listed, 3))
+    if not found:
+        raise StageError(f"object '{name}' and its scene are clouds: there are no photos to click in")
+    return found
+
+
+def object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dict[str, Picture]:
+    """The photos around an object, or the frames of its video, by the names that the workflow gives them.
+
+    Args:
+        source: folder of photos, or video.
+        results: folder of the object's results.
+        frames: settings `object.frames`.
+
+    Raises:
+        StageError: there are no photos, one cannot be read, or a video has no frames yet.
+    """
+    if source.is_file():
+        return _video_pictures(source, results)
+    names = photo_names(source)
+    chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
+    return _pictures((name.replace("/", "_"), source / name) for name in chosen)
+
+
+def scene_pictures(source: Path, results: Path) -> dict[str, Picture]:
+    """The photos of a scene by name; those that the workflow turned upright are the same to a person."""
+    return _pictures((name, source / name) for name in photo_names(source))
+
+
+def _video_pictures(video: Path, results: Path) -> dict[str, Picture]:
+    """The frames that were extracted. They may be smaller than the video's, whose pixels clicks are in."""
+    listed = results / "photos.json"
+    if not listed.is_file():
+        raise StageError(f"{video} is a video whose frames are not there yet; run: snakemake --cores 2 {listed}")
+    found = {}
+    for name, origin in read_json(listed)["origin"]["value"].items():
+        path = results / "frames" / name
+        scale = upright_size(path)[0] / origin["width"]
+        found[name] = Picture(name, path, origin["width"], origin["height"], scale)
+    return found
+
+
+def _pictures(files: Iterable[tuple[str, Path]]) -> dict[str, Picture]:
+    def picture(file: tuple[str, Path]) -> Picture:
+        return Picture(*file, *upright_size(file[1]))
+
+    with ThreadPoolExecutor(4) as pool:
+        return {found.name: found for found in pool.map(picture, files)}
+
+
+def _table(project: Project, row: dict[str, str], name: str, column: str) -> tuple[Path, bool]:
+    """The path of a table, and whether the table of objects names it; a new one lies beside that."""
+    if row.get(column):
+        return Path(row[column]), True
+    return Path(project.settings["objects"]).parent / f"{name}_{column}.tsv", False

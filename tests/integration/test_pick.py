@@ -1,0 +1,343 @@
+"""The page to click in, as a person uses it: a real server and a real browser, with mouse and keyboard."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from support.browser import chromium
+from support.user_project import Project
+
+from scenefuse.pick.pictures import Picture
+from scenefuse.sfm.fiducials import read_points
+
+ROOT = Path(__file__).resolve().parents[2]
+# The page comes from this machine, and from nowhere else.
+LOCAL = "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"
+PATIENCE_S = 60
+NAME, SIZE = "Füße und Kopf.jpg", (600, 400)
+DISC = ((250, 120), (200, 220), (300, 220))
+MASK = "img.leaflet-image-layer"
+
+
+@pytest.fixture(scope="module")
+def browser():
+    with chromium(LOCAL, "--window-size=1366,768") as window:
+        yield window
+
+
+@pytest.fixture
+def yard(tmp_path):
+    """A project with a red disc in four photos, one of them sharper than the others."""
+    project = Project(tmp_path)
+    project.photos("flight", 4)
+    (tmp_path / "close").mkdir()
+    v, u = np.mgrid[: SIZE[1], : SIZE[0]]
+    disc = (np.hypot(u - 250, v - 180) < 90)[..., None]
+    noise = np.random.default_rng(0).normal(0, 6, (SIZE[1], SIZE[0], 3))
+    pixels = (np.where(disc, [60, 50, 190], [60, 130, 70]) + noise).clip(0, 255).astype(np.uint8)
+    for k, name in enumerate((NAME, "1.jpg", "2.jpg", "3.jpg")):
+        file = cv2.imencode(".jpg", cv2.GaussianBlur(pixels, (0, 0), 3 * k) if k else pixels)[1]
+        (tmp_path / "close" / name).write_bytes(file.tobytes())
+    project.write()
+    return project
+
+
+@contextmanager
+def served(project):
+    """The address of a page of the shed."""
+    # NiceGUI would take the server for one of its own tests.
+    env = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST")}
+    command = [
+        sys.executable,
+        ROOT / "scripts/pick.py",
+        "--object",
+        "shed",
+        "--configfile",
+        "mine.yaml",
+        "--no-browser",
+    ]
+    server = subprocess.Popen(
+        command, cwd=project.path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
+    )
+    try:
+        printed = ""
+        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", printed)):
+            line = server.stdout.readline()
+            assert line, printed
+            printed += line
+        yield found[0]
+    finally:
+        server.terminate()
+        server.communicate(timeout=PATIENCE_S)
+
+
+@pytest.fixture
+def page(browser, yard):
+    with served(yard) as address:
+        yield Page(browser, yard.path, address)
+
+
+class Page:
+    """What a person does with the page, and sees."""
+
+    def __init__(self, browser, folder, address):
+        self.browser, self.path, self.address = browser, folder / "prompts.tsv", address
+        self.open()
+
+    def open(self):
+        self.browser.complaints()
+        self.browser.window.get(self.address)
+        self.until("return !!document.querySelector('.leaflet-tile-loaded');")
+
+    def until(self, script, *given):
+        end = time.monotonic() + PATIENCE_S
+        while not self.browser.value(script, *given):
+            assert time.monotonic() < end, f"never: {script}; the page says: {self.text()}"
+            time.sleep(0.05)
+
+    def text(self):
+        return self.browser.value("return document.body.innerText;")
+
+    def until_text(self, text):
+        self.until("return document.body.innerText.includes(given[0]);", text)
+
+    def point(self, x, y, width=SIZE[0], height=SIZE[1]):
+        """Where a pixel of the photo is in the window."""
+        return self.browser.value(
+            "const e = document.querySelector('.photo'), box = e.getBoundingClientRect();"
+            "const p = getElement(+e.id.slice(1)).map.latLngToContainerPoint(given);"
+            "return [Math.round(box.x + p.x), Math.round(box.y + p.y)];",
+            *Picture("", Path(), width, height).place(x, y),
+        )
+
+    def mouse(self, button=0):
+        from selenium.webdriver.common.action_chains import ActionBuilder
+        from selenium.webdriver.common.actions.pointer_input import PointerInput
+
+        return ActionBuilder(self.browser.window, mouse=PointerInput("mouse", "pointer"), duration=40)
+
+    def click(self, x, y, button=0):
+        action = self.mouse()
+        action.pointer_action.move_to_location(*self.point(x, y)).pointer_down(button=button).pointer_up(button=button)
+        action.perform()
+
+    def drag(self, start, end):
+        action, middle = self.mouse(), ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
+        action.pointer_action.move_to_location(*self.point(*start)).pointer_down()
+        action.pointer_action.move_to_location(*self.point(*middle)).move_to_location(*self.point(*end)).pointer_up()
+        action.perform()
+
+    def key(self, keys):
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.browser.window).send_keys(keys).perform()
+
+    def button(self, text):
+        for button in self.browser.window.find_elements("css selector", "button"):
+            if text in button.text:
+                button.click()
+                return
+        raise AssertionError(f"no button {text}: {self.text()}")
+
+    def marks(self, count):
+        """Wait until the badge of the shown photo counts so many clicks."""
+        shown = "document.querySelector('.thumb.here .clicks')"
+        self.until(f"const b = {shown}; return (b.offsetParent ? +b.innerText : 0) === given[0];", count)
+
+    def save(self):
+        self.key("s")
+        self.until_text("rows saved in")
+        return read_points(self.path)
+
+
+def test_clicks_give_a_mask_and_are_saved_where_they_were_made(page):
+    for place in DISC:
+        page.click(*place)
+    page.marks(3)
+    page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
+    page.key("o")
+    page.click(550, 350)
+    page.marks(4)
+    page.until_text("not saved")
+    marked = page.save()
+    assert marked.labels == ["inside"] * 3 + ["outside"] and set(marked.photos) == {NAME}
+    assert np.abs(marked.pixels - [*DISC, (550, 350)]).max() < 1
+    page.until("return !document.body.innerText.includes('not saved');")
+    assert page.browser.complaints() == []
+    asked = {re.split(r"(?<!/)/(?!/)", url)[0] for url in page.browser.requests() if not url.startswith("data:")}
+    assert asked == {page.address.split("/?")[0]}
+
+
+def test_the_mask_covers_the_disc(page):
+    for place in DISC:
+        page.click(*place)
+    page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
+    alpha = page.browser.value(
+        f"const image = document.querySelector('{MASK}'), canvas = document.createElement('canvas');"
+        "canvas.width = image.naturalWidth; canvas.height = image.naturalHeight;"
+        "const pen = canvas.getContext('2d'); pen.drawImage(image, 0, 0);"
+        "return given.map(([x, y]) => pen.getImageData(x, y, 1, 1).data[3]);",
+        *((250, 180), (180, 180), (320, 180), (500, 180), (250, 350)),
+    )
+    assert [value > 0 for value in alpha] == [True, True, True, False, False]
+
+
+def test_a_click_is_exact_to_a_pixel_when_zoomed_in(page):
+    page.browser.wheel(page.browser.find(".photo"), -300)
+    time.sleep(1)
+    page.key("+")
+    time.sleep(1)
+    page.click(300.5, 200.5)
+    page.marks(1)
+    assert np.abs(page.save().pixels - (300.5, 200.5)).max() < 0.5
+
+
+def test_undo_and_redo_by_keyboard(page):
+    page.click(*DISC[0])
+    page.click(*DISC[1])
+    page.marks(2)
+    page.key("z")
+    page.marks(1)
+    page.key("z")
+    page.marks(0)
+    page.until(f"return !document.querySelector('{MASK}');")
+    page.key("y")
+    page.marks(1)
+
+
+def test_a_right_click_removes_the_click_under_the_pointer(page):
+    page.click(*DISC[0])
+    page.click(*DISC[1])
+    page.marks(2)
+    page.click(500, 350, button=2)
+    page.click(*DISC[0], button=2)
+    page.marks(1)
+    assert np.abs(page.save().pixels - DISC[1]).max() < 1
+
+
+def test_a_box_is_dragged(page):
+    page.key("b")
+    page.until("return !!window.boxTool?._enabled;")
+    page.drag((140, 70), (360, 290))
+    page.marks(2)
+    marked = page.save()
+    assert marked.labels == ["box", "box"] and np.abs(marked.pixels - [(140, 70), (360, 290)]).max() < 1.5
+    page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
+    page.click(*DISC[0])  # and the tool is the one for clicks again
+    page.marks(3)
+
+
+def test_the_keyboard_steps_through_the_photos_sharpest_first(page):
+    names = "return [...document.querySelectorAll('.thumb .name')].map((e) => e.innerText);"
+    page.until("return !document.body.innerText.includes('Looking for the sharpest');")
+    page.until(f"const names = (() => {{ {names} }})(); return names[0] === given[0] && names[3] === '3.jpg';", NAME)
+    for key, name in (("n", "1.jpg"), ("n", "2.jpg"), ("p", "1.jpg"), ("p", NAME), ("p", "3.jpg")):
+        page.key(key)
+        page.until("return document.querySelector('.thumb.here .name').innerText === given[0];", name)
+
+
+def test_what_cannot_be_clicked_is_said(page):
+    page.click(-5, 100)
+    page.until_text("lies outside")
+    page.click(*DISC[0])
+    page.marks(1)
+    page.click(*DISC[0])
+    page.until_text("already marked inside")
+    page.marks(1)
+
+
+def test_only_outside_clicks_are_said_to_be_too_few(page):
+    page.key("o")
+    page.click(550, 350)
+    page.until_text("There are only clicks outside")
+
+
+def test_clicks_survive_a_reload_and_a_restart(page, browser, yard):
+    page.click(*DISC[0])
+    page.marks(1)
+    page.open()
+    page.marks(1)
+    page.save()
+    with served(yard) as address:
+        again = Page(browser, yard.path, address)
+        again.marks(1)
+
+
+def test_two_pages_of_one_server_show_the_same(page, browser):
+    first = browser.window.current_window_handle
+    browser.window.switch_to.new_window("tab")
+    try:
+        page.open()
+        page.click(*DISC[0])
+        page.marks(1)
+        browser.window.switch_to.window(first)
+        page.marks(1)
+    finally:
+        browser.window.switch_to.window(first)
+        for other in browser.window.window_handles:
+            if other != first:
+                browser.window.switch_to.window(other)
+                browser.window.close()
+        browser.window.switch_to.window(first)
+
+
+def test_a_file_that_someone_else_wrote_is_not_overwritten(page):
+    page.click(*DISC[0])
+    page.marks(1)
+    page.path.write_text(f"label\tphoto\tx_px\ty_px\noutside\t{NAME}\t550\t350\n")
+    page.key("s")
+    page.until_text("The file has changed")
+    page.button("Take both")
+    page.marks(2)
+    assert sorted(page.save().labels) == ["inside", "outside"]
+
+
+def test_what_an_editor_wrote_is_read_again(page):
+    page.path.write_text(f"label\tphoto\tx_px\ty_px\noutside\t{NAME}\t550\t350\n")
+    page.marks(1)
+
+
+def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
+    page.key("t")
+    page.until_text("Named points")
+    page.button("Named points")
+    page.until("return !!document.querySelector('.side input');")
+    page.browser.find(".side input").send_keys("chimney\n")
+    page.until_text("chimney · 0 photos")
+    for _ in range(2):
+        action = page.mouse()
+        action.pointer_action.move_to_location(*page.point(30, 20, 64, 48)).click()
+        action.perform()
+        page.marks(1)
+        page.key("n")
+    page.until_text("chimney · 2 photos")
+    page.path = yard.path / "clicks.tsv"
+    marked = page.save()
+    assert marked.points == ["chimney"] * 2 and len(set(marked.photos)) == 2
+    assert np.abs(marked.pixels - (30, 20)).max() < 0.5
+
+
+def test_the_page_fits_a_laptop_s_screen_and_says_what_comes_next(page):
+    wide, high = page.browser.value("return [innerWidth, innerHeight];")
+    right, low = page.browser.value(
+        "const b = document.querySelector('.side').getBoundingClientRect(); return [b.right, b.bottom];"
+    )
+    assert right <= wide and low <= high
+    assert "results/objects/shed/masks.png" in page.text()
+
+
+def test_a_dry_run_says_which_rules_a_correction_runs(page, yard):
+    (yard.path / "clicks.tsv").write_text("new")
+    page.click(*DISC[0])
+    page.marks(1)
+    page.save()
+    page.button("What will run?")
+    page.until_text("Will run:")
+    assert "make_masks" in page.text()

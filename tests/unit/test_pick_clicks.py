@@ -1,0 +1,129 @@
+"""Clicks as they are edited: what is refused, undo, and merging with another page's."""
+
+import pytest
+
+from scenefuse.pick.clicks import (
+    Click,
+    History,
+    difference,
+    merged,
+    problems,
+    with_box,
+    with_label,
+    with_point,
+    without_nearest,
+)
+from scenefuse.stage import StageError
+
+SIZES = {"a.jpg": (100, 50), "Füße 2.jpg": (100, 50)}
+HEAD = Click("inside", "a.jpg", 10, 20)
+SKY = Click("outside", "a.jpg", 90, 5)
+BOX = (Click("box", "a.jpg", 1, 2), Click("box", "a.jpg", 30, 40))
+
+
+def test_a_click_is_kept_to_a_tenth_of_a_pixel():
+    assert with_label((), "inside", "Füße 2.jpg", 10.04, 20.06, SIZES) == (Click("inside", "Füße 2.jpg", 10.0, 20.1),)
+
+
+@pytest.mark.parametrize("place", [(-0.5, 10), (10, -1), (100.5, 10), (10, 51)])
+def test_a_click_outside_the_photo_is_refused(place):
+    with pytest.raises(StageError, match="outside a.jpg, which has 100 x 50"):
+        with_label((), "inside", "a.jpg", *place, SIZES)
+
+
+@pytest.mark.parametrize("label", ["inside", "outside"])
+def test_the_same_place_twice_is_refused(label):
+    with pytest.raises(StageError, match="already marked inside"):
+        with_label((HEAD,), label, "a.jpg", 10.01, 20, SIZES)
+
+
+def test_a_box_is_cut_to_the_photo_and_takes_the_place_of_the_former_one():
+    rows = with_box((HEAD, *BOX), "a.jpg", ((120, 45), (50, -3)), SIZES)
+    assert rows == (HEAD, Click("box", "a.jpg", 50, 0), Click("box", "a.jpg", 100, 45))
+
+
+def test_a_box_beside_the_photo_is_refused():
+    with pytest.raises(StageError, match="too small"):
+        with_box((), "a.jpg", ((120, 10), (150, 40)), SIZES)
+
+
+def test_a_point_clicked_again_in_its_photo_moves():
+    rows = with_point((), "hat", "a.jpg", 1, 1, SIZES)
+    rows = with_point(with_point(rows, "boot", "a.jpg", 9, 9, SIZES), " hat ", "a.jpg", 5, 6, SIZES)
+    assert rows == (Click("hat", "a.jpg", 5, 6), Click("boot", "a.jpg", 9, 9))
+
+
+@pytest.mark.parametrize("name", ["", "  ", "a\tb", "#1"])
+def test_a_name_that_a_table_cannot_hold_is_refused(name):
+    with pytest.raises(StageError, match="needs a name"):
+        with_point((), name, "a.jpg", 1, 1, SIZES)
+
+
+def test_the_click_under_the_pointer_is_removed_and_no_other():
+    rows = (HEAD, SKY)
+    assert without_nearest(rows, "a.jpg", 12, 21, 5) == (SKY,)
+    assert without_nearest(rows, "a.jpg", 50, 40, 5) == rows
+    assert without_nearest(rows, "Füße 2.jpg", 10, 20, 5) == rows
+
+
+def test_with_a_corner_the_whole_box_is_removed():
+    assert without_nearest((HEAD, *BOX), "a.jpg", 29, 41, 5) == (HEAD,)
+
+
+def test_undo_and_redo_go_back_and_forth_until_a_new_change():
+    history = History((HEAD,))
+    history.change((HEAD, SKY))
+    history.change((HEAD, SKY))  # no change
+    assert history.undo() and history.rows == (HEAD,)
+    assert not history.undo()
+    assert history.redo() and history.rows == (HEAD, SKY)
+    assert history.undo()
+    history.change(())
+    assert not history.redo() and history.rows == ()
+
+
+def test_merging_keeps_what_both_added_and_drops_what_either_removed():
+    mine, theirs = (SKY, Click("inside", "a.jpg", 1, 1)), (HEAD, SKY, Click("inside", "a.jpg", 2, 2))
+    assert set(merged((HEAD, SKY), mine, theirs)) == {SKY, mine[1], theirs[2]}
+
+
+def test_merging_a_point_that_both_moved_keeps_one_and_it_is_mine():
+    base, mine, theirs = ((Click("hat", "a.jpg", x, 1),) for x in (1, 2, 3))
+    assert merged(base, mine, theirs) == mine
+
+
+def test_merging_a_box_that_both_drew_keeps_two_corners():
+    mine = with_box((), "a.jpg", ((1, 2), (50, 40)), SIZES)
+    assert merged((), mine, BOX) == mine
+
+
+def test_a_difference_is_said_in_numbers():
+    assert difference((HEAD,), (SKY, *BOX)) == "3 added, 1 removed"
+    assert difference((HEAD,), (HEAD,)) == "no difference"
+
+
+@pytest.mark.parametrize(
+    ("rows", "kind", "expected"),
+    [
+        ((), "labels", "Nothing is marked yet"),
+        ((SKY,), "labels", "only clicks outside"),
+        ((HEAD, BOX[0]), "labels", "has 1 corners"),
+        ((HEAD, Click("inside", "renamed.jpg", 1, 1)), "labels", "renamed.jpg is not among the photos"),
+        ((HEAD, Click("inside", "a.jpg", 300, 1)), "labels", "outside a.jpg"),
+        ((Click("hat", "a.jpg", 1, 1),), "points", "hat is marked in one photo"),
+        ((Click("hat", "a.jpg", 1, 1),), "points", "1 of at least 4 points"),
+    ],
+)
+def test_what_the_workflow_would_refuse_is_said(rows, kind, expected):
+    assert any(expected in sentence for sentence in problems(rows, kind, SIZES))
+
+
+def test_nothing_is_said_where_the_workflow_would_go_on():
+    assert problems((HEAD, SKY), "labels", SIZES) == []
+    assert problems(BOX, "labels", SIZES) == []
+    photos = [(name, photo) for name in "abcd" for photo in SIZES]
+    assert problems(tuple(Click(*p, 1, 1) for p in photos), "points", SIZES) == []
+
+
+def test_clicks_in_the_scene_have_to_be_three():
+    assert problems((HEAD, SKY), "labels", SIZES, least_inside=3) == ["1 of at least 3 clicks inside are there."]

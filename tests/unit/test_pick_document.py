@@ -1,0 +1,158 @@
+"""Tables of clicks on disk: what is read back, what others wrote, and files that cannot be read."""
+
+import pytest
+
+from scenefuse.pick.clicks import Click
+from scenefuse.pick.document import Document, FileChanged
+from scenefuse.sfm.fiducials import read_points
+from scenefuse.stage import StageError
+
+HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
+TEXT = "label\tphoto\tx_px\ty_px\n"
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "prompts.tsv"
+
+
+def names(path):
+    return sorted(file.name for file in path.parent.iterdir())
+
+
+def test_saved_clicks_are_read_back_by_the_page_and_by_the_workflow(path):
+    document = Document(path, "labels")
+    document.change((HEAD, FOOT))
+    assert document.unsaved
+    document.save()
+    assert not document.unsaved and Document(path, "labels").rows == (HEAD, FOOT)
+    marked = read_points(path)
+    assert marked.photos == ["Füße 2.jpg", "a b.jpg"] and marked.pixels.tolist() == [[10.5, 20], [3, 4]]
+    assert names(path) == ["prompts.tsv"]
+
+
+def test_a_file_of_points_is_edited_as_such_whatever_was_expected(path):
+    path.write_text("point\tphoto\tx_px\ty_px\nhat\ta.jpg\t1\t2\n")
+    document = Document(path, "labels")
+    assert document.kind == "points" and document.rows == (Click("hat", "a.jpg", 1, 2),)
+    with pytest.raises(StageError, match="remove them all"):
+        document.choose_kind("labels")
+
+
+def test_comments_survive(path):
+    path.write_text(f"# by hand\n{TEXT}inside\ta.jpg\t1\t2\n")
+    document = Document(path, "labels")
+    document.change((*document.rows, HEAD))
+    document.save()
+    assert path.read_text().startswith("# by hand\nlabel\t") and len(Document(path, "labels").rows) == 2
+
+
+@pytest.mark.parametrize(
+    "content", [b"label\tphoto\nx", TEXT.encode() + b"inside\ta.jpg\tone\t2\n", b"\xff\xfe\x00\x01"]
+)
+def test_a_corrupt_file_is_kept_beside_and_never_overwritten(path, content):
+    path.write_bytes(content)
+    document = Document(path, "labels")
+    assert document.trouble and document.rows == ()
+    assert path.read_bytes() == content
+    document.change((HEAD,))
+    assert "prompts.kept-1.tsv" in document.save()
+    assert (path.parent / "prompts.kept-1.tsv").read_bytes() == content
+    assert Document(path, "labels").rows == (HEAD,) and not document.trouble
+
+
+@pytest.mark.parametrize("content", ["", TEXT, "# nothing yet\n"])
+def test_a_file_without_rows_is_no_trouble(path, content):
+    path.write_text(content)
+    assert Document(path, "labels").trouble == ""
+
+
+def test_points_by_coordinates_cannot_be_edited_and_stay(path):
+    content = "point\tx\ty\tz\nhat\t1\t2\t3\n"
+    path.write_text(content)
+    document = Document(path, "points")
+    for action in (lambda: document.change((HEAD,)), document.save):
+        with pytest.raises(StageError, match="by their coordinates"):
+            action()
+    assert path.read_text() == content
+
+
+def test_of_two_that_save_the_second_is_told_and_nothing_is_lost(path):
+    first, second = Document(path, "labels"), Document(path, "labels")
+    first.change((HEAD,))
+    first.save()
+    second.change((FOOT,))
+    with pytest.raises(FileChanged, match="1 added"):
+        second.save()
+    assert Document(path, "labels").rows == (HEAD,)
+    second.merge()
+    assert set(second.rows) == {HEAD, FOOT}
+    second.save()
+    assert set(Document(path, "labels").rows) == {HEAD, FOOT}
+
+
+def test_keeping_the_own_clicks_sets_the_other_version_aside(path):
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    assert "prompts.kept-1.tsv" in document.keep_mine()
+    assert Document(path, "labels").rows == (HEAD,)
+    assert Document(path.parent / "prompts.kept-1.tsv", "labels").rows == (FOOT,)
+
+
+def test_a_file_that_became_unreadable_meanwhile_is_kept_too(path):
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    path.write_text("garbage")
+    with pytest.raises(FileChanged, match="no longer readable"):
+        document.save()
+    document.merge()
+    assert document.rows == (HEAD,)
+    document.save()
+    assert (path.parent / "prompts.kept-1.tsv").read_text() == "garbage"
+    assert Document(path, "labels").rows == (HEAD,)
+
+
+def test_a_file_that_was_removed_meanwhile_has_changed(path):
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    document = Document(path, "labels")
+    path.unlink()
+    assert document.changed_on_disk()
+
+
+def test_unsaved_clicks_are_taken_up_again(path):
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    document = Document(path, "labels")
+    document.change((FOOT, HEAD))
+    assert document.keep_draft() == path.parent / "prompts.unsaved.tsv"
+    again = Document(path, "labels")
+    assert again.unsaved and again.rows == (FOOT, HEAD)
+    again.save()
+    assert names(path) == ["prompts.tsv"]
+
+
+def test_what_is_saved_leaves_no_draft(path):
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    document.save()
+    assert document.keep_draft() is None and names(path) == ["prompts.tsv"]
+
+
+def test_a_link_stays_a_link(path):
+    target = path.parent / "elsewhere" / "table.tsv"
+    target.parent.mkdir()
+    target.write_text(TEXT)
+    path.symlink_to(target)
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    document.save()
+    assert path.is_symlink() and Document(target, "labels").rows == (HEAD,)
+
+
+def test_a_file_that_cannot_be_written_is_named(tmp_path):
+    document = Document(tmp_path / "prompts.tsv", "labels")
+    document.change((HEAD,))
+    (tmp_path / "prompts.tsv").mkdir()
+    with pytest.raises((StageError, FileChanged), match="prompts.tsv"):
+        document.save()
+    assert document.unsaved

@@ -1,0 +1,146 @@
+"""What the page opens for an object: its tables and photos, and the masks of its clicks."""
+
+import cv2
+import numpy as np
+import pytest
+from support.user_project import HEADER, Project
+
+from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.pick.clicks import Click
+from scenefuse.pick.next_run import as_text, command
+from scenefuse.pick.pictures import Picture
+from scenefuse.pick.segmenter import Segmenter
+from scenefuse.pick.session import Session
+from scenefuse.stage import StageError, write_json
+
+GRABCUT = {"method": "grabcut", "max_click_residual_px": 4}
+
+
+@pytest.fixture
+def yard(tmp_path, monkeypatch):
+    project = Project(tmp_path)
+    project.photos("flight")
+    project.photos("close", 5)
+    monkeypatch.chdir(tmp_path)
+    return project
+
+
+def opened(project, name="shed"):
+    return Session(name, project.write())
+
+
+def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
+    first, second = opened(yard).boards
+    assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "clicks.tsv")
+    assert list(first.source.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.source.pictures) == 3
+    assert first.source.sizes["0.jpg"] == (64, 48) and first.source.listed and first.cameras is None
+
+
+def test_without_cells_tables_lie_beside_the_table_of_objects_and_it_is_said(yard):
+    yard.objects = HEADER + "shed\tyard\tclose\t\t\t\t\n"
+    first, second = opened(yard).boards
+    assert (first.source.path.name, second.source.path.name) == ("shed_prompts.tsv", "shed_fiducials.tsv")
+    assert not first.source.listed and not second.source.listed
+
+
+def test_photos_have_the_names_that_the_workflow_gives_them(yard):
+    (yard.path / "close/ring").mkdir()
+    (yard.path / "close/0.jpg").rename(yard.path / "close/ring/0.jpg")
+    yard.config["object"] = {"frames": {"frame_step": 2}}
+    assert list(opened(yard).boards[0].source.pictures) == ["1.jpg", "3.jpg", "ring_0.jpg"]
+
+
+def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
+    (yard.path / "walk.mp4").write_bytes(b"video")
+    yard.objects = HEADER + "shed\tyard\twalk.mp4\t\tprompts.tsv\t\t\n"
+    with pytest.raises(StageError, match="snakemake --cores 2 results/objects/shed/photos.json"):
+        opened(yard)
+    frames = yard.path / "results/objects/shed/frames"
+    frames.mkdir(parents=True)
+    cv2.imwrite(str(frames / "frame_000003.jpg"), np.zeros((300, 400, 3), dtype=np.uint8))
+    origin = {"frame_000003.jpg": {"frame": 3, "width": 1600, "height": 1200}}
+    write_json(frames.parent / "photos.json", {"origin": {"value": origin, "unit": ""}})
+    picture = opened(yard).boards[0].source.pictures["frame_000003.jpg"]
+    assert (picture.width, picture.height, picture.scale) == (1600, 1200, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda p: None, "unknown object 'barn'; objects.tsv lists: shed"),
+        (lambda p: (p.path / "close/2.jpg").write_bytes(b"x"), r"close/2\.jpg cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_said_before_the_page_opens(yard, change, expected):
+    change(yard)
+    with pytest.raises(StageError, match=expected):
+        opened(yard, "barn" if "barn" in expected else "shed")
+
+
+def test_an_object_without_photos_has_nothing_to_click_in(yard):
+    yard.objects = "object\tscene\tcloud\nshed\tyard\tshed.ply\n"
+    yard.scenes = "scene\tcloud\nyard\tyard.ply\n"
+    with pytest.raises(StageError, match="no photos to click in"):
+        opened(yard)
+
+
+def test_what_was_not_saved_is_kept_when_the_page_ends(yard):
+    session = opened(yard)
+    session.boards[0].document.change((Click("inside", "0.jpg", 1, 2),))
+    assert any("prompts.unsaved.tsv" in sentence for sentence in session.close())
+    assert opened(yard).boards[0].document.unsaved
+
+
+def test_results_are_noticed_when_they_come(yard):
+    session = opened(yard)
+    assert not session.carried
+    report = {"dropped": {}, "per_photo": {"0.jpg": {"area": 0.1, "agreement": 0.8}}}
+    write_json(yard.path / "results/objects/shed/masks.json", report)
+    session.read_results()
+    assert session.carried.agreement == {"0.jpg": 0.8}
+    (yard.path / "results/objects/shed/masks.json").write_text("{")
+    assert "cannot be read" in opened(yard).boards[0].notes[0]
+
+
+@pytest.fixture
+def ball(tmp_path):
+    """A red disc on green, at 600 x 400 pixels, and its mask."""
+    v, u = np.mgrid[:400, :600]
+    mask = np.hypot(u - 250, v - 180) < 90
+    noise = np.random.default_rng(0).normal(0, 6, (400, 600, 3))
+    pixels = np.where(mask[..., None], [190, 60, 50], [70, 130, 60]) + noise
+    cv2.imwrite(str(tmp_path / "ball.png"), pixels.clip(0, 255).astype(np.uint8)[..., ::-1])
+    return Picture("ball.png", tmp_path / "ball.png", 1200, 800, 0.5), mask
+
+
+def test_clicks_give_the_mask_of_their_photo(ball):
+    picture, mask = ball
+    rows = tuple(Click("inside", "ball.png", 2 * x, 2 * y) for x, y in ((250, 120), (200, 220), (300, 220)))
+    rows += (Click("outside", "ball.png", 1100, 700), Click("inside", "other.png", 3, 3))
+    found, notes = Segmenter(GRABCUT, 600).mask(picture, rows)
+    assert found.shape == mask.shape and mask_iou(found, mask) > 0.95 and notes == []
+
+
+def test_a_box_gives_a_mask_and_a_click_that_contradicts_it_is_counted(ball):
+    picture, mask = ball
+    box = (Click("box", "ball.png", 280, 140), Click("box", "ball.png", 720, 580))
+    found, notes = Segmenter(GRABCUT, 600).mask(picture, box)
+    assert mask_iou(found, mask) > 0.95 and notes == []
+    rows = (*box, Click("inside", "ball.png", 1100, 700))
+    _, notes = Segmenter(GRABCUT, 600).mask(picture, rows)
+    assert any("1 click lies on the wrong side" in note for note in notes)
+
+
+def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path):
+    paths = {"sam2_encoder": str(tmp_path / "no.ort"), "sam2_decoder": "no.onnx", "sam2_checkpoint": None}
+    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 600)
+    segmenter.load()
+    assert segmenter.method == "GrabCut" and "no.ort do not exist" in segmenter.trouble
+
+
+def test_the_next_command_is_the_one_to_type(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = command(tmp_path / "my settings.yaml", "results/objects/shed/masks.png")
+    assert as_text(words).endswith("my settings.yaml' --cores 2 results/objects/shed/masks.png")
+    (tmp_path / "Snakefile").touch()
+    assert "--snakefile" not in command(None, "all")
