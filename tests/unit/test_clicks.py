@@ -242,7 +242,7 @@ def test_bad_clicks_are_named(tmp_path, model, photos, rows, sentence):
 
 def test_labels_are_not_fiducials(tmp_path):
     assert isinstance(read(tmp_path, [("inside", "f00.png", 5, 5)]), Labels)
-    with pytest.raises(StageError, match="holds labels, which are for prompts; mark points here"):
+    with pytest.raises(StageError, match="holds labels; mark points here"):
         locate(tmp_path / "prompts.tsv", tmp_path, 5)
 
 
