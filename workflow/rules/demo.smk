@@ -97,20 +97,29 @@ rule click_fiducials:
         " --seed {params.seed} {params.options} &> {log}"
 
 
-# Clicks in the object's own photos, which prompt the masks.
-use rule click_fiducials as click_prompts with:
+rule click_object:
+    """Click the object in one of its own photos, which prompts the masks: three spots and a box, some pixels off."""
     input:
         "results/demo/{scene}/truth/{object}",
     output:
         "results/demo/{scene}/{object}/prompts.tsv",
     log:
-        "results/logs/click_prompts/{scene}-{object}.log",
+        "results/logs/click_object/{scene}-{object}.log",
     benchmark:
-        "results/benchmarks/click_prompts/{scene}-{object}.tsv"
+        "results/benchmarks/click_object/{scene}-{object}.tsv"
+    wildcard_constraints:
+        object=DEMO_OBJECTS,
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=10,
     params:
         options=flags(config["demo"]["prompts"]),
         seed=config["seed"],
-        script=script("demo/click_points.py"),
-        code=code("demo/click_points.py"),
+        script=script("demo/click_object.py"),
+        code=code("demo/click_object.py"),
     message:
-        "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
+        "Demo {wildcards.scene}: clicking the {wildcards.object} in one of its photos"
+    shell:
+        "exec python {params.script} --truth {input} --clicks {output} --seed {params.seed} {params.options} &> {log}"
