@@ -12,6 +12,7 @@ from scenefuse.masks.grabcut import (
     fill_hull,
     first_trimap,
     grabcut,
+    grow_seeds,
     learn_colours,
     prefer_colour,
     second_trimap,
@@ -24,6 +25,8 @@ from scenefuse.workspace import Rows, View, Workspace
 
 FIRST_ROUNDS = 4
 """Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one."""
+PATHS_WIDTH_PX = 320
+"""Seeds grow along paths in photos at most this wide."""
 REFERENCE_WIDTH_PX = 640
 """Photo width that `band_px` is meant for."""
 SEED_RADIUS = 0.003
@@ -48,6 +51,8 @@ def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mappin
         outline, spanning = target.outline(view), view.project(target.spanning)[0]
         trimaps.append(first_trimap((view.height, view.width), outline, spanning))
         stamp(trimaps[-1], target, view, seen, seen_at, clicked.get(k))
+        if clicked:
+            grow_seeds(view.pixels, trimaps[-1], PATHS_WIDTH_PX)
     images = [view.pixels for view in photos.views]
     colours = learn_colours(images, [t == cv2.GC_FGD for t in trimaps], [t == cv2.GC_BGD for t in trimaps])
     masks = []
@@ -77,6 +82,7 @@ def ask_grabcut(
     elif len(on) >= 3:
         fill_hull(trimap, on, cv2.GC_PR_FGD)
     _discs(trimap, off, on, SEED_RADIUS * view.width)
+    grow_seeds(view.pixels, trimap, PATHS_WIDTH_PX)
     mask = cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS))
     return [mask], np.array([float(mask.any() and not mask.all())])
 

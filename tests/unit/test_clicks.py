@@ -2,13 +2,14 @@
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
 
 from scenefuse.masks.carry import carry
 from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
-from scenefuse.masks.grabcut import along_edges
+from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.sam2 import ask_sam2
@@ -245,6 +246,26 @@ def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, pho
     # Its quality is low, so it is segmented again in the end; the second answer has the same part in the corner.
     assert [name for name, *_ in network.told].count("f06.png") == 3
     assert not found.masks[6][:8, :8].any() and mask_iou(found.masks[6], true_mask(photos.views[6])) > 0.95
+
+
+def test_a_part_with_the_background_s_colour_is_found_from_a_click_by_the_edge_around_it():
+    pixels = np.full((120, 160, 3), (120, 100, 80), np.uint8)
+    pixels[20:60, 50:110] = (200, 60, 50)
+    basket = np.zeros((120, 160), bool)
+    basket[64:84, 70:92] = True
+    pixels[62:86, 68:94] = (30, 25, 20)
+    pixels[basket] = (120, 100, 80)
+    trimap = np.full((120, 160), cv2.GC_PR_BGD, np.uint8)
+    trimap[:10], trimap[95:] = cv2.GC_BGD, cv2.GC_BGD
+    for x, y in ((80, 40), (81, 74)):
+        cv2.circle(trimap, (x, y), 2, cv2.GC_FGD, -1)
+    grow_seeds(pixels, trimap, 160)
+    sure = trimap == cv2.GC_FGD
+    assert sure[basket].mean() > 0.9 and sure[22:58, 52:108].mean() > 0.95
+    assert not sure[:, :45].any() and not sure[:, 115:].any() and not sure[86:].any()
+    alone = np.full((120, 160), cv2.GC_PR_BGD, np.uint8)
+    grow_seeds(pixels, alone, 160)
+    assert (alone == cv2.GC_PR_BGD).all()
 
 
 def test_a_coarse_mask_is_moved_to_the_edges_of_its_photo_and_no_farther():
