@@ -192,7 +192,8 @@ def _shares(photos: Workspace, made: dict[int, _Voter]) -> Array:
 
 
 def _known(photos: Workspace, k: int, others: dict[int, _Voter]) -> tuple[Array, Array]:
-    """Pixels (N, 2) of a photo's points on the object and (M, 2) of those off it, by the votes of the others."""
+    """Pixels (N, 2) of a photo's points on the object and (M, 2) of those off it, by the votes of the others; those
+    clicked in the others, where this photo has them in its frame: what hides them is mostly the object."""
     share = _shares(photos, others)[photos.seen[k]]
     known = (share >= SURE) | (share <= 1 - SURE)
     pixels, own = photos.seen_at[k][known], share[known] >= SURE
@@ -200,7 +201,10 @@ def _known(photos: Workspace, k: int, others: dict[int, _Voter]) -> tuple[Array,
         near = cKDTree(pixels).query(pixels, NEIGHBOURS + 1)[1][:, 1:]
         agree = (own[near] == own[:, None]).mean(1) > 0.5
         pixels, own = pixels[agree], own[agree]
-    return pixels[own], pixels[~own]
+    view, clicked = photos.views[k], [voter.clicks.placed for voter in others.values() if voter.votes]
+    points = np.concatenate([np.zeros((0, 3)), *clicked])
+    shown = view.project(points[view.visible(points)[0]])[0]
+    return np.concatenate([shown, pixels[own]]), pixels[~own]
 
 
 def _agreement(photos: Workspace, k: int, mask: Mask, others: dict[int, _Voter]) -> float:

@@ -21,11 +21,13 @@ class PhotoClicks:
         pixels: (N, 2) of the undistorted photo.
         inside: (N,) True on the object, False off it.
         box: (2, 2) corners of a box around the object, upper left first; None where there is none.
+        points: (N, 3) what was clicked on, in the object's frame, NaN where unknown; None before it is looked for.
     """
 
     pixels: Array
     inside: NDArray[np.bool_]
     box: Array | None = None
+    points: Array | None = None
 
     @property
     def on(self) -> Array:
@@ -38,13 +40,21 @@ class PhotoClicks:
         return self.pixels[~self.inside]
 
     @property
+    def placed(self) -> Array:
+        """(K, 3) the known points that were clicked inside."""
+        if self.points is None:
+            return np.zeros((0, 3))
+        return self.points[self.inside & np.isfinite(self.points).all(axis=1)]
+
+    @property
     def prompt(self) -> bool:
         """Whether they say where the object is: one inside, or a box."""
         return bool(self.inside.any()) or self.box is not None
 
     def only(self, keep: NDArray[np.bool_]) -> "PhotoClicks":
         """The clicks of the rows (N,) to keep, and the box."""
-        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep])
+        points = None if self.points is None else self.points[keep]
+        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points)
 
 
 def clicks_per_photo(

@@ -14,6 +14,8 @@ from scenefuse.mvs.visual_hull import Mask
 
 Trimap = NDArray[np.uint8]
 COLOUR_BINS = 32
+EDGE_WIDTH_PX = 1024
+"""Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each."""
 STEP_BLUR_PX, STEP_PX = 0.7, 0.15
 """Paths between pixels: the picture is smoothed by this, and a step costs as much as this change of Lab."""
 GROWN_SHARE = 0.7
@@ -162,7 +164,7 @@ def grow_seeds(image: NDArray[np.uint8], trimap: Trimap, width_px: int) -> None:
     away = []
     for side in sides:
         # Areas: a disc of one pixel must not get lost.
-        small = cv2.resize(side.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.25
+        small = cv2.resize(side.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0
         paths = dijkstra(graph, directed=False, indices=np.flatnonzero(small), min_only=True) if small.any() else np.inf
         away.append(np.broadcast_to(paths, size[0] * size[1]).reshape(size[1], size[0]))
     with np.errstate(invalid="ignore"):
@@ -227,7 +229,7 @@ def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
     inner, outer = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
     trimap = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[inner > band_px], trimap[outer > band_px] = cv2.GC_FGD, cv2.GC_BGD
-    return grabcut(image, trimap, image.shape[1], 1) if mask.any() else mask
+    return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask
 
 
 def cleaned(mask: Mask, smallest_share: float = 0.02) -> Mask:

@@ -1,13 +1,14 @@
 """Masks from prompts: points triangulated from several photos, or clicks in one, carried on to the others."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from scenefuse.masks.carry import Ask, carry, prompted_parts
+from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
@@ -69,12 +70,14 @@ def masks_from_prompts(
         StageError: the prompts are wrong or too few, or lead to no mask.
     """
     if isinstance(marked, Labels):
-        clicked = clicks_per_photo(marked, sparse, photos.views, sizes)
+        clicked = with_depth(photos, clicks_per_photo(marked, sparse, photos.views, sizes))
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
         carried = carry(ask, photos, clicked, settings.max_click_residual_px)
         target = target_from_votes(carried.kind, photos, up, seed)
+        placed = [clicks.placed for clicks in carried.clicked.values()]
+        target = replace(target, spanning=np.concatenate([*placed, target.spanning]))
         if network:
             masks = segment_again(network, target, carried.masks, photos, settings, carried.clicked)
         else:

@@ -1,13 +1,16 @@
 """Masks from clicks in one photo: a planted ball, sparse points on it and around it, photos on a circle."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
 import pytest
+from support.photographed_plane import photographs
 
 from scenefuse.masks.carry import carry
+from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
@@ -246,6 +249,38 @@ def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, pho
     # Its quality is low, so it is segmented again in the end; the second answer has the same part in the corner.
     assert [name for name, *_ in network.told].count("f06.png") == 3
     assert not found.masks[6][:8, :8].any() and mask_iou(found.masks[6], true_mask(photos.views[6])) > 0.95
+
+
+def test_a_click_has_the_depth_at_which_the_other_photos_show_the_same():
+    views = [replace(view, pixels=np.dstack([view.pixels] * 3)) for view in photographs(12, 4.0)]
+    sparse = np.random.default_rng(0).uniform([-2, -2, -0.5], [2, 2, 0.5], (300, 3))
+    rows = [view.visible(sparse)[0] for view in views]
+    painted = Workspace(Path(), views, sparse, rows, [v.project(sparse[r])[0] for v, r in zip(views, rows)])
+    blank = views[0].project(np.array([[2.2, 0.0, 0.0]]))[0][0]
+    told = clicks([(160.0, 160.0), (200.5, 120.0), blank], [(90.0, 200.0)])
+    placed = with_depth(painted, {0: told})[0]
+    assert np.isfinite(placed.points).all(axis=1).tolist() == [True, True, False, True]
+    assert np.abs(placed.points[[0, 1, 3], 2]).max() < 0.03
+    np.testing.assert_allclose(views[0].project(placed.points[:2])[0], told.pixels[:2], atol=0.1)
+    assert len(placed.placed) == 2 and len(placed.only(np.array([True, False, False, False])).placed) == 1
+
+
+def test_what_was_clicked_in_one_photo_prompts_the_others_though_no_sparse_point_is_there(photos):
+    told = {}
+
+    def ask(view, inside, outside, box):
+        told[view.name] = inside[1]
+        return [true_mask(view)], np.ones(1)
+
+    top = np.array([[0.0, 0, 0.8]])
+    marked = replace(
+        clicks([MIDDLE, tuple(photos.views[3].project(top)[0][0])]), points=np.vstack([[[np.nan] * 3], top])
+    )
+    carry(ask, photos, {3: marked}, 2)
+    for k in (0, 6, 9):
+        here = photos.views[k].project(top)[0][0]
+        assert np.abs(told[f"f{k:02}.png"] - here).max(axis=1).min() < 1e-9
+    assert not len(told["f03.png"])
 
 
 def test_a_part_with_the_background_s_colour_is_found_from_a_click_by_the_edge_around_it():
