@@ -1,7 +1,7 @@
 """Masks from prompts: points triangulated from several photos, or clicks in one, carried on to the others."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -75,9 +75,8 @@ def masks_from_prompts(
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
         carried = carry(ask, photos, clicked, settings.max_click_residual_px)
-        target = target_from_votes(carried.kind, photos, up, seed)
-        placed = [clicks.placed for clicks in carried.clicked.values()]
-        target = replace(target, spanning=np.concatenate([*placed, target.spanning]))
+        placed = [np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())]
+        target = target_from_votes(carried.kind, photos, up, seed, np.concatenate(placed))
         if network:
             masks = segment_again(network, target, carried.masks, photos, settings, carried.clicked)
         else:
