@@ -16,6 +16,7 @@ from typing import Any, Literal
 from scenefuse.demo.bodies import Kind
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
+from scenefuse.demo.prompts import PromptSettings
 from scenefuse.depth.refine_depth import FeedbackSettings
 from scenefuse.depth.train_depth import DepthTrainingSettings
 from scenefuse.fusion.modes import FusionSettings
@@ -110,6 +111,7 @@ SECTIONS: dict[str, list[Any]] = {
     "demo.orbit": [OrbitSettings()],
     "demo.fiducials": [ClickSettings()],
     "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
+    "demo.clicks": [PromptSettings(inside=3, box=True)],
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings(max_features=3000, first_octave=0, camera_mode="auto")],
     "scene.matches": [MatchSettings()],

@@ -49,23 +49,26 @@ class Carried:
         reasons: why a photo's mask is not good enough, by the photo's name.
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
         left_out: the clicks that contradict their mask, a sentence each.
+        clicked: the others, by row of the photo.
     """
 
     masks: list[Mask]
     reasons: dict[str, str]
     kind: NDArray[np.int8]
     left_out: list[str]
+    clicked: dict[int, PhotoClicks]
 
 
 @dataclass
 class _Voter:
-    """A photo's mask, its weight, and what it says of the sparse points that the photo sees."""
+    """A photo's mask, the clicks that it agrees with, and what it says of the sparse points that the photo sees."""
 
     mask: Mask
     quality: float
     agreement: float
     rows: NDArray[np.int64]
     inside: NDArray[np.bool_]
+    clicks: PhotoClicks
 
     @property
     def votes(self) -> bool:
@@ -97,9 +100,7 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
         known = [int((shares[photos.seen[k]] >= SURE).sum()) for k in left]
         k = left[int(np.argmax(known))]
         if max(known) < LEAST_KNOWN:
-            own = [
-                row for row in left if row in clicked and (clicked[row].inside.any() or clicked[row].box is not None)
-            ]
+            own = [row for row in left if row in clicked and clicked[row].prompt]
             if not own:
                 break
             k = max(own, key=lambda row: len(clicked[row].pixels))
@@ -133,13 +134,13 @@ def _make(
     inside, outside = _known(photos, k, others)
     keep, view = np.ones(len(clicks.pixels), dtype=bool), photos.views[k]
     notes: list[str] = []
-    voter = _voter(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0)
+    voter = _voter(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0, NO_CLICKS)
     for _ in range(2):
-        on, off = clicks.pixels[keep & clicks.inside], clicks.pixels[keep & ~clicks.inside]
-        if len(inside) < LEAST_KNOWN and not len(on) and clicks.box is None:
+        kept = clicks.only(keep)
+        if len(inside) < LEAST_KNOWN and not kept.prompt:
             break
-        found = _asked(ask, view, (on, inside), (off, outside), clicks.box, tolerance_px)
-        voter = _voter(photos, k, *found)
+        found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px)
+        voter = _voter(photos, k, *found, kept)
         x, y = _pixel(clicks.pixels, voter.mask)
         miss = np.where(clicks.inside, _distance(voter.mask)[y, x], _distance(~voter.mask)[y, x])
         wrong = keep & (miss > tolerance_px)
@@ -165,7 +166,7 @@ def _asked(
     """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement."""
     masks, quality = ask(view, inside, outside, box)
     on, off = np.concatenate(inside), np.concatenate(outside)
-    masks = [_prompted_parts(cleaned(mask), on, off) for mask in masks]
+    masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
     agreement = []
     for mask in masks:
         held = np.concatenate([_held(mask, inside[0], tolerance_px), _held(mask, inside[1], 0)])
@@ -181,11 +182,11 @@ def _held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:
     return mask[v, u] if tolerance_px == 0 or not len(pixels) else _distance(mask)[v, u] <= tolerance_px
 
 
-def _voter(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float) -> _Voter:
+def _voter(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float, clicks: PhotoClicks) -> _Voter:
     """What a photo's mask says of the points that the photo sees, but for those next to its outline."""
     u, v = _pixel(photos.seen_at[k], mask)
     sure = (_distance(mask) + _distance(~mask))[v, u] > EDGE * max(mask.shape)
-    return _Voter(mask, quality, agreement, photos.seen[k][sure], mask[v, u][sure])
+    return _Voter(mask, quality, agreement, photos.seen[k][sure], mask[v, u][sure], clicks)
 
 
 def _shares(photos: Workspace, made: dict[int, _Voter]) -> Array:
@@ -200,7 +201,8 @@ def _shares(photos: Workspace, made: dict[int, _Voter]) -> Array:
 
 
 def _known(photos: Workspace, k: int, others: dict[int, _Voter]) -> tuple[Array, Array]:
-    """Pixels (N, 2) of a photo's points on the object and (M, 2) of those off it, by the votes of the others."""
+    """Pixels (N, 2) of a photo's points on the object and (M, 2) of those off it, by the votes of the others; those
+    clicked in the others, where this photo has them in its frame: what hides them is mostly the object."""
     share = _shares(photos, others)[photos.seen[k]]
     known = (share >= SURE) | (share <= 1 - SURE)
     pixels, own = photos.seen_at[k][known], share[known] >= SURE
@@ -208,7 +210,10 @@ def _known(photos: Workspace, k: int, others: dict[int, _Voter]) -> tuple[Array,
         near = cKDTree(pixels).query(pixels, NEIGHBOURS + 1)[1][:, 1:]
         agree = (own[near] == own[:, None]).mean(1) > 0.5
         pixels, own = pixels[agree], own[agree]
-    return pixels[own], pixels[~own]
+    view, clicked = photos.views[k], [voter.clicks.placed for voter in others.values() if voter.votes]
+    points = np.concatenate([np.zeros((0, 3)), *clicked])
+    shown = view.project(points[view.visible(points)[0]])[0]
+    return np.concatenate([shown, pixels[own]]), pixels[~own]
 
 
 def _agreement(photos: Workspace, k: int, mask: Mask, others: dict[int, _Voter]) -> float:
@@ -233,8 +238,9 @@ def _distance(mask: Mask) -> Array:
     return ndimage.distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, float(max(mask.shape)))
 
 
-def _prompted_parts(mask: Mask, inside: Array, outside: Array) -> Mask:
-    """The connected parts of a mask that hold a prompt inside, and not as many outside."""
+def prompted_parts(mask: Mask, inside: Array, outside: Array) -> Mask:
+    """The connected parts of a mask (H, W) that hold one of (N, 2) pixels inside, and not as many of (M, 2) outside;
+    all of it where no pixel inside is known."""
     labels, count = ndimage.label(mask)
     if not count or not len(inside):
         return mask
@@ -269,4 +275,6 @@ def _carried(photos: Workspace, made: dict[int, _Voter], left_out: list[str]) ->
     counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
     kind = np.where(shares >= SURE, 1, np.where(shares <= 1 - SURE, -1, 0)).astype(np.int8)
     kind[counts < 3] = 0
-    return Carried(masks, reasons, kind, left_out)
+    return Carried(
+        masks, reasons, kind, left_out, {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
+    )

@@ -1,10 +1,11 @@
 """Clicks that say what is the object in single photos: inside, outside, or the corners of a box."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.sfm.fiducials import Labels
 from scenefuse.stage import StageError
@@ -20,11 +21,40 @@ class PhotoClicks:
         pixels: (N, 2) of the undistorted photo.
         inside: (N,) True on the object, False off it.
         box: (2, 2) corners of a box around the object, upper left first; None where there is none.
+        points: (N, 3) what was clicked on, in the object's frame, NaN where unknown; None before it is looked for.
     """
 
     pixels: Array
-    inside: np.ndarray
+    inside: NDArray[np.bool_]
     box: Array | None = None
+    points: Array | None = None
+
+    @property
+    def on(self) -> Array:
+        """(N, 2) pixels clicked inside."""
+        return self.pixels[self.inside]
+
+    @property
+    def off(self) -> Array:
+        """(N, 2) pixels clicked outside."""
+        return self.pixels[~self.inside]
+
+    @property
+    def placed(self) -> Array:
+        """(K, 3) the known points that were clicked inside."""
+        if self.points is None:
+            return np.zeros((0, 3))
+        return self.points[self.inside & np.isfinite(self.points).all(axis=1)]
+
+    @property
+    def prompt(self) -> bool:
+        """Whether they say where the object is: one inside, or a box."""
+        return bool(self.inside.any()) or self.box is not None
+
+    def only(self, keep: NDArray[np.bool_]) -> "PhotoClicks":
+        """The clicks of the rows (N,) to keep, and the box."""
+        points = None if self.points is None else self.points[keep]
+        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points)
 
 
 def clicks_per_photo(
@@ -73,7 +103,7 @@ def clicks_per_photo(
             )
         found.setdefault(rows[photo], []).append((label, undistorted))
     clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
-    if not any(c.inside.any() or c.box is not None for c in clicked.values()):
+    if not any(clicks.prompt for clicks in clicked.values()):
         raise StageError(f"{labels.path} holds only clicks outside the object; add a few inside it, or a box around it")
     return clicked
 

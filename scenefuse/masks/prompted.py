@@ -5,8 +5,11 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from scenefuse.masks.carry import Ask, carry
-from scenefuse.masks.clicks import clicks_per_photo
+import numpy as np
+
+from scenefuse.masks.carry import Ask, carry, prompted_parts
+from scenefuse.masks.click_depth import with_depth
+from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
@@ -19,6 +22,9 @@ from scenefuse.workspace import Workspace, read_model
 
 LEAST_POINTS = 3
 """Prompts that span an object."""
+CARRIED_WIDTHS = 2
+"""GrabCut carries masks on at photos so many times as wide as those of its first cut: what one mask lacks is missing
+from the next."""
 
 
 @dataclass(frozen=True)
@@ -64,20 +70,35 @@ def masks_from_prompts(
         StageError: the prompts are wrong or too few, or lead to no mask.
     """
     if isinstance(marked, Labels):
-        clicked = clicks_per_photo(marked, sparse, photos.views, sizes)
-        ask: Ask = partial(ask_sam2, network) if network else partial(ask_grabcut, settings.grabcut_width_px)
+        clicked = with_depth(photos, clicks_per_photo(marked, sparse, photos.views, sizes))
+        ask: Ask = (
+            partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
+        )
         carried = carry(ask, photos, clicked, settings.max_click_residual_px)
-        target = target_from_votes(carried.kind, photos, up, seed)
+        placed = [np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())]
+        target = target_from_votes(carried.kind, photos, up, seed, np.concatenate(placed))
         if network:
-            masks = segment_again(network, target, carried.masks, photos, settings)
+            masks = segment_again(network, target, carried.masks, photos, settings, carried.clicked)
         else:
-            masks = segment_by_grabcut(target, photos, settings)
+            masks = segment_by_grabcut(target, photos, settings, carried.clicked)
+        masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
         return Prompted(masks, target, carried.reasons, carried.left_out)
     points, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = target_from_points(points, photos, up, seed)
     if network:
         return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out)
     return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out)
+
+
+def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: PhotoClicks | None) -> Mask:
+    """The parts of a photo's mask that hold a click, or a sparse point that is the object's: seen, or hidden by it."""
+    at, kind = photos.seen_at[k], target.kind[photos.seen[k]]
+    hidden, depth = photos.views[k].project(target.spanning)
+    shown = (depth > 0) & (hidden >= 0).all(1) & (hidden < mask.shape[::-1]).all(1)
+    on, off = [at[kind > 0], hidden[shown]], [at[kind < 0]]
+    if clicks is not None:
+        on, off = [*on, clicks.on], [*off, clicks.off]
+    return prompted_parts(mask, np.concatenate(on), np.concatenate(off))
 
 
 def _points(

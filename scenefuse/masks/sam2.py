@@ -10,6 +10,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
+from scenefuse.masks.clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
 from scenefuse.masks.target import Target, far_apart
@@ -169,7 +170,7 @@ def _enlarged(logits: NDArray[np.float32], size: tuple[int, int]) -> list[Mask]:
     return [cv2.resize(m.astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR) > 0 for m in logits]
 
 
-def segment(network: Sam2, target: Target, view: View, outline: Mask | None) -> Mask:
+def segment(network: Sam2, target: Target, view: View, outline: Mask | None, clicks: PhotoClicks | None = None) -> Mask:
     """The object in one photo, prompted by all points, as this photo sees them, and the box around them.
 
     A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
@@ -180,6 +181,7 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None) -> 
         view: the photo, with RGB pixels.
         outline: (H, W) the visual hull of the other photos' masks; then the box is its own, and the mask most like it
             is taken. The network does not see it: it would only give it back.
+        clicks: made in this photo, if any; they prompt it too.
 
     Returns:
         (H, W), of the network's masks the one with most points in it and the best quality, or the most like the
@@ -195,8 +197,11 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None) -> 
     low, high = spanned.min(0), spanned.max(0)
     grow = BOX_GROWTH * (high - low).max()
     box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
-    found, quality = network.masks(network.encode(view.pixels), size, pixels[inside], box)
-    u, v = pixels[inside].astype(int).T
+    on, off = pixels[inside], NONE
+    if clicks is not None:
+        on, off, box = np.concatenate([clicks.on, on]), clicks.off, box if clicks.box is None else clicks.box
+    found, quality = network.masks(network.encode(view.pixels), size, on, box, off)
+    u, v = on.astype(int).T
     if outline is not None:
         quality = np.array([mask_iou(m, outline) for m in found])
     return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))])

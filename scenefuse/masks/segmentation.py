@@ -1,10 +1,13 @@
 """Masks of all photos of an object by GrabCut or SAM 2, and their agreement with the visual hull of all of them."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+from scenefuse.masks.clicks import PhotoClicks
+from scenefuse.masks.grabcut import along_edges, cleaned
 from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
-from scenefuse.masks.sam2 import Sam2, segment
+from scenefuse.masks.sam2 import LOGITS_PX, Sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target
 from scenefuse.mvs.visual_hull import Hull, Mask, carve, mask_iou, silhouette
@@ -15,6 +18,9 @@ HULL_TOLERANCE = 0.1
 """Share of the photos that may contradict a voxel of the hull: some masks are wrong somewhere."""
 FIRST_TOLERANCE = 2 * HULL_TOLERANCE
 """The same for the first masks, which are made photo by photo."""
+EDGE_LOGITS = 1.0
+"""The network's masks are moved to edges of the photo this near, in pixels of the 256 x 256 that it decides on."""
+NOTHING: Mapping[int, PhotoClicks] = {}
 TRUST_TOLERANCE = 0.34
 """The same for the hull that tells which masks count for the final one: a third of them may be wrong all over."""
 
@@ -69,12 +75,17 @@ class ScoredMasks:
     hull: Hull
 
 
-def segment_by_grabcut(target: Target, photos: Workspace, settings: MaskSettings) -> list[Mask]:
-    """GrabCut photo by photo, then twice more along the visual hull: masks (H, W) of V views with RGB pixels."""
-    masks = first_cuts(target, photos, settings.grabcut_width_px)
+def segment_by_grabcut(
+    target: Target, photos: Workspace, settings: MaskSettings, clicked: Mapping[int, PhotoClicks] = NOTHING
+) -> list[Mask]:
+    """GrabCut photo by photo, then twice more along the visual hull: masks (H, W) of V views with RGB pixels.
+
+    Clicks, by row of the photo, are certain in their own photo.
+    """
+    masks = first_cuts(target, photos, settings.grabcut_width_px, clicked)
     for tolerance in (FIRST_TOLERANCE, HULL_TOLERANCE):
         hull = carve_trusted(target, photos.views, masks, settings, tolerance)
-        masks = second_cuts(target, masks, photos, hull, settings.band_px)
+        masks = second_cuts(target, masks, photos, hull, settings.band_px, clicked)
     return masks
 
 
@@ -85,19 +96,28 @@ def segment_by_sam2(network: Sam2, target: Target, photos: Workspace, settings: 
 
 
 def segment_again(
-    network: Sam2, target: Target, masks: list[Mask], photos: Workspace, settings: MaskSettings
+    network: Sam2,
+    target: Target,
+    masks: list[Mask],
+    photos: Workspace,
+    settings: MaskSettings,
+    clicked: Mapping[int, PhotoClicks] = NOTHING,
 ) -> list[Mask]:
-    """SAM 2 once more, with the visual hull's box, where one of the masks (H, W) disagrees with the hull."""
+    """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
+    with the hull; then all of them at the photo's resolution."""
     masks = list(masks)
     hull = carve_trusted(target, photos.views, masks, settings, FIRST_TOLERANCE)
     for k, view in enumerate(photos.views):
         outline = silhouette(hull, view)
         if mask_iou(masks[k], outline) < settings.min_agreement:
-            again = segment(network, target, view, outline)
+            again = segment(network, target, view, outline, clicked.get(k))
             if mask_iou(again, outline) > mask_iou(masks[k], outline):
                 masks[k] = again
             print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
-    return masks
+    return [
+        cleaned(along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX))
+        for view, mask in zip(photos.views, masks)
+    ]
 
 
 def score_masks(masks: list[Mask], target: Target, views: list[View], settings: MaskSettings) -> ScoredMasks:

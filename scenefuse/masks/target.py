@@ -22,6 +22,7 @@ PART_EDGE = 0.12
 the corners of a small part."""
 MOST_SPANNING = 64
 """Sparse points, far apart, that stand for the object where masks voted for thousands."""
+NOTHING_CLICKED = np.zeros((0, 3))
 LEAST_OWN = 10
 """Sparse points on the object that supplied masks have to hold: fewer do not tell its extent."""
 
@@ -87,8 +88,11 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
     return Target(box, ground, found, points, grow, _parts(points, PART_EDGE * box.diagonal), sparse, kind)
 
 
-def target_from_votes(kind: NDArray[np.int8], photos: Workspace, up: Array, seed: int) -> Target:
-    """Where the object is, by the sparse points that the photos' masks vote for: those whose kind (P,) is 1.
+def target_from_votes(
+    kind: NDArray[np.int8], photos: Workspace, up: Array, seed: int, clicked: Array = NOTHING_CLICKED
+) -> Target:
+    """Where the object is, by the sparse points that the photos' masks vote for, those whose kind (P,) is 1, and by the
+    points (N, 3) that were clicked.
 
     What these points do not decide is decided as in `target_from_points`, whose other arguments they are: a vote
     against a point says less, as a part of the object that one mask lacks is missing from the next ones too.
@@ -102,8 +106,8 @@ def target_from_votes(kind: NDArray[np.int8], photos: Workspace, up: Array, seed
             f"only {len(own)} sparse points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
             " a photo that shows more of the object, or in several"
         )
-    target = target_from_points(_without_outermost(own, up), photos, up, seed)
-    spanning = far_apart(np.empty((0, 3)), target.spanning, MOST_SPANNING)
+    target = target_from_points(np.concatenate([clicked, _without_outermost(own, up)]), photos, up, seed)
+    spanning = far_apart(clicked, target.spanning, MOST_SPANNING)
     return replace(
         target,
         spanning=spanning,

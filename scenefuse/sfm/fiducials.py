@@ -84,8 +84,8 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     header = [cell.strip() for cell in rows[0][1]] if rows else []
     if header not in (CLICK_COLUMNS, POINT_COLUMNS, LABEL_COLUMNS):
         raise StageError(
-            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' (or, for "
-            f"prompts, 'label photo x_px y_px'), not with '{' '.join(header)}'"
+            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
+            f"'label photo x_px y_px', not with '{' '.join(header)}'"
         )
     if len(rows) == 1:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
@@ -230,7 +230,7 @@ def locate(
     if isinstance(marked, ScenePoints):
         return marked.points, marked.positions, np.zeros(len(marked.points))
     if isinstance(marked, Labels):
-        raise StageError(f"{path} holds labels, which are for prompts; mark points here ('point photo x_px y_px')")
+        raise StageError(f"{path} holds labels; mark points here ('point photo x_px y_px')")
     return triangulate(marked, read_model(model), max_residual_px, sizes)
 
 

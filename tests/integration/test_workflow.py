@@ -47,12 +47,17 @@ def test_the_house_is_registered_where_it_is(finished):
     assert truth["translation_error_over_diagonal"]["value"] <= 0.02
 
 
-def test_masks_find_the_house_in_the_scene_without_clicks(finished):
-    full, by_masks = (
-        np.array(decision(finished, variant)["scene_from_object"]["value"]) for variant in ("full", "by_masks")
+def test_masks_find_the_house_in_the_scene_where_fiducials_do(finished):
+    full, by_fiducials = (
+        np.array(decision(finished, variant)["scene_from_object"]["value"]) for variant in ("full", "by_fiducials")
     )
-    assert decision(finished, "by_masks")["status"]["value"] == "registered"
-    assert np.linalg.norm(full[:3, 3] - by_masks[:3, 3]) < 0.1  # metres
+    crops = [
+        json.loads((finished / f"results/objects/house/registration/{variant}/crop.json").read_text())["mode"]["value"]
+        for variant in ("full", "by_fiducials")
+    ]
+    assert crops == ["masks", "fiducials"]
+    assert decision(finished, "by_fiducials")["status"]["value"] == "registered"
+    assert np.linalg.norm(full[:3, 3] - by_fiducials[:3, 3]) < 0.1  # metres
 
 
 def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(finished):

@@ -19,7 +19,7 @@ from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 Z = np.array([0.0, 0.0, 1.0])
-SETTINGS, BY_MASKS = CropSettings(), CropSettings(mode="masks")
+SETTINGS = CropSettings()
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.15])
@@ -259,7 +259,7 @@ def test_stage_crops_by_masks_as_by_clicks(orbit, tmp_path):
     crop_scene(**files, settings=SETTINGS)
     clicked = read_cloud(files["crop"]).points
     files |= {"inputs": masked(files["inputs"], folder, folder / "alignment.json")}
-    crop_scene(**files, settings=BY_MASKS)
+    crop_scene(**files, settings=SETTINGS)
     voted, report = read_cloud(files["crop"]).points, read_json(files["report"])
     both = len({*map(tuple, clicked)} & {*map(tuple, voted)})
     assert both > 0.9 * max(len(clicked), len(voted))
@@ -274,13 +274,42 @@ def test_without_fiducials_and_without_an_alignment_the_sentence_names_both_ways
     not_found = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
     write_json(tmp_path / "alignment.json", not_found)
     with pytest.raises(StageError, match=r"only 3 of 90 .* column fiducials .* or add photos"):
-        crop_scene(**files, settings=BY_MASKS)
+        crop_scene(**files, settings=SETTINGS)
     far = Sim3(1.0, np.eye(3), np.array([500.0, 0, 0])) @ trial.scene_from_object
     elsewhere = {"found": quantity(True, ""), "scene_from_object": quantity(far.matrix, "")}
     write_json(tmp_path / "alignment.json", elsewhere)
     with pytest.raises(StageError, match="only 0 scene points are left in the box of .*masks"):
-        crop_scene(**files, settings=BY_MASKS)
+        crop_scene(**files, settings=SETTINGS)
     assert not files["crop"].exists()
+
+
+def test_masks_come_before_fiducials_which_then_check_them(orbit, tmp_path):
+    folder, trial = orbit
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    both = replace(masked(files["inputs"], folder, folder / "alignment.json"), fiducials=files["inputs"].fiducials)
+    crop_scene(**files | {"inputs": both}, settings=SETTINGS)
+    report = read_json(files["report"])
+    assert value(report, "mode") == "masks" and len(value(report, "fiducials")) == len(trial.fiducials)
+    assert not any("outside the box" in note for note in value(report, "notes"))
+    crop_scene(**files | {"inputs": both}, settings=replace(SETTINGS, mode="fiducials"))
+    assert value(read_json(files["report"]), "mode") == "fiducials"
+    away = trial.fiducials + [0, 0, 0.8 * trial.diagonal]
+    stray = np.concatenate([trial.fiducials[:4], away[:1]])
+    crop_scene(**stage_files(tmp_path, trial, stray) | {"inputs": both}, settings=SETTINGS)
+    assert value(read_json(files["report"]), "notes")[1].endswith("lie outside the box: p4")
+    with pytest.raises(StageError, match="all 5 marks of .* lie outside the box that the masks mark"):
+        crop_scene(**stage_files(tmp_path, trial, away[:5]) | {"inputs": both}, settings=SETTINGS)
+
+
+def test_without_an_alignment_the_fiducials_mark_the_object_and_that_is_said(orbit, tmp_path):
+    folder, trial = orbit
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    not_found = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
+    write_json(tmp_path / "alignment.json", not_found)
+    inputs = replace(masked(files["inputs"], folder, tmp_path / "alignment.json"), fiducials=files["inputs"].fiducials)
+    crop_scene(**files | {"inputs": inputs}, settings=SETTINGS)
+    report = read_json(files["report"])
+    assert value(report, "mode") == "fiducials" and "only 3 of 90" in value(report, "notes")[0]
 
 
 def stage_files(folder, trial, fiducials):

@@ -10,10 +10,11 @@ import open3d as o3d
 import pytest
 from PIL import Image
 
-from scenefuse.demo import capture, clicks, textures
+from scenefuse.demo import capture, clicks, prompts, textures
 from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
 from scenefuse.demo.cameras import Cameras, pinhole, read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
+from scenefuse.sfm.fiducials import Labels, read_points
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import StageError, manifest, read_json, value
 
@@ -171,6 +172,29 @@ def test_clicks_without_noise_meet_at_the_landmarks(tmp_path: Path, world: World
         assert inside[0] and np.abs(pixel[0] - [float(x), float(y)]).max() < 0.01
         seen[point] = seen.get(point, 0) + 1
     assert len(seen) >= 6 and min(seen.values()) >= 2
+
+
+def test_an_object_is_clicked_in_the_photo_that_shows_most_of_it_some_pixels_off(tmp_path: Path) -> None:
+    (tmp_path / "masks").mkdir()
+    shown = np.zeros((120, 160), dtype=np.uint8)
+    shown[30:90, 40:120] = 255
+    for name, mask in (("a", shown // 2), ("b", shown), ("c", np.zeros_like(shown))):
+        cv2.imwrite(str(tmp_path / f"masks/{name}.png"), mask)
+    settings = prompts.PromptSettings(inside=3, box=True)
+    for seed in range(5):
+        prompts.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=seed)
+        marked = read_points(tmp_path / "prompts.tsv")
+        assert isinstance(marked, Labels)
+        assert marked.labels == ["inside"] * 3 + ["box"] * 2 and set(marked.photos) == {"b.jpg"}
+        off = np.linalg.norm(marked.pixels[3:] - [[40, 30], [120, 90]], axis=1)
+        assert (off > 2.9).all() and (off < 10.1).all()
+        apart = np.linalg.norm(marked.pixels[:3, None] - marked.pixels[:3], axis=2)
+        assert apart[np.triu_indices(3, 1)].min() > 25
+        assert ((marked.pixels[:3] > [30, 20]) & (marked.pixels[:3] < [130, 100])).all()
+    cv2.imwrite(str(tmp_path / "masks/b.png"), np.zeros_like(shown))
+    cv2.imwrite(str(tmp_path / "masks/a.png"), np.zeros_like(shown))
+    with pytest.raises(StageError, match="no mask in .* shows the object"):
+        prompts.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=0)
 
 
 def test_an_ideal_camera_changes_nothing(world: World) -> None:

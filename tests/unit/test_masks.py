@@ -257,7 +257,7 @@ class TrueNetwork:
         self.segmented.append(k)
         return k
 
-    def masks(self, k, size, points_px, box_px):
+    def masks(self, k, size, points_px, box_px, outside_px):
         ball = look(camera_pose(k))[0]
         assert size == ball.shape
         assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()

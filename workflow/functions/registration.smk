@@ -7,8 +7,8 @@ def variant_options(part):
 
 
 def crop_mode(wildcards):
-    """How a variant crops; without fiducials, the object's masks mark it, which takes photos of both sides. Without either,
-    the whole scene is kept: None."""
+    """How a variant crops: by the object's masks where the photos of both sides may be linked, else by the file in the
+    column fiducials. Without either, the whole scene is kept: None."""
     crop = VARIANTS[wildcards.variant]["crop"]
     marked, linked = object_row(wildcards.object).get("fiducials"), is_linked(wildcards)
     if crop.get("whole_scene") or not (marked or linked):
@@ -17,16 +17,18 @@ def crop_mode(wildcards):
 
 
 def crop_marks(wildcards):
-    """The files that mark an object in its scene: option of the crop -> path."""
-    mode = crop_mode(wildcards)
+    """The files that mark an object in its scene: option of the crop -> path. Fiducials check the masks, or take their
+    place where shared features give no alignment."""
+    mode, row = crop_mode(wildcards), object_row(wildcards.object)
+    own = {"fiducials": row["fiducials"]} if mode and row.get("fiducials") else {}
     if mode == "masks":
         folder = f"results/objects/{wildcards.object}"
-        return {
+        own |= {
             "alignment_json": f"{folder}/alignment.json",
             "workspace": f"{folder}/undistorted",
             "masks": f"{folder}/masks",
         }
-    return {"fiducials": object_row(wildcards.object)["fiducials"]} if mode else {}
+    return own
 
 
 def crop_inputs(wildcards):

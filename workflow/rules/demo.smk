@@ -4,7 +4,8 @@
 # OUTPUTS   results/demo/{scene}/scene/photos/              the flight, GPS with noise in its EXIF
 #           results/demo/{scene}/{object}/photos/           an orbit of each object
 #           results/demo/{scene}/{object}/fiducials.tsv     what a person would click in the flight's photos
-#           results/demo/{scene}/{object}/prompts.tsv       what a person would click in the object's photos
+#           results/demo/{scene}/{object}/prompts.tsv       what a person would click in the object's photos: landmarks in several
+#           results/demo/{scene}/{object}/clicks.tsv        the same in one photo; name it in the column prompts
 #           results/demo/{scene}/truth/                     cameras, surfaces, masks; read by evaluation, and by the clicks
 DEMO_OBJECTS = "house|balloon|sculpture"
 
@@ -114,3 +115,31 @@ use rule click_fiducials as click_prompts with:
         code=code("demo/click_points.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in its own photos"
+
+
+rule click_object:
+    """Click the object in one of its own photos, three spots and a box, some pixels off: prompts for SAM 2."""
+    input:
+        "results/demo/{scene}/truth/{object}",
+    output:
+        "results/demo/{scene}/{object}/clicks.tsv",
+    log:
+        "results/logs/click_object/{scene}-{object}.log",
+    benchmark:
+        "results/benchmarks/click_object/{scene}-{object}.tsv"
+    wildcard_constraints:
+        object=DEMO_OBJECTS,
+    conda:
+        "../../envs/reconstruction.yaml"
+    resources:
+        mem_mb=2000,
+        runtime=10,
+    params:
+        options=flags(config["demo"]["clicks"]),
+        seed=config["seed"],
+        script=script("demo/click_object.py"),
+        code=code("demo/click_object.py"),
+    message:
+        "Demo {wildcards.scene}: clicking the {wildcards.object} in one of its photos"
+    shell:
+        "exec python {params.script} --truth {input} --clicks {output} --seed {params.seed} {params.options} &> {log}"

@@ -6,7 +6,7 @@
 #           results/objects/{object}/frames.json
 #
 # `full` is the variant that is fused; the others run beside it by the same scripts, with other options, and are measured at the same
-# thresholds. `paper` shares the crop only: the paper's recipe is a stage of its own.
+# thresholds. `paper` has a crop by fiducials, and the paper's recipe is a stage of its own.
 ruleorder: register_as_paper > estimate_scale > register_coarsely > register_finely
 
 
@@ -48,7 +48,7 @@ rule align_models:
 
 
 rule crop_scene:
-    """Cut the object's surroundings out of the scene by its fiducials, or by its masks' votes (paper 3.3; C1 to C3)."""
+    """Cut the object's surroundings out of the scene by its masks' votes, or by clicks or fiducials (paper 3.3; C1 to C5)."""
     input:
         crop_inputs,
         scene=in_scene("dense.ply"),

@@ -26,9 +26,10 @@ LEAST_LEFT = 0.05
 class CropSettings:
     """Settings of the crop."""
 
-    mode: Literal["fiducials", "masks"] = setting("fiducials")
-    """What marks the object in the scene: fiducials, or its masks, seen through the alignment from shared features (in
-    any case for objects without fiducials, if both sides have photos; else the whole scene is searched)."""
+    mode: Literal["masks", "fiducials"] = setting("masks")
+    """What marks the object in the scene: its masks, seen through the alignment from shared features, and only where
+    photos share too few the file in the column `fiducials`; or this file in any case. An object without it, and without
+    photos on both sides, is searched in the whole scene."""
     shape: Literal["box", "oriented", "hull"] = setting("box")
     """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float = setting(0.05, least=0)
@@ -38,7 +39,7 @@ class CropSettings:
     max_residual_px: float = setting(5, unit="px", least=0)
     """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
     min_votes: float = setting(0.8, above=0, most=1)
-    """Share of the object's photos showing a scene point that must have it inside their mask; mode masks only."""
+    """Share of the object's photos showing a scene point that must have it inside their mask."""
     whole_scene: bool = False
     """Keep the whole scene, whatever the mode: the ablation without cropping, and what is left without any mark."""
 

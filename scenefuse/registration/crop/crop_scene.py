@@ -1,17 +1,19 @@
-"""The crop stage: an object's surroundings, cut out of the scene by its fiducials or by its masks."""
+"""The crop stage: an object's surroundings, cut out of the scene by its masks, by clicks or by fiducials."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
+from scenefuse.registration.crop.one_photo import crop_grown, locate_clicks
 from scenefuse.registration.crop.parts import MIN_PART, parts
 from scenefuse.registration.crop.vote import Votes, vote
-from scenefuse.sfm.fiducials import ScenePoints, locate, read_points
+from scenefuse.sfm.fiducials import Labels, ScenePoints, locate, read_points
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
@@ -29,59 +31,109 @@ class CropInputs:
     scene: Path
     """Dense scene cloud (PLY), z up as the georegister stage leaves it."""
     sparse: Path | None = None
-    """COLMAP model of the scene in the same frame; clicked fiducials are triangulated in it. None where the scene was
-    given as a cloud."""
+    """COLMAP model of the scene in the same frame; clicks are in its photos. None where the scene was given as a
+    cloud."""
     georeference_json: Path | None = None
     """JSON of the scene, for the unit of its lengths and the origin of an imported cloud."""
     fiducials: Path | None = None
-    """Tab-separated clicks (point, photo, x_px, y_px) or scene points (point, x, y, z; of an imported scene in its
-    file's coordinates), at least four different points on the object; mode fiducials."""
+    """Tab-separated labels (label, photo, x_px, y_px), a few pixels of one scene photo inside and outside the object;
+    or clicks (point, photo, x_px, y_px) or scene points (point, x, y, z; of an imported scene in its file's
+    coordinates), at least four different points on the object."""
     alignment_json: Path | None = None
-    """JSON of the alignment stage, with `scene_from_object`; mode masks."""
+    """JSON of the alignment stage, with `found` and `scene_from_object`, for the masks."""
     workspace: Path | None = None
-    """Undistorted COLMAP workspace of the object; mode masks."""
+    """Undistorted COLMAP workspace of the object, for the masks."""
     masks: Path | None = None
-    """Folder of the object's masks; mode masks."""
+    """Folder of the object's masks."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What marks the object.
+
+    Attributes:
+        mode: none, masks, clicks or fiducials.
+        fiducials: (F, 3) in the scene frame: the fiducials, or the inside clicks with their depth.
+        voted: scene points that the masks vote for.
+    """
+
+    mode: str
+    fiducials: Array
+    voted: int = 0
 
 
 def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSettings) -> None:
-    """Cut an object's surroundings out of the scene by its fiducials or its masks (method C1 to C4).
+    """Cut an object's surroundings out of the scene by its masks, by clicks in a photo or by fiducials (C1 to C5).
 
     Args:
         inputs: the scene, and what marks the object in it.
         crop: output PLY, the scene's points on the object.
-        report: output JSON: box, gravity, ground, counts.
+        report: output JSON: what marked it, box, gravity, ground, counts.
         settings: see CropSettings.
 
     Raises:
-        StageError: fewer than four fiducials, one far from every scene point, too few points in the box, or neither
-            fiducials nor a pose of the object from the alignment.
+        StageError: nothing marks the object, the marks are wrong or contradict each other, or too few points are left.
     """
-    scene, mode = read_cloud(inputs.scene), "none" if settings.whole_scene else settings.mode
-    fiducials, voted = np.zeros((0, 3)), 0
-    if mode == "none":
-        cut = whole(scene)
-        print(cut.notes[0], flush=True)
-    elif mode == "masks":
-        cut, voted = crop_by_masks(scene, inputs, settings)
-    else:
-        cut, fiducials = crop_by_fiducials(scene, inputs, settings)
+    scene = read_cloud(inputs.scene)
+    cut, marks = _cut(scene, inputs, settings)
     part = scene[cut.keep]
     write_cloud(crop, part)
     unit = length_unit(inputs.georeference_json)
-    marks = {"fiducials": quantity(fiducials, unit), "voted_points": quantity(voted, "1")}
-    write_json(report, {"mode": quantity(mode, "")} | marks | _report(scene, part, cut, unit))
+    about = {
+        "mode": quantity(marks.mode, ""),
+        "fiducials": quantity(marks.fiducials, unit),
+        "voted_points": quantity(marks.voted, "1"),
+    }
+    write_json(report, about | _report(scene, part, cut, unit))
 
 
-def crop_by_fiducials(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Array]:
-    """`crop_marked` with the fiducials of a file; these, (F, 3) in the scene frame."""
+def _cut(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
+    """The crop by what marks the object, in this order: masks where photos are linked, then the user's file."""
+    if settings.whole_scene:
+        cut = whole(scene)
+        print(cut.notes[0], flush=True)
+        return cut, Marks("none", np.zeros((0, 3)))
+    if settings.mode == "masks" and inputs.alignment_json is not None:
+        alignment = read_json(inputs.alignment_json)
+        if value(alignment, "found") or inputs.fiducials is None:
+            return crop_by_masks(scene, inputs, settings)
+        cut, marks = crop_by_file(scene, inputs, settings)
+        note = (
+            f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
+            f" ({value(alignment, 'reason')})"
+        )
+        print(note, flush=True)
+        return replace(cut, notes=[note, *cut.notes]), marks
+    return crop_by_file(scene, inputs, settings)
+
+
+def crop_by_file(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
+    """The crop by labels in photos of the scene (`crop_grown`) or by fiducials (`crop_marked`)."""
+    names, points, other, left_out = _located(scene, inputs, settings)
+    assert inputs.fiducials is not None
+    if other is None:
+        return crop_marked(scene, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
+    cut = crop_grown(scene, points, UP, settings, other)
+    cut = replace(cut, notes=[*left_out, *cut.notes])
+    _announce(cut, str(inputs.fiducials))
+    return cut, Marks("clicks", points)
+
+
+def _located(
+    scene: Cloud, inputs: CropInputs, settings: CropSettings
+) -> tuple[list[str], Array, NDArray[np.bool_] | None, list[str]]:
+    """Names and positions (F, 3) in the scene frame of what the user's file marks; for labels, which of the scene's
+    points (N,) are something else by them (None for fiducials), and the clicks that were left out."""
     if inputs.fiducials is None:
-        raise StageError("cropping by fiducials needs --fiducials; give them, or mode masks")
+        raise StageError("cropping by fiducials needs --fiducials; give them, or mode masks and its files")
     if inputs.sparse is None:
-        names, points = points_in(inputs.fiducials, inputs.georeference_json)
-    else:
-        names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
-    return crop_marked(scene, names, points, UP, settings, inputs.fiducials), points
+        return *points_in(inputs.fiducials, inputs.georeference_json), None, []
+    marked = read_points(inputs.fiducials)
+    if isinstance(marked, Labels):
+        found = locate_clicks(marked, inputs.sparse, scene)
+        return found.names, found.inside, found.other, found.left_out
+    names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
+    return names, points, None, []
 
 
 def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str], Array]:
@@ -101,11 +153,13 @@ def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str
     return marked.points, marked.positions - origin
 
 
-def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, int]:
-    """`crop_cloud` around the scene points that the object's masks vote for, and its SfM points; and their number (C3).
+def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
+    """`crop_cloud` around the scene points that the object's masks vote for, and its SfM points (C3); checked by the
+    fiducials or clicks where there are some.
 
     Raises:
-        StageError: a file is missing, the alignment has no pose, or the masks mark nothing.
+        StageError: a file is missing, the alignment has no pose, the masks mark nothing, or the fiducials mark
+            something else.
     """
     if inputs.alignment_json is None or inputs.workspace is None or inputs.masks is None:
         raise StageError(
@@ -113,10 +167,30 @@ def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> t
         )
     votes = votes_of(scene, inputs.alignment_json, inputs.workspace, inputs.masks, settings)
     cut = crop_cloud(scene, np.concatenate([scene.points[votes.object], votes.own]), UP, settings, votes.other)
-    note = f"marked by the votes of {inputs.masks} through the alignment from shared features, not by fiducials"
-    cut = replace(cut, notes=[note, *cut.notes])
+    notes = [f"marked by the votes of {inputs.masks} through the alignment from shared features, not by fiducials"]
+    points = np.zeros((0, 3))
+    if inputs.fiducials is not None:
+        names, points, _, left_out = _located(scene, inputs, settings)
+        notes += [*left_out, *_check_inside(names, points, cut, inputs.fiducials)]
+    cut = replace(cut, notes=notes + cut.notes)
     _announce(cut, str(inputs.masks))
-    return cut, int(votes.object.sum())
+    return cut, Marks("masks", points, int(votes.object.sum()))
+
+
+def _check_inside(names: list[str], points: Array, cut: Crop, path: Path) -> list[str]:
+    """Names the fiducials (F, 3) off the box that the masks mark; StageError when all are."""
+    level = points @ cut.level_from_scene.T
+    off = ((level < cut.low) | (level > cut.high)).any(axis=1)
+    outside = [names[k] for k in np.flatnonzero(off)]
+    if len(outside) == len(names):
+        raise StageError(
+            f"all {len(names)} marks of {path} lie outside the box that the masks mark in the scene: either they are on"
+            " something else, or the alignment from shared features is wrong; correct them, or set"
+            " registration.crop.mode to fiducials"
+        )
+    if not outside:
+        return []
+    return [f"{len(outside)} of {len(names)} marks of {path} lie outside the box: {', '.join(outside)}"]
 
 
 def votes_of(scene: Cloud, alignment_json: Path, workspace: Path, masks: Path, settings: CropSettings) -> Votes:
@@ -129,8 +203,8 @@ def votes_of(scene: Cloud, alignment_json: Path, workspace: Path, masks: Path, s
     if not value(alignment, "found"):
         raise StageError(
             "there are no fiducials, and shared features give no alignment of the object with the scene"
-            f" ({value(alignment, 'reason')}; see {alignment_json}): click at least four points on it in the scene's"
-            " photos and name the file in the column fiducials of the objects table, or add photos of the object that"
+            f" ({value(alignment, 'reason')}; see {alignment_json}): click on the object in one of the scene's photos"
+            " and name the file in the column fiducials of the objects table, or add photos of the object that"
             " show its surroundings too, from as far away as the scene's"
         )
     pose = Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))

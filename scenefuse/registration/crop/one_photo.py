@@ -1,0 +1,145 @@
+"""The object in the scene from a few clicks in one of the scene's photos, with the depth of the dense cloud."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud
+from scenefuse.sfm.fiducials import Labels
+from scenefuse.stage import StageError, threads
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, read_views
+
+# A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
+# more; of points up to so many spacings behind the nearest.
+AROUND_SPACINGS, AROUND_PX, THICK_SPACINGS = 2, 3, 8
+# Inside clicks with a depth that span an object.
+LEAST_INSIDE = 3
+# Rounds in which the crop grows along the object; each reaches farther by its margin.
+ROUNDS = 25
+# A round that adds less than this share of the points is the last.
+LEAST_ADDED = 0.01
+# The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
+# that the photo shows. What is larger is connected with something else.
+MOST_GROWTH = 3.0
+# The outermost share of the kept points on each side marks nothing.
+STRAYS = 0.005
+
+
+@dataclass(frozen=True)
+class SceneClicks:
+    """Clicks in photos of the scene, with their depth.
+
+    Attributes:
+        names: of the inside clicks, for messages.
+        inside: (F, 3) where they are, in the scene frame.
+        other: (N,) bool over the scene's points, True for those nearer to a click outside than to any inside, or off a
+            box.
+        left_out: clicks where the scene has no point, a sentence each.
+    """
+
+    names: list[str]
+    inside: Array
+    other: NDArray[np.bool_]
+    left_out: list[str]
+
+
+def locate_clicks(labels: Labels, sparse: Path, scene: Cloud) -> SceneClicks:
+    """Where labelled pixels of scene photos are in the scene: on the nearest points of the dense cloud there (C5).
+
+    Args:
+        labels: pixels of the scene's photos, inside and outside the object, or a box around it.
+        sparse: COLMAP model of these photos.
+        scene: dense cloud in the model's frame.
+
+    Raises:
+        StageError: as `clicks_per_photo`; fewer than three inside clicks meet the scene.
+    """
+    views = read_views(sparse)
+    step = spacing(scene.points)
+    names: list[str] = []
+    sides: tuple[list[Array], list[Array]] = ([], [])
+    left_out: list[str] = []
+    other = np.zeros(len(scene), dtype=bool)
+    for row, clicks in clicks_per_photo(labels, sparse, views, {}).items():
+        view = views[row]
+        pixels, depth = view.project(scene.points)
+        for pixel, inside in zip(clicks.pixels, clicks.inside):
+            name = f"{'inside' if inside else 'outside'} ({pixel[0]:.0f}, {pixel[1]:.0f}) in {view.name}"
+            found = _on_surface(scene.points, pixels, depth, pixel, step, view)
+            if found is None:
+                left_out.append(f"the click {name} of {labels.path} meets no point of the scene: left out")
+            else:
+                sides[int(inside)].append(found)
+                names += [name] * bool(inside)
+        other |= _off_box(clicks, pixels, depth)
+    if len(sides[1]) < LEAST_INSIDE:
+        about = f" ({'; '.join(left_out)})" if left_out else ""
+        raise StageError(
+            f"{labels.path} has {len(sides[1])} clicks inside the object that meet points of the scene, {LEAST_INSIDE}"
+            f" are needed{about}: click on the object's ends, in a photo that shows it well"
+        )
+    inside = np.array(sides[1])
+    if sides[0]:
+        near = [cKDTree(np.array(side)).query(scene.points, workers=threads())[0] for side in sides]
+        other |= near[0] < near[1]
+    return SceneClicks(names, inside, other, left_out)
+
+
+def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: float, view: View) -> Array | None:
+    """The middle (3,) of the nearest points (N, 3) that a photo shows about a pixel; None where there are none."""
+    focal = float(view.intrinsics[0, 0])
+    with np.errstate(divide="ignore"):
+        reach = np.maximum(AROUND_PX, AROUND_SPACINGS * step * focal / depth)
+    rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
+    if not len(rows):
+        return None
+    front = rows[depth[rows] <= depth[rows].min() + THICK_SPACINGS * step]
+    return np.median(points[front], axis=0)
+
+
+def _off_box(clicks: PhotoClicks, pixels: Array, depth: Array) -> NDArray[np.bool_]:
+    """(N,) which of the projected points lie outside the box clicked in the photo."""
+    if clicks.box is None:
+        return np.zeros(len(depth), dtype=bool)
+    return (depth <= 0) | (pixels < clicks.box[0]).any(1) | (pixels > clicks.box[1]).any(1)
+
+
+def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_]) -> Crop:
+    """`crop_cloud` around clicks on one side of an object, grown along what they lie on, to its other sides (C5).
+
+    Each round takes the points of the last crop as its marks, until none are added. Growth ends at the ground, at gaps
+    and at points that are something else. Where the object is connected with something much larger, the box around the
+    clicks remains, and a note says so.
+
+    Args:
+        scene: the dense cloud.
+        inside: (F, 3) clicks on the object.
+        up: (3,) against gravity.
+        settings: of the crop.
+        other: (N,) points of the scene that are something else.
+    """
+    first = cut = crop_cloud(scene, inside, up, settings, other)
+    most = MOST_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
+    for _ in range(ROUNDS):
+        own = scene.points[cut.keep]
+        if not len(own):
+            return cut
+        low, high = np.percentile(own, [100 * STRAYS, 100 * (1 - STRAYS)], axis=0)
+        if np.linalg.norm(high - low) > most:
+            break
+        marks = np.concatenate([inside, own[((own >= low) & (own <= high)).all(1)]])
+        grown = crop_cloud(scene, marks, up, settings, other)
+        if grown.keep.sum() <= (1 + LEAST_ADDED) * cut.keep.sum():
+            return grown
+        cut = grown
+    note = (
+        f"what the clicks lie on reaches more than {MOST_GROWTH:g} times as far as they do: only the box around them"
+        " was cut out; click on the object's ends, and outside, on what it touches"
+    )
+    return replace(first, notes=[note, *first.notes])

@@ -1,0 +1,162 @@
+"""Masks from five clicks in one photo, over several choices of the photo and of the clicks, beside true masks.
+
+python tests/benchmarks/clicked_masks.py --folder results/objects/house --truth results/demo/demo/truth/house/masks \\
+    --out results/bench/house.tsv
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from scenefuse.demo.prompts import PromptSettings, clicks_on
+from scenefuse.io.mask_files import mask_files
+from scenefuse.io.pictures import read_mask
+from scenefuse.io.settings import build, read_settings
+from scenefuse.masks.prompted import masks_from_prompts
+from scenefuse.masks.sam2 import Sam2, load_network
+from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.masks.supplied import supplied_masks
+from scenefuse.mvs.visual_hull import Mask, mask_iou
+from scenefuse.sfm.fiducials import Labels
+from scenefuse.sfm.frames import original_sizes
+from scenefuse.stage import StageError, read_json, run, value
+from scenefuse.transforms import Array
+from scenefuse.workspace import Workspace, read_workspace
+
+
+class Remembering:
+    """A network that encodes every photo once."""
+
+    def __init__(self, network: Sam2) -> None:
+        """Wrap it."""
+        self._network = network
+        self._known: dict[int, Any] = {}
+
+    def encode(self, image: Any) -> Any:
+        """See Sam2; photos are told apart by their pixels."""
+        key = hash(np.ascontiguousarray(image).tobytes())
+        if key not in self._known:
+            self._known[key] = self._network.encode(image)
+        return self._known[key]
+
+    def masks(self, *prompts: Any) -> Any:
+        """See Sam2."""
+        return self._network.masks(*prompts)
+
+
+@dataclass(frozen=True)
+class Object:
+    """An object's photos with cameras, and its true masks, (H, W) each, by photo."""
+
+    folder: Path
+    photos: Workspace
+    up: Array
+    sizes: dict[str, tuple[int, int]]
+    truth: dict[str, Mask]
+    files: dict[str, Path]
+
+
+def clicked_masks(
+    *,
+    folder: Path,
+    truth: Path,
+    out: Path,
+    method: Literal["grabcut", "sam2"] = "grabcut",
+    photos: int = 10,
+    clicks: int = 5,
+    box: bool = False,
+    wrong: tuple[str, ...] = (),
+    config: Path | None = None,
+) -> None:
+    """Print the IoU of the masks with the true ones for every choice, worst and median; a row of each to a table.
+
+    A choice is a photo and five clicks in it: spots far apart on the true mask, or three of these and the corners of
+    its box, each 3 to 10 px off in the original photo.
+
+    Args:
+        folder: the object's results, undistorted photos at least.
+        truth: folder of the true masks of the original photos.
+        out: output table, .tsv.
+        method: of the masks.
+        photos: how many photos to click in, spread evenly.
+        clicks: how many times to click in each.
+        box: three clicks inside and the corners of a box in the place of five inside.
+        wrong: photos whose true mask is wrong.
+        config: settings file of the capture; the shipped settings without one.
+
+    Raises:
+        StageError: a file is missing.
+    """
+    shipped = read_settings(config)
+    settings = build(MaskSettings, shipped["object"]["masks"] | {"method": method})
+    thing, network = _read(folder, truth, wrong), None
+    if method == "sam2":
+        network = Remembering(load_network(Path(settings.sam2_encoder), Path(settings.sam2_decoder), None, 1)[0])
+    names = sorted(thing.truth)
+    rows, prompts = [], PromptSettings(inside=3 if box else 5, box=box)
+    for name in [names[k] for k in np.linspace(0, len(names) - 1, photos).round().astype(int)]:
+        for trial in range(clicks):
+            rows.append(_trial(thing, name, trial, prompts, network, settings))
+            print(" ".join(f"{key} {cell}" for key, cell in rows[-1].items()), flush=True)
+    table = pd.DataFrame(rows)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    table.to_csv(out, sep="\t", index=False, float_format="%.4f")
+    failed = int(table.error.astype(bool).sum())
+    for column in ("median", "mean", "least", "kept"):
+        print(f"{column}: worst {table[column].min():.3f}, median {table[column].median():.3f}", flush=True)
+    print(f"{len(table)} choices, {failed} without masks; {len(thing.truth)} photos")
+
+
+def _read(folder: Path, truth: Path, wrong: tuple[str, ...]) -> Object:
+    """An object's photos and true masks."""
+    workspace = read_workspace(folder / "undistorted")
+    views = [workspace.rgb(view) for view in workspace.views]
+    true, _ = supplied_masks(truth, folder / "sparse", views)
+    return Object(
+        folder,
+        replace(workspace, views=views),
+        np.array(value(read_json(folder / "undistorted.json"), "up_in_camera_frame")),
+        original_sizes(read_json(folder / "photos.json")),
+        {name: mask for name, mask in true.items() if name not in wrong},
+        mask_files(truth),
+    )
+
+
+def _trial(
+    thing: Object, name: str, trial: int, prompts: PromptSettings, network: Any, settings: MaskSettings
+) -> dict[str, Any]:
+    """Masks from one choice of clicks, and how like the true ones they are."""
+    rng = np.random.default_rng([trial, *name.encode()])
+    labels, pixels = clicks_on(read_mask(thing.files[Path(name).stem]), prompts, rng)
+    marked = Labels(Path(name), labels, [name] * len(pixels), pixels)
+    row: dict[str, Any] = {"photo": name, "trial": trial}
+    try:
+        found = masks_from_prompts(
+            marked, thing.folder / "sparse", thing.sizes, thing.photos, thing.up, network, settings, 0
+        )
+        scored = score_masks(found.masks, found.target, thing.photos.views, settings)
+    except StageError as error:
+        return row | dict.fromkeys(("median", "mean", "least", "kept", "left_out"), 0) | {"error": str(error)}
+    iou = {
+        photo: mask_iou(mask, thing.truth[photo])
+        for photo, mask in scored.masks.items()
+        if photo in thing.truth and photo not in scored.dropped
+    }
+    least = min(iou, key=lambda photo: iou[photo]) if iou else ""
+    values = np.array(list(iou.values()) or [0.0])
+    return row | {
+        "median": round(float(np.median(values)), 4),
+        "mean": round(float(values.mean()), 4),
+        "least": round(float(values.min()), 4),
+        "kept": len(iou),
+        "left_out": len(found.left_out),
+        "error": "",
+        "worst_photo": least,
+    }
+
+
+if __name__ == "__main__":
+    run(clicked_masks)

@@ -1,0 +1,130 @@
+"""A few clicks in one photo of the scene find the object there."""
+
+import numpy as np
+import pytest
+
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import look_at
+from scenefuse.workspace import View, write_model
+
+SIZE = np.array([6.0, 4.0, 3.0])
+"""Of the shed, which stands about the origin of the yard."""
+
+
+def shell(size, middle, count, seed):
+    """Points on the faces of an upright box, without its bottom."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.5, 0.5, (count, 3))
+    side = np.array([(0, -0.5), (0, 0.5), (1, -0.5), (1, 0.5), (2, 0.5)])[rng.integers(0, 5, count)]
+    points[np.arange(count), side[:, 0].astype(int)] = side[:, 1]
+    return points * size + middle
+
+
+def ground(seed):
+    return np.random.default_rng(seed).uniform([-20, -20, 0], [20, 20, 0.02], (40000, 3))
+
+
+YARD = np.concatenate([shell(SIZE, [0, 0, 1.5], 9000, 0), ground(1)])
+OWN = np.arange(len(YARD)) < 9000
+EYE = np.array([12.0, -18.0, 14.0])
+CORNERS = [(-2.8, -2, 2.8), (2.8, -2, 2.8), (2.8, -2, 0.3), (3, 1.8, 2.8), (0, 0, 3)]
+"""Where somebody clicks: on the roof, and on the two walls that the photo shows."""
+
+
+def photo(eye=EYE, name="drone 1.jpg"):
+    pose = np.eye(4)
+    pose[:3, :3] = look_at(eye, np.zeros(3), np.array([0, 0, 1.0]))
+    pose[:3, 3] = -pose[:3, :3] @ eye
+    return View(name, np.array([[700, 0, 400], [0, 700, 300], [0, 0, 1.0]]), pose, 800, 600)
+
+
+@pytest.fixture
+def crop(tmp_path):
+    """Crop a scene by rows (label, point in the scene or pixel); what is kept, and the report."""
+
+    def run(rows, points=YARD, view=None, **settings):
+        view = view or photo()
+        lines = [
+            f"{label}\t{view.name}\t{x:.1f}\t{y:.1f}"
+            for label, at in rows
+            for x, y in [at if len(at) == 2 else view.project(np.array([at], float))[0][0]]
+        ]
+        (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + "\n".join(lines) + "\n")
+        (tmp_path / "sparse").mkdir(exist_ok=True)
+        write_model(tmp_path / "sparse", [view, photo(EYE * [-1, 1, 1], "drone 2.jpg")])
+        write_cloud(tmp_path / "dense.ply", Cloud(points))
+        inputs = CropInputs(scene=tmp_path / "dense.ply", sparse=tmp_path / "sparse", fiducials=tmp_path / "clicks.tsv")
+        report = tmp_path / "crop.json"
+        crop_scene(inputs=inputs, crop=tmp_path / "crop.ply", report=report, settings=CropSettings(**settings))
+        kept = {tuple(p) for p in np.round(read_cloud(tmp_path / "crop.ply").points, 4)}
+        return np.array([tuple(p) in kept for p in np.round(points, 4)]), read_json(report)
+
+    return run
+
+
+def inside(*points):
+    return [("inside", point) for point in points]
+
+
+def test_five_clicks_in_one_photo_cut_out_all_sides_of_the_object(crop):
+    kept, report = crop(inside(*CORNERS))
+    # The walls away from the camera too; points in the ground's thickness go with the ground.
+    assert kept[OWN].mean() > 0.9 and kept[~OWN].sum() < 0.02 * kept.sum()
+    hidden = OWN & (YARD[:, 1] > 1.99) & (YARD[:, 2] > 0.5)
+    assert hidden.sum() > 1000 and kept[hidden].mean() > 0.99
+    assert value(report, "mode") == "clicks" and len(value(report, "fiducials")) == 5
+    # Not by the clicks' own box alone: from the roof it grows down to the foot.
+    roof = crop(inside((-2, -1.5, 3), (2, -1.5, 3), (2, 1.5, 3), (-2, 1.5, 3)))[0]
+    assert roof[OWN].mean() > 0.9 and roof[~OWN].sum() < 0.02 * roof.sum()
+
+
+def test_clicks_have_the_depth_of_the_nearest_surface(crop):
+    report = crop(inside(*CORNERS))[1]
+    np.testing.assert_allclose(value(report, "fiducials"), CORNERS, atol=0.35)
+
+
+BESIDE = np.concatenate([YARD, shell([4, 4, 2.5], [5.0, 0, 1.25], 6000, 2)])
+
+
+def test_clicks_outside_or_a_box_leave_out_what_touches_the_object(crop):
+    other = np.arange(len(BESIDE)) >= len(YARD)
+    on_roof = inside((-2.8, -2, 2.8), (2.8, -2, 2.8), (-2.8, -2, 0.4), (0, 0, 3))
+    assert crop(on_roof, BESIDE)[0][other].mean() > 0.5
+    told = [("outside", (5, -2, 1.0)), ("outside", (5, 0, 2.5)), ("outside", (3.3, 1.8, 2.5))]
+    kept = crop(on_roof + told, BESIDE)[0]
+    assert kept[other].mean() < 0.15 and kept[: len(OWN)][OWN].mean() > 0.7
+    view = photo(np.array([0.0, -0.1, 25.0]))
+    corners = view.project(np.array([[-3.3, -2.3, 3.0], [3.2, 2.3, 3.0]]))[0]
+    kept = crop([*on_roof, *(("box", tuple(c)) for c in corners)], BESIDE, view)[0]
+    # A fifth of the other is the wall that they share.
+    assert kept[other].mean() < 0.3 and kept[: len(OWN)][OWN].mean() > 0.85
+
+
+def test_what_is_connected_with_something_much_larger_is_the_box_of_the_clicks_and_that_is_said(crop):
+    row = np.concatenate([YARD, shell([30, 4, 3], [18, 0, 1.5], 40000, 3)])
+    kept, report = crop(inside((-2.8, -2, 2.8), (-0.5, -2, 2.8), (-2.8, -2, 0.4), (-1, 0, 3)), row)
+    assert "reaches more than 3 times as far" in value(report, "notes")[0]
+    assert row[kept, 0].max() < 1.5
+
+
+def test_a_click_on_the_sky_is_left_out_and_named_and_too_few_are_an_error(crop):
+    report = crop(inside(*CORNERS, (700.0, 2.0)), view=photo(np.array([12.0, -18.0, 4.0])))[1]
+    assert value(report, "notes")[0].startswith("the click inside (700, 2) in drone 1.jpg")
+    with pytest.raises(StageError, match=r"2 clicks inside .* 3 are needed \(the click inside \(700, 2\)"):
+        crop(inside(*CORNERS[:2], (700.0, 2.0)), view=photo(np.array([12.0, -18.0, 4.0])))
+
+
+@pytest.mark.parametrize(
+    "rows, sentence",
+    [
+        (inside((900.0, 10.0)), r"lies outside drone 1\.jpg, which has 800 x 600"),
+        ([("outside", (400.0, 300.0))], "holds only clicks outside"),
+        ([("box", (400.0, 300.0))], "a box in drone 1.jpg needs two lines"),
+    ],
+)
+def test_bad_clicks_in_the_scene_are_one_sentence(crop, rows, sentence):
+    with pytest.raises(StageError, match=sentence):
+        crop(rows)
