@@ -19,7 +19,7 @@ def planted(noise=0.01, **given):
     trial = plant("gate", 5, coverage=0.35, ground=False, noise=noise, object_points=6000, density_ratio=1.0, **given)
     voxel = SPACING * trial.diagonal
     obj = prepare(trial.object, voxel / trial.scene_from_object.scale, 0, 12000)
-    return trial, obj, prepare(trial.scene, voxel, 0, 12000)
+    return trial, obj, with_queries(prepare(trial.scene, voxel, 0, 12000), 800)
 
 
 @pytest.fixture(scope="module")
