@@ -99,22 +99,34 @@ def most_likely(
     """
     pose, floor = start, LEAST_NOISE * spacing
     noise = Noise(FIRST_NOISE * diagonal, 0.15, np.ones(3), np.zeros(3))
+    found = explain(obj, scene, pose, noise, spacing)
     for step in range(ROUNDS):
-        noise = _measured_noise(obj, scene, explain(obj, scene, pose, noise, spacing), floor)
-        found = explain(obj, scene, pose, noise, spacing)
+        noise = _measured_noise(obj, scene, found, floor)
+        found = explain(obj, scene, pose, noise, spacing, found.partner)
         at = _derivatives(obj, scene, pose, noise, found)
         change = _newton_step(at, diagonal / 3, scales.width == 0)
-        pose, moved = _climb(obj, scene, at, found, change, scales, spacing)
+        pose, found, moved = _climb(obj, scene, at, found, change, scales, spacing)
         if step >= LEAST_ROUNDS - 1 and moved * diagonal / 3 < CONVERGED * noise.place:
             break
-    return _derivatives(obj, scene, pose, noise, explain(obj, scene, pose, noise, spacing))
+    return _derivatives(obj, scene, pose, noise, found)
 
 
-def explain(obj: Surface, scene: Surface, pose: Sim3, noise: Noise, spacing: float) -> Explanation:
-    """From which object points, `spacing` apart (scene units), the scene's query points may come at a pose."""
+def explain(
+    obj: Surface,
+    scene: Surface,
+    pose: Sim3,
+    noise: Noise,
+    spacing: float,
+    partner: NDArray[np.int64] | None = None,
+) -> Explanation:
+    """From which object points, `spacing` apart (scene units), the scene's query points may come at a pose.
+
+    `partner` (N, K) are the nearest object points at this pose, where they are known already.
+    """
     at = scene.points[scene.queries]
     near = min(NEIGHBOURS, len(obj))
-    partner = obj.tree.query(pose.inverse().apply(at), k=near, workers=threads())[1].reshape(len(at), near)
+    if partner is None:
+        partner = obj.tree.query(pose.inverse().apply(at), k=near, workers=threads())[1].reshape(len(at), near)
     residual = at[:, None] - pose.apply(obj.points[partner])
     off = (residual**2).sum(2) / (2 * noise.place**2)
     if _colored(obj, scene):
@@ -203,12 +215,13 @@ def _climb(
     change: Array,
     scales: ScaleRange,
     spacing: float,
-) -> tuple[Sim3, float]:
+) -> tuple[Sim3, Explanation, float]:
     """The pose after a change, or a part of it, that is more likely, and how far it moves a point at the distance 1."""
     for _ in range(HALVINGS):
         pose = moved_about(at.pose, change, at.centre, scales)
-        if explain(obj, scene, pose, at.noise, spacing).log_likelihood > found.log_likelihood:
+        then = explain(obj, scene, pose, at.noise, spacing)
+        if then.log_likelihood > found.log_likelihood:
             reach = float(np.linalg.norm(change[:3]) + abs(change[6]))
-            return pose, reach + float(np.linalg.norm(change[3:6]))
+            return pose, then, reach + float(np.linalg.norm(change[3:6]))
         change = change / 3
-    return at.pose, 0.0
+    return at.pose, found, 0.0
