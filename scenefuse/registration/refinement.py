@@ -49,12 +49,11 @@ class Outcome:
 
 
 def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:
-    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12).
+    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
 
     Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
     polish; ranking by the two-way F-score, the agreement of colours and free space; comparison with the alignment from
-    shared features, which replaces the clouds' pose where they differ; the uncertainty over halves of the surface; the
-    gate.
+    shared features, which replaces the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
 
     Args:
         problem: the clouds and what is known.

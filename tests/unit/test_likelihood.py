@@ -1,14 +1,20 @@
 """The most likely pose: its derivatives are those of the likelihood, it is right, and so is what it states."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.planted import deviations, errors, plant
 
+from scenefuse.registration import refinement
+from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.likelihood import mixture
 from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.likelihood.mixture import explain, most_likely, moved_about
+from scenefuse.registration.problem import Problem
 from scenefuse.registration.surface import prepare, with_queries
+from scenefuse.registration.uncertainty import Uncertainty
 
 SPACING = 0.01  # of the clouds, as a share of the object's diagonal
 OFF = np.array([0.01, -0.01, 0.01, 0, 0, 0, 0.015])
@@ -91,3 +97,23 @@ def test_too_few_points_determine_nothing(gate):
     scales, start = ScaleRange(trial.scene_from_object.scale, 0.5), disturbed(trial)
     few = with_queries(scene, 60)
     assert certified(obj, few, start, scales, SPACING * trial.diagonal, trial.diagonal, seed=0) is None
+
+
+def test_the_most_likely_pose_is_taken_where_it_is_less_uncertain_and_fits(gate, monkeypatch):
+    trial, truth = gate[0], gate[0].scene_from_object
+    away = moved_about(
+        truth, np.array([0, 0, 0, 0.1 * trial.diagonal, 0, 0, 0]), np.zeros(3), ScaleRange(truth.scale, 1)
+    )
+    monkeypatch.setattr(refinement, "POLISH_ROUNDS", 5)
+    monkeypatch.setattr(refinement, "RESAMPLINGS", 2)
+    problem = Problem(trial.object, trial.scene, ScaleRange(truth.scale, 0.3))
+    settings = replace(FineSettings(), turn_steps=3, voxel_fraction=0.02)
+
+    def outcome(pose, sd):
+        monkeypatch.setattr(refinement, "certified", lambda *_: (pose, Uncertainty.even(sd, sd, sd)))
+        return refinement.refine_hypotheses(problem, [(truth, "planted")], settings)
+
+    sure, unsure, astray = outcome(truth, 1e-6), outcome(truth, 9.0), outcome(away, 1e-6)
+    assert sure.ranked[0].pose is truth and sure.uncertainty.scale_sd_log == pytest.approx(1e-6)
+    assert unsure.ranked[0].pose is not truth and unsure.uncertainty.scale_sd_log < 0.1
+    assert np.array_equal(astray.ranked[0].pose.matrix, unsure.ranked[0].pose.matrix)
