@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.registration.coarse import Candidate
 from scenefuse.registration.decision import DecidedBy, Decision, FineSettings, decide
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
+from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
 from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
 from scenefuse.registration.surface import Surface, with_grid, with_queries
@@ -48,12 +49,11 @@ class Outcome:
 
 
 def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:
-    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12).
+    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
 
     Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
     polish; ranking by the two-way F-score, the agreement of colours and free space; comparison with the alignment from
-    shared features, which replaces the clouds' pose where they differ; the uncertainty over halves of the surface; the
-    gate.
+    shared features, which replaces the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
 
     Args:
         problem: the clouds and what is known.
@@ -155,10 +155,19 @@ class _Work:
         pose = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
         return Hypothesis(pose, h.source, self._score(pose, self.scored))
 
-    def uncertainty(self, h: Hypothesis) -> Uncertainty | None:
-        """How far the pose moves when halves of the surface are left out."""
-        surfaces, problem = [self.scored, self.coarser], self.problem
-        return half_sampling(surfaces, h.pose, problem.scales, self.narrow, RESAMPLINGS, problem.seed)
+    def settled(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None]:
+        """The ranking with its first replaced by the most likely pose, where that is less uncertain, and how uncertain
+        it is. A most likely pose that fits worse went astray."""
+        problem, best, diagonal = self.problem, ranked[0], self.problem.scene.diagonal
+        surfaces, spacing = [self.scored, self.coarser], self.settings.voxel_fraction * diagonal
+        own = half_sampling(surfaces, best.pose, problem.scales, self.narrow, RESAMPLINGS, problem.seed)
+        other = certified(*self.scored, best.pose, problem.scales, spacing, diagonal, problem.seed)
+        if other is None or (own is not None and own.size(diagonal) <= other[1].size(diagonal)):
+            return ranked, own
+        likely = Hypothesis(other[0], best.source, self._score(other[0], self.scored))
+        if likely.score.total <= ASTRAY * best.score.total:
+            return ranked, own
+        return [likely, *ranked[1:]], other[1]
 
     def compared_with_photos(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None, DecidedBy]:
         """The ranking after the alignment from shared features, the uncertainty of its first, and what decided.
@@ -169,11 +178,11 @@ class _Work:
         """
         alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
         if alignment is None:
-            return ranked, self.uncertainty(ranked[0]), "geometry"
+            return *self.settled(ranked), "geometry"
         agree = alignment.agrees(ranked[0].pose, self.centre, diagonal)
         if not agree:
             ranked = [self.polish(self.refine(alignment.pose, "photos", self.narrow)), *ranked]
-        own = self.uncertainty(ranked[0])
+        ranked, own = self.settled(ranked)
         by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
 from support.photographed_place import Kind
-from support.planted import errors
+from support.planted import AXES, deviations, errors
 from support.planted_photos import PhotoTrial, Plan, Truth, calibrated, mapped, plant_photos, truth
 
 from scenefuse.registration.decision import FineSettings
@@ -32,8 +32,6 @@ SCALE_PCT, ROTATION_DEG, SHIFT_PCT = 2.0, 2.0, 1.0
 ELSEWHERE_DEG, ELSEWHERE_PCT = 30.0, 30.0
 FEW = 40
 MEASURES = ("scale_pct", "rotation_deg", "shift_pct")
-# The seven parts of an error, in the order of the stated covariance.
-AXES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z", "scale")
 
 
 def drawn(seed: int, bend: float = 1.0) -> Plan:
@@ -113,7 +111,7 @@ def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads:
     for name, true, stated in (("true", known.scene_from_object, world), ("here", known.here, here)):
         deviation = np.sqrt(np.diag(stated.covariance))
         row |= _errors(name, pose, true, known.centre, trial.diagonal)
-        row |= {f"{name}_over_sd_{k}": off for k, off in zip(AXES, _off(pose, true, at) / deviation)}
+        row |= {f"{name}_over_sd_{k}": off for k, off in zip(AXES, deviations(pose, true, at) / deviation)}
     return {**row, "strict": strict}
 
 
@@ -121,12 +119,6 @@ def _errors(name: str, pose: Sim3, true: Sim3, centre: Array, diagonal: float) -
     """Scale in %, rotation in degrees, shift of the object's centre in % of its diagonal."""
     scale, angle, shift = errors(pose, true, centre, diagonal)
     return {f"{name}_scale_pct": scale, f"{name}_rotation_deg": angle, f"{name}_shift_pct": 100 * shift}
-
-
-def _off(pose: Sim3, true: Sim3, at: Array) -> Array:
-    """(7,) errors of rotation vector, shift at (3,) in the object's frame, and log scale."""
-    turn = Rotation.from_matrix(pose.rotation @ true.rotation.T).as_rotvec()
-    return np.array([*turn, *(pose.apply(at) - true.apply(at)), np.log(pose.scale / true.scale)])
 
 
 def shared_photos(

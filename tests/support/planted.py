@@ -13,10 +13,12 @@ from scenefuse.demo import objects
 from scenefuse.demo.meshes import Part, blob, box, grid, join, lathe, tube
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.free_space import FreeSpace, without_edges
-from scenefuse.transforms import Sim3, rotation_angle_deg
+from scenefuse.transforms import Sim3, rotation_angle_deg, rotation_between
 from scenefuse.workspace import View
 
 OUTER_POINTS = 60000
+# The seven parts of an error, in the order of a stated covariance.
+AXES = ("turn_x", "turn_y", "turn_z", "shift_x", "shift_y", "shift_z", "scale")
 
 
 @dataclass(frozen=True)
@@ -357,3 +359,16 @@ def errors(estimate: Sim3, truth: Sim3, centre_in_object, diagonal, axis=None):
         angle = float(np.degrees(np.arccos(np.clip((turn @ axis) @ axis, -1, 1))))
     shift = np.linalg.norm(estimate.apply(centre_in_object) - truth.apply(centre_in_object)) / diagonal
     return 100 * (estimate.scale / truth.scale - 1), angle, float(shift)
+
+
+def deviations(estimate: Sim3, truth: Sim3, centre_in_object, axis=None):
+    """(7,) errors of rotation vector (radians), shift of a place (3,) in the object's frame, log scale, as in `AXES`.
+
+    Where an axis (3,) in the scene is given, about which the object may turn freely, the turn is the least that brings
+    the axis back to its place.
+    """
+    turn = estimate.rotation @ truth.rotation.T
+    if axis is not None:
+        turn = rotation_between(axis, turn @ axis)
+    shift = estimate.apply(centre_in_object) - truth.apply(centre_in_object)
+    return np.array([*Rotation.from_matrix(turn).as_rotvec(), *shift, np.log(estimate.scale / truth.scale)])

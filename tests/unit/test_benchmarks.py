@@ -10,7 +10,9 @@ from typing import get_args, get_type_hints
 import numpy as np
 import pandas as pd
 import pytest
-from benchmarks import completed_scene, frames_scaling, lego, object_ablation, object_mvs
+from benchmarks import completed_scene, frames_scaling, lego, object_ablation, object_mvs, registration
+from scipy.spatial.transform import Rotation
+from support.planted import AXES, deviations
 
 from scenefuse.fusion.fuse_object import FusionSettings
 from scenefuse.io.clouds import Cloud
@@ -107,6 +109,31 @@ def test_the_table_of_the_completed_scene_compares_with_the_better_source_of_eac
     lines = completed_scene.summary(pd.DataFrame(rows("a", 0.9, 0.8, 0.5) + rows("b", 0.5, 0.8, 0.8))).splitlines()
     fill = next(line for line in lines if line.startswith("fill"))
     assert fill.endswith("-0.050") and fill.count("0.800 ± 0.000") == 4
+
+
+def test_the_table_of_planted_registrations_counts_right_and_refused_apart():
+    def row(right, accepted, over):
+        errors = {"scale_pct": 0.1, "rotation_deg": 0.1, "shift_pct": 0.1, "seconds": 1.0, "cpu_seconds": 1.0}
+        stated = {f"over_sd_{axis}": over for axis in AXES} | {"over_sd_turn_z": np.nan}
+        known = {"method": "scenefuse", "coverage": 0.3, "shape": "urn"}
+        return known | errors | {"right": right, "accepted": accepted} | stated
+
+    trials = [row(True, True, 1.0)] * 5 + [row(True, False, 3.0)] * 3 + [row(False, False, 9.0)] * 2
+    text = registration.summary(pd.DataFrame([*trials, row(False, True, 9.0)]))
+    counts = next(line for line in text.splitlines() if "scenefuse" in line).split()
+    assert counts[2:7] == ["11", "8", "3", "2", "1"]
+    right, accepted = text.splitlines()[-2:]
+    assert right.split()[1:5] == ["right", "62%", "|", "100%"]
+    assert accepted.split()[:4] == ["accepted", "83%", "|", "83%"]
+
+
+def test_the_turn_about_a_free_axis_is_no_deviation():
+    truth, up = Sim3(2.0, Rotation.random(random_state=1).as_matrix(), np.array([1.0, 2, 3])), np.array([0, 0, 1.0])
+    lean, spin = (Rotation.from_rotvec(np.radians(turn)).as_matrix() for turn in ([0.5, 0, 0], [0, 0, 170.0]))
+    estimate = Sim3(2.02, lean @ spin @ truth.rotation, truth.translation + [0, 0, 0.1])
+    found = deviations(estimate, truth, np.zeros(3), up)
+    assert np.allclose(found, [np.radians(0.5), 0, 0, 0, 0, 0.1, np.log(1.01)])
+    assert np.linalg.norm(deviations(estimate, truth, np.zeros(3))[:3]) > np.radians(169)
 
 
 def fields(settings: type) -> set[str]:
