@@ -104,3 +104,16 @@ def test_what_is_gone_is_noticed(tmp_path):
         "`object.masks.gone`, `object.masks.keep`, `object.ply`, `object: { gone: 1 }`, `object: { hold_out_every: 8 }`"
     )
     assert missing_keys(text) == ["object.masks.gone", "object: { gone: 1 }"]
+
+
+def test_the_ten_settings_are_shipped_as_their_table_says():
+    text = (ROOT / "config/README.md").read_text().split("## How to write")[0]
+    rows = re.findall(r"^\| `([a-z0-9_.]+)` \| (\S+) \|", text, flags=re.M)
+    assert len(rows) == 10
+    for path, stated in rows:
+        entry = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
+        for key in path.split("."):
+            entry = entry["properties"][key]
+        shipped = entry["default"]
+        count = {5: "five", 6: "six"}.get(len(shipped)) if isinstance(shipped, list) else None
+        assert stated == count or yaml.safe_load(stated.strip("`")) == shipped, path
