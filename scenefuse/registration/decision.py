@@ -1,7 +1,7 @@
 """May a pose be used? The margin to the best rival, and the gate (method R12)."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -23,6 +23,8 @@ MAX_TILT_DEG = 8.0  # angle between the up directions
 MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
 # A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
 SAME_SHAPE, SAME_COLOR = 0.95, 0.9
+# A pose that may be so far off because the object's own model is bent (`Uncertainty.size`) is none: the model is torn.
+MOST_BENT = 0.1
 
 
 @dataclass(frozen=True)
@@ -108,6 +110,23 @@ def decide(
         "photos": f"by the alignment, against the clouds' best fit, F-score {best.score.f_score:.2f}",
     }[decided_by]
     return Decision(reason is None, reason or words, decided_by, margin, rival, free_axis)
+
+
+def unless_torn(decision: Decision, with_bending: Uncertainty | None, diagonal: float) -> Decision:
+    """The decision, or a refusal where the object's own model may be bent too far.
+
+    Args:
+        decision: by the gate, which counts the uncertainty on the scene as it is.
+        with_bending: the uncertainty with how far the object's model may be bent (method M10); None if unknown.
+        diagonal: of the scene crop.
+    """
+    if with_bending is None or not decision.registered or with_bending.size(diagonal) <= MOST_BENT:
+        return decision
+    reason = (
+        f"the object's model may be bent so far that it lies off by {with_bending.size(diagonal):.0%} of the diagonal, "
+        f"more than {MOST_BENT:.0%}; take more photos between those of the object"
+    )
+    return replace(decision, registered=False, reason=reason)
 
 
 def _rivals(

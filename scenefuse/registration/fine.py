@@ -88,11 +88,13 @@ def register_finely(
     known = Evidence(inputs.ups(), evidence.free_space(scene), alignment)
     problem = Problem(obj, scene, read_scales(prior), known, seed)
     outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
+    bending = evidence.bending(outcome.ranked[0].pose, obj.points.mean(0))
+    outcome = outcome.unless_torn(bending[0], scene.diagonal)
     seconds = time.perf_counter() - start
     if picture is not None:
         draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
     content = _report(outcome, problem, prior, inputs.length_unit(), settings, seconds)
-    write_json(report, content | _stated(outcome, evidence, obj.points.mean(0), inputs.length_unit()))
+    write_json(report, content | _stated(outcome, bending, inputs.length_unit()))
 
 
 def read_candidates(coarse_json: Path) -> list[Candidate]:
@@ -140,11 +142,10 @@ def rests_on(best: Hypothesis, evidence: Evidence) -> list[str]:
     return [name for name, there in known.items() if there]
 
 
-def _stated(outcome: Outcome, evidence: EvidenceFiles, centre: Array, length: str) -> dict[str, Any]:
-    """The standard deviations of the pose: against the world, with what either model may be bent; and on the scene as
-    it is, which the gate counts; `centre` (3,) of the object in its frame."""
+def _stated(outcome: Outcome, bending: tuple[Array | None, Array | None], length: str) -> dict[str, Any]:
+    """The standard deviations of the pose: against the world, with what either model may be bent (covariances of object
+    and scene); and on the scene as it is, which the gate counts."""
     on_scene, pose = outcome.uncertainty, outcome.ranked[0].pose
-    bending = evidence.bending(pose, centre)
     total = None if on_scene is None else with_bending(on_scene, pose, *bending)
     known = [name for name, of in zip(("object", "scene"), bending) if of is not None]
     return {

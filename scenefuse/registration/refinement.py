@@ -7,13 +7,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.coarse import Candidate
-from scenefuse.registration.decision import DecidedBy, Decision, FineSettings, decide
+from scenefuse.registration.decision import DecidedBy, Decision, FineSettings, decide, unless_torn
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
 from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
 from scenefuse.registration.surface import Surface, with_grid, with_queries
-from scenefuse.registration.uncertainty import Uncertainty, half_sampling
+from scenefuse.registration.uncertainty import Uncertainty, half_sampling, with_bending
 from scenefuse.transforms import Array, Sim3
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
@@ -46,6 +46,13 @@ class Outcome:
     ranked: list[Hypothesis]
     decision: Decision
     uncertainty: Uncertainty | None
+
+    def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
+        """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
+        if self.uncertainty is None or bending is None:
+            return self
+        bent = with_bending(self.uncertainty, self.ranked[0].pose, bending, None)
+        return replace(self, decision=unless_torn(self.decision, bent, diagonal))
 
 
 def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:

@@ -17,7 +17,7 @@ from support.photographed_place import Kind
 from support.planted import AXES, deviations, errors
 from support.planted_photos import PhotoTrial, Plan, Truth, calibrated, mapped, plant_photos, truth
 
-from scenefuse.registration.decision import FineSettings
+from scenefuse.registration.decision import MOST_BENT, FineSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.registration.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm.bundle.spread import Spread, spread_of
@@ -79,7 +79,7 @@ def one(seed: int, bend: float) -> dict[str, Any]:
         "shared": value(content, "shared_points"), "matches": value(content, "matches"),
         **_errors("scene", known.here, known.scene_from_object, known.centre, trial.diagonal),
         "misfit_pct": 100 * known.misfit,
-        **(_compared(content, known, trial, spreads) if value(content, "found") else {}),
+        **(_compared(content, known, trial, spreads) if value(content, "found") else {"accepted": False}),
         "planting_s": planted - start, "aligning_s": aligned - planted, "reason": value(content, "reason"),
     }  # fmt: skip
 
@@ -112,7 +112,7 @@ def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads:
         deviation = np.sqrt(np.diag(stated.covariance))
         row |= _errors(name, pose, true, known.centre, trial.diagonal)
         row |= {f"{name}_over_sd_{k}": off for k, off in zip(AXES, deviations(pose, true, at) / deviation)}
-    return {**row, "strict": strict}
+    return {**row, "strict": strict, "accepted": here.size(trial.diagonal) <= MOST_BENT}
 
 
 def _errors(name: str, pose: Sim3, true: Sim3, centre: Array, diagonal: float) -> dict[str, float]:
@@ -155,13 +155,13 @@ def shared_photos(
 
 def summary(table: pd.DataFrame) -> str:
     """The printed tables."""
-    if not table.found.any():
+    if not table.accepted.any():
         return f"all {len(table)} trials are refused"
     groups = {str(kind): table[table.kind == kind] for kind in get_args(Kind)}
     groups |= {f"< {FEW} alike": table[table.alike < FEW], f">= {FEW} alike": table[table.alike >= FEW]}
     groups |= {"twin": table[table.twin], "all": table}
     decisions = pd.DataFrame({name: _decisions(part) for name, part in groups.items()}).T
-    errors_ = pd.DataFrame({name: _precision(part[part.found]) for name, part in groups.items()}).T
+    errors_ = pd.DataFrame({name: _precision(part[part.accepted]) for name, part in groups.items()}).T
     seconds = table[["planting_s", "aligning_s"]].median()
     return "\n\n".join(
         [
@@ -178,7 +178,7 @@ def summary(table: pd.DataFrame) -> str:
 
 def _decisions(part: pd.DataFrame) -> dict[str, int]:
     """Counts: what the gate does, and what the gate for clouds would do beside it."""
-    accepted = part[part.found]
+    accepted = part[part.accepted]
     strict = accepted[accepted.strict.astype(bool)]
     counts = {"trials": len(part), "refused": len(part) - len(accepted)}
     counts |= {f"right {kind}": int(_right(accepted, kind).sum()) for kind in ("true", "here")}

@@ -11,10 +11,11 @@ from support.planted import errors
 from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.io.clouds import Cloud
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.decision import FineSettings
+from scenefuse.registration.decision import Decision, FineSettings, unless_torn
 from scenefuse.registration.problem import Evidence, Problem
 from scenefuse.registration.refinement import refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
+from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.transforms import Sim3
 
 UP, DIAGONAL = np.array([0.0, 0.0, 1.0]), 14.0
@@ -79,3 +80,13 @@ def test_the_same_object_is_registered_where_the_scene_shows_its_distinctive_par
     assert outcome.decision.registered, outcome.decision.reason
     assert is_at(outcome.ranked[0].pose, TRUTH, with_canopy)
     assert is_at(outcome.decision.rival.pose, TURNED, with_canopy)
+
+
+def test_a_pose_is_refused_where_the_objects_own_model_may_be_bent_beyond_use():
+    decision = Decision(True, "good", "photos", 1.0, None, None)
+    assert unless_torn(decision, None, 10.0) is decision
+    assert unless_torn(decision, Uncertainty.even(0.03, 2.0, 0.1), 10.0) is decision
+    torn = unless_torn(decision, Uncertainty.even(0.2, 5.6, 1.7), 10.0)
+    assert not torn.registered and "20% of the diagonal" in torn.reason and "more photos" in torn.reason
+    refused = replace(decision, registered=False, reason="too little")
+    assert unless_torn(refused, Uncertainty.even(0.2, 5.6, 1.7), 10.0).reason == "too little"
