@@ -81,14 +81,14 @@ def test_older_clicks_rerun_what_reads_them_and_nothing_else(plan, name, rules):
     assert plan(replace(name)) == rules
 
 
-def test_a_correction_that_the_page_saves_reruns_the_masks_and_nothing_else(plan):
+def test_a_correction_that_the_page_saves_reruns_the_masks_and_what_they_mark(plan):
     def correct(path):
         (path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t30\t20\n")
         document = Document(path / "prompts.tsv", "labels")
         document.change((*document.rows, Click("outside", "1.jpg", 3, 4)))
         document.save()
 
-    assert plan(correct) == {"make_masks"}
+    assert plan(correct) == {"make_masks", "crop_scene"}
 
 
 def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed(plan):

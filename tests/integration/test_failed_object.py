@@ -75,7 +75,8 @@ def project(tmp_path, snakemake):
     for name in ("clicks.tsv", "prompts.tsv"):
         (tmp_path / name).write_text("")
         os.utime(tmp_path / name, (1e9, 1e9))
-    config = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": {"variants": ["full"]}}
+    registration = {"variants": ["full"], "crop": {"mode": "fiducials"}}
+    config = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": registration}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(config))
 
     def run(*words):

@@ -166,7 +166,7 @@ def new_words(source):
             "scenefuse/registration/refinement.py",
             {"register.py", "registration/register_as_paper.py", "registration/register_finely.py"},
         ),
-        ("scenefuse/masks/grabcut_passes.py", {"masks/make_masks.py"}),
+        ("scenefuse/masks/grabcut_passes.py", {"masks/make_masks.py", "pick.py"}),
         ("scripts/masks/make_masks.py", {"masks/make_masks.py"}),
     ],
 )
