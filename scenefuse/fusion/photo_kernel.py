@@ -46,11 +46,8 @@ def _suitability(angle):
 
 
 @njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
-def _sample(pixels, start, width, height, x, y):
-    """Bilinear grey value at (x, y), pixel centres at +0.5; negative outside the photo."""
-    px, py = x - 0.5, y - 0.5
-    if not (px >= 0.0 and py >= 0.0 and px < width - 1.0 and py < height - 1.0):
-        return np.float32(-1.0)
+def _bilinear(pixels, start, width, px, py):
+    """Grey value between the pixel (px, py) is in and the next ones; px, py inside, pixel centres whole numbers."""
     x0, y0 = int(px), int(py)
     fx, fy = np.float32(px - x0), np.float32(py - y0)
     at = start + y0 * width + x0
@@ -58,6 +55,15 @@ def _sample(pixels, start, width, height, x, y):
     at += width
     lower = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
     return upper * (np.float32(1.0) - fy) + lower * fy
+
+
+@njit(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
+def _sample(pixels, start, width, height, x, y):
+    """Bilinear grey value at (x, y), pixel centres at +0.5; negative outside the photo."""
+    px, py = x - 0.5, y - 0.5
+    if not (px >= 0.0 and py >= 0.0 and px < width - 1.0 and py < height - 1.0):
+        return np.float32(-1.0)
+    return _bilinear(pixels, start, width, px, py)
 
 
 @njit(error_model="numpy")
@@ -204,13 +210,7 @@ def _match(
                 nearness = 1.0 / (mz + a * az + b * bz)
                 px = (mx + a * ax + b * bx) * nearness - 0.5
                 py = (my + a * ay + b * by) * nearness - 0.5
-                x0, y0 = int(px), int(py)
-                fx, fy = np.float32(px - x0), np.float32(py - y0)
-                at = start + y0 * width + x0
-                upper = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
-                at += width
-                lower = np.float32(pixels[at]) * (np.float32(1.0) - fx) + np.float32(pixels[at + 1]) * fx
-                samples[j, k] = upper * (np.float32(1.0) - fy) + lower * fy
+                samples[j, k] = _bilinear(pixels, start, width, px, py)
             ncc[j], square = _correlate(patch, weight, mean, variance, samples[j])
             if j == OFFSETS:
                 spread = square
