@@ -10,7 +10,7 @@ from scenefuse.transforms import Sim3
 
 
 def write_frame_ledger(
-    *, object_json: Path, fine_json: Path, georeference_json: Path | None = None, report: Path
+    *, object_json: Path, fusion_json: Path, georeference_json: Path | None = None, report: Path
 ) -> None:
     """Collect the transforms between the frames of one object (docs/frames.md).
 
@@ -20,7 +20,7 @@ def write_frame_ledger(
 
     Args:
         object_json: JSON of the object cloud, with `nerf_from_object` or `object_from_file`.
-        fine_json: JSON of the fine registration, with `scene_from_object`.
+        fusion_json: JSON of the fusion, with `scene_from_object`, the pose of the added points.
         georeference_json: JSON of the scene, with `crs_from_scene` where it is known.
         report: output JSON; a transform that is not known is null.
 
@@ -30,7 +30,7 @@ def write_frame_ledger(
     known: dict[str, Sim3 | None] = {
         "nerf_from_object": _read(object_json, "nerf_from_object"),
         "object_from_file": _read(object_json, "object_from_file"),
-        "scene_from_object": _read(fine_json, "scene_from_object"),
+        "scene_from_object": _read(fusion_json, "scene_from_object"),
         "world_from_scene": _read(georeference_json, "crs_from_scene"),
     }
     scene, world, nerf = (known[n] for n in ("scene_from_object", "world_from_scene", "nerf_from_object"))
@@ -41,7 +41,7 @@ def write_frame_ledger(
     for name, transform in known.items():
         content[name] = quantity(None if transform is None else transform.matrix, "")
         content[f"{name}_inverse_error"] = quantity(None if transform is None else round_trip(transform), "1")
-    content["status"] = quantity(value(read_json(fine_json), "status"), "")
+    content["status"] = quantity(value(read_json(fusion_json), "registration"), "")
     write_json(report, content)
 
 

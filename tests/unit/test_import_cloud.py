@@ -121,11 +121,11 @@ def test_points_of_an_objects_own_file_reach_the_world_by_the_ledger(tmp_path, c
     pose = np.eye(4)
     pose[:3, :3] *= 3
     pose[:3, 3] = scene[0] - 3 * obj[0]
-    fine = {"scene_from_object": quantity(pose, ""), "status": quantity("registered", "")}
-    write_json(tmp_path / "fine.json", fine)
+    fusion = {"scene_from_object": quantity(pose, ""), "registration": quantity("registered", "")}
+    write_json(tmp_path / "fusion.json", fusion)
     write_frame_ledger(
         object_json=tmp_path / "object.json",
-        fine_json=tmp_path / "fine.json",
+        fusion_json=tmp_path / "fusion.json",
         georeference_json=tmp_path / "georeference.json",
         report=tmp_path / "frames.json",
     )

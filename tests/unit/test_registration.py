@@ -258,16 +258,19 @@ def test_frame_ledger_inverts_every_transform(tmp_path):
     pose = Sim3(2.5, Rotation.random(random_state=1).as_matrix(), np.array([4e5, 5e6, 100.0]))
     write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([0.5, 0.5, 0.5, 1.0]), "")})
     write_json(
-        tmp_path / "f.json", {"scene_from_object": quantity(pose.matrix, ""), "status": quantity("registered", "")}
+        tmp_path / "f.json",
+        {"scene_from_object": quantity(pose.matrix, ""), "registration": quantity("registered", "")},
     )
-    write_frame_ledger(object_json=tmp_path / "o.json", fine_json=tmp_path / "f.json", report=tmp_path / "frames.json")
+    write_frame_ledger(
+        object_json=tmp_path / "o.json", fusion_json=tmp_path / "f.json", report=tmp_path / "frames.json"
+    )
     ledger = read_json(tmp_path / "frames.json")
     assert np.allclose(value(ledger, "scene_from_nerf"), (pose @ Sim3(2.0, np.eye(3), np.zeros(3))).matrix)
     assert value(ledger, "world_from_scene") is None
     assert round_trip(pose) < 1e-8
     write_json(tmp_path / "f.json", {"scene_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
     with pytest.raises(StageError, match="not a similarity"):
-        write_frame_ledger(object_json=tmp_path / "o.json", fine_json=tmp_path / "f.json", report=tmp_path / "x.json")
+        write_frame_ledger(object_json=tmp_path / "o.json", fusion_json=tmp_path / "f.json", report=tmp_path / "x.json")
 
 
 def test_a_scale_at_the_edge_of_its_prior_is_refused(house):

@@ -241,7 +241,7 @@ rule write_frame_ledger:
     """Every transform between the object's frames, in one file."""
     input:
         cloud="results/objects/{object}/object.json",
-        fine="results/objects/{object}/registration/full/fine.json",
+        fusion="results/objects/{object}/fusion.json",
         georeference=in_scene("georeference.json"),
     output:
         "results/objects/{object}/frames.json",
@@ -260,5 +260,5 @@ rule write_frame_ledger:
     message:
         "{wildcards.object}: frame ledger"
     shell:
-        "exec python {params.script} --object-json {input.cloud} --fine-json {input.fine} --georeference-json {input.georeference}"
+        "exec python {params.script} --object-json {input.cloud} --fusion-json {input.fusion} --georeference-json {input.georeference}"
         " --report {output} &> {log}"
