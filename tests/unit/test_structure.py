@@ -11,9 +11,9 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 # In the order in which data flow; each imports only itself and what stands before it.
 PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
-PACKAGES += ["metrics", "report", "pick"]
+PACKAGES += ["metrics", "report", "pick", "two_clouds"]
 # Shared by all, and importing no package.
-SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records"]
+SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records", "version"]
 # The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.
 MAY_IMPORT = {name: {*SHARED, *PACKAGES[: PACKAGES.index(name) + 1]} for name in PACKAGES}
 MAY_IMPORT |= {name: set(SHARED) for name in SHARED}
