@@ -5,20 +5,24 @@ undistortion writes, and what dense stereo, masks and training read. Axes are Op
 pixel centres lie at +0.5.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Rows = NDArray[np.int64]
 
@@ -181,6 +185,8 @@ def read_views(folder: Path) -> list[View]:
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); StageError that names the folder when it cannot be read."""
+    import pycolmap
+
     try:
         return pycolmap.Reconstruction(folder)
     except Exception as error:
@@ -211,6 +217,8 @@ def write_model(folder: Path, views: list[View]) -> None:
 
     Views with the same lens and size share a camera.
     """
+    import pycolmap
+
     model = pycolmap.Reconstruction()
     known: dict[tuple[float, ...], int] = {}
     for number, view in enumerate(views, start=1):
