@@ -80,7 +80,7 @@ class View:
         rows = np.flatnonzero(inside)
         return rows, np.floor(at[rows]).astype(np.int64), depth[rows]
 
-    def resized(self, width: int, height: int) -> "View":
+    def resized(self, width: int, height: int) -> View:
         """The same photo at another size, its pixels averaged over areas: never sharper than they were."""
         if (width, height) == (self.width, self.height):
             return self
@@ -90,7 +90,7 @@ class View:
             pixels = np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), dtype=pixels.dtype)
         return replace(self, intrinsics=shrink @ self.intrinsics, width=width, height=height, pixels=pixels)
 
-    def at_most(self, side_px: int) -> "View":
+    def at_most(self, side_px: int) -> View:
         """The same photo, its longer side at most `side_px`."""
         scale = min(1.0, side_px / max(self.width, self.height))
         return self.resized(round(self.width * scale), round(self.height * scale))
@@ -114,7 +114,7 @@ class Workspace:
     seen: list[Rows]
     seen_at: list[Array]
 
-    def subset(self, rows: Sequence[int]) -> "Workspace":
+    def subset(self, rows: Sequence[int]) -> Workspace:
         """The same workspace with only these of its views, and all sparse points."""
         views, seen = [self.views[k] for k in rows], [self.seen[k] for k in rows]
         return replace(self, views=views, seen=seen, seen_at=[self.seen_at[k] for k in rows])
