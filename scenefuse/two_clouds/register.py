@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
@@ -60,7 +61,7 @@ def register(
     scene: Path,
     out: Path = Path("registered"),
     format: Literal["ply", "laz", "las"] = "ply",
-    fuse: bool = False,
+    fuse: tyro.conf.UseCounterAction[int] = 0,
     known: Known = NOTHING,
     config: Path | None = None,
     seed: int | None = None,

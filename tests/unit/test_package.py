@@ -23,7 +23,18 @@ from scenefuse.version import VERSION
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 CORE, ALL = PROJECT["dependencies"], PROJECT["optional-dependencies"]["all"]
-COMMAND = "from scenefuse.command_line import main; main()"
+COMMAND = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {without}:
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+
+sys.meta_path.insert(0, Absent())
+from scenefuse.command_line import main
+main()
+"""
 
 
 def names(requirements):
@@ -32,11 +43,9 @@ def names(requirements):
 
 def scenefuse(*words, cwd, library=ROOT, without=()):
     """Exit status and output of the command, in a process that cannot import some packages."""
-    gone = f"import sys; sys.modules.update(dict.fromkeys({list(without)})); "
+    program = COMMAND.replace("{without}", repr(list(without)))
     env = os.environ | {"PYTHONPATH": str(library), "COLUMNS": "200"}
-    done = subprocess.run(
-        [sys.executable, "-c", gone + COMMAND, *words], cwd=cwd, env=env, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", program, *words], cwd=cwd, env=env, capture_output=True, text=True)
     return done.returncode, done.stdout + done.stderr
 
 
@@ -44,7 +53,8 @@ def test_two_clouds_are_registered_and_fused_without_what_the_slim_install_leave
     trial = plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
     write_cloud(tmp_path / "house.ply", trial.object)
     write_cloud(tmp_path / "yard.ply", trial.scene)
-    absent = [name.replace("-", "_") for name in names(ALL)]
+    # Pygments comes with IPython, which k3d brings along.
+    absent = [name.replace("-", "_") for name in names(ALL) - {"pygments"}]
     assert {"torch", "pycolmap", "snakemake", "nicegui", "onnxruntime"} <= set(absent)
     words = ("register", "--object", "house.ply", "--scene", "yard.ply", "--fuse")
     status, output = scenefuse(*words, cwd=tmp_path, without=absent)
