@@ -36,7 +36,6 @@ class Completed:
         fill_distance: distance within which both show the same place.
         mode: `fill`, or the mode for comparison that the settings name.
         notes: what a user should know.
-        left_out: columns of the scene that `cloud` does not have.
         seconds: that it took.
     """
 
@@ -46,7 +45,6 @@ class Completed:
     fill_distance: float
     mode: str
     notes: list[str]
-    left_out: list[str]
     seconds: float
 
     @property
@@ -79,18 +77,16 @@ def complete(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, set
     if scene.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
+    if scene.fields:
+        notes.append(f"completed.ply has no {', '.join(sorted(scene.fields))}: the object's points have none")
     kept = with_source(unchecked(scene[fusion.kept]), FROM_SCENE)
     seconds = time.perf_counter() - start
-    return Completed(
-        fusion.kept, kept, added, fusion.fill_distance, settings.mode, notes, sorted(scene.fields), seconds
-    )
+    return Completed(fusion.kept, kept, added, fusion.fill_distance, settings.mode, notes, seconds)
 
 
 def write_completed(out: Path, done: Completed, object: Path, scene: Path) -> list[Path]:
     """Write completed.ply, completed.laz where the scene is LAS or LAZ, and completed.json; returns their paths."""
     notes, crs, written = list(done.notes), las_crs(scene), [out / "completed.ply"]
-    if done.left_out:
-        notes.append(f"completed.ply has no {', '.join(done.left_out)}: the object's points have none")
     write_cloud(written[0], done.cloud)
     if scene.suffix.lower() in (".las", ".laz"):
         written.append(out / "completed.laz")

@@ -102,7 +102,7 @@ def _told(done: Completed) -> str:
         + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
         *done.notes,
     ]
-    return f"<p>{escape('. '.join(said))}. <code>source</code> of completed.ply: 0 scene, 1 object.</p>"
+    return f"<p>{escape('; '.join(said))}. <code>source</code> of completed.ply: 0 scene, 1 object.</p>"
 
 
 def _table(content: dict[str, Any]) -> str:
@@ -110,8 +110,13 @@ def _table(content: dict[str, Any]) -> str:
     fields = flatten(content)
     cells = [
         f'<tr><td class="text">{escape(label)}</td><td class="text">{escape(number(fields[name]["value"]))}'
-        f" {escape(fields[name]['unit'])}</td></tr>"
+        f"{escape(_unit(fields[name]['unit']))}</td></tr>"
         for name, label in ROWS.items()
         if name in fields
     ]
     return f'<h2>Numbers</h2><div class="wide"><table><tbody>{"".join(cells)}</tbody></table></div>'
+
+
+def _unit(unit: str) -> str:
+    """A unit behind its number; nothing for a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"

@@ -70,6 +70,15 @@ def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own
     assert not {rule for rule in rules if not rule.startswith("completion_")} - {"count_points"}
 
 
+def test_a_prefix_would_not_reach_all_files_and_is_refused(yard):
+    text = OTHER.format(snakefile=ROOT / "workflow/Snakefile")
+    text = text.replace("    config:", "    prefix:\n        'part'\n    config:")
+    (yard / "mine.yaml").write_text("completion: { seed: 1 }\n")
+    (yard / "Snakefile").write_text(text)
+    status, output = plan(yard)
+    assert status != 0 and "`prefix` and `replace_prefix` of a module do not reach" in output
+
+
 def test_a_wrong_setting_of_the_module_is_named(yard):
     (yard / "mine.yaml").write_text("completion: { fusion: { mod: fill } }\n")
     (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))

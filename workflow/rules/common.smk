@@ -17,6 +17,11 @@ from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
 
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
+if workflow.modifier.path_modifier.replace_prefix("results") != "results":
+    raise WorkflowError(
+        "scenefuse names its files in commands and settings too, which `prefix` and `replace_prefix` of a module do not"
+        " reach; leave them out"
+    )
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
