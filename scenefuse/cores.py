@@ -4,7 +4,6 @@ import contextlib
 from typing import Any
 
 import cv2
-import torch
 
 nb: Any = None
 with contextlib.suppress(ImportError):
@@ -16,6 +15,8 @@ with contextlib.suppress(ImportError):
 
 def use_threads(count: int) -> None:
     """Let PyTorch, Numba and OpenCV use `count` threads each."""
+    import torch
+
     cv2.setNumThreads(count)
     if nb is not None:
         nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))

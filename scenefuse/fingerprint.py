@@ -27,12 +27,14 @@ from scenefuse.stage import atomic_file
 # Packages that are imported by another name than they are installed by, most likely first.
 DISTRIBUTIONS = {
     "PIL": ("pillow",),
+    "open3d": ("open3d", "open3d-cpu"),
     "cv2": ("opencv-python-headless", "opencv-python", "opencv-contrib-python-headless", "opencv-contrib-python"),
     "yaml": ("pyyaml",),
 }
 IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
 REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
 MOST_REMEMBERED = 5000
+LIBRARY = Path(__file__).resolve().parent
 OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered
 # A file of a user up to this size is read whole; of a larger one only size and date are looked at.
 LARGEST_READ_BYTES = 200_000
@@ -49,7 +51,9 @@ class _Module(NamedTuple):
 
 @functools.cache
 def fingerprint(script: Path, root: Path) -> str:
-    """Twelve hex digits that identify `script`, all modules below `root` that it reaches, and the versions of packages.
+    """Twelve hex digits that identify `script`, all modules of the project that it reaches, and versions of packages.
+
+    The project is what lies below `root`, and this library, which lies elsewhere where it was installed.
 
     Raises:
         SyntaxError: a module does not parse.
@@ -60,7 +64,8 @@ def fingerprint(script: Path, root: Path) -> str:
         if path not in modules:
             modules[path] = _module(path, root)
             todo += modules[path].files
-    lines = [f"{path.relative_to(root).as_posix()} {modules[path].code}" for path in sorted(modules)]
+    names = {path.relative_to(_above(path, root)).as_posix(): module for path, module in modules.items()}
+    lines = [f"{name} {names[name].code}" for name in sorted(names)]
     lines += [f"{name} {_version(name)}" for name in sorted(set().union(*(m.packages for m in modules.values())))]
     return _digest("\n".join(lines))
 
@@ -90,7 +95,7 @@ def _module(path: Path, root: Path) -> _Module:
         known[key] = _digest(_normalised(source, path))
     names = set(imported_names(source, path, root))
     files: frozenset[Path] = frozenset().union(*(_files(name, root) for name in names))
-    packages = {name.split(".")[0] for name in names if not _in_project(name.split(".")[0], root)}
+    packages = {name.split(".")[0] for name in names if _home(name.split(".")[0], root) is None}
     return _Module(known[key], files, frozenset(packages - sys.stdlib_module_names))
 
 
@@ -124,17 +129,26 @@ def _remember(known: dict[str, str], before: int) -> None:
 
 
 @functools.cache
-def _in_project(top: str, root: Path) -> bool:
-    return (root / top).is_dir() or (root / f"{top}.py").is_file()
+def _home(top: str, root: Path) -> Path | None:
+    """The folder that holds a module of the project by its first name; None for any other package."""
+    if (root / top).is_dir() or (root / f"{top}.py").is_file():
+        return root
+    return LIBRARY.parent if top == LIBRARY.name else None
+
+
+def _above(path: Path, root: Path) -> Path:
+    """The folder that names of a module begin at."""
+    return root if path.is_relative_to(root) else LIBRARY.parent
 
 
 @functools.cache
 def _files(name: str, root: Path) -> frozenset[Path]:
     """The project's files that Python runs to import a dotted name."""
     parts = name.split(".")
-    if not _in_project(parts[0], root):
+    home = _home(parts[0], root)
+    if home is None:
         return frozenset()
-    stem = root.joinpath(*parts)
+    stem = home.joinpath(*parts)
     here = [file for file in (stem / "__init__.py", stem.with_name(f"{stem.name}.py")) if file.is_file()]
     return frozenset(here).union(_files(".".join(parts[:-1]), root) if len(parts) > 1 else ())
 
@@ -145,7 +159,7 @@ def imported_names(source: str, module: Path, root: Path) -> Iterator[str]:
         names = re.findall(r"(?:^|,)\s*([\w.]+)", re.sub(r"#[^\n]*|[()\\]", "", listed))
         if base.startswith("."):
             above = len(base) - len(base.lstrip("."))
-            package = module.relative_to(root).parent.parts
+            package = module.relative_to(_above(module, root)).parent.parts
             base = ".".join([*package[: len(package) - above + 1], *filter(None, [base[above:]])])
         yield from [base, *(f"{base}.{name}" for name in names)] if base else names
 
@@ -167,5 +181,5 @@ def _digest(text: str) -> str:
 
 def forget() -> None:
     """Read all files and versions again."""
-    for cached in (fingerprint, files_fingerprint, _module, _in_project, _files, _version):
+    for cached in (fingerprint, files_fingerprint, _module, _home, _files, _version):
         cached.cache_clear()

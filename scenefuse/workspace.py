@@ -5,20 +5,24 @@ undistortion writes, and what dense stereo, masks and training read. Axes are Op
 pixel centres lie at +0.5.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.io.pictures import read_gray, read_rgb
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Rows = NDArray[np.int64]
 
@@ -76,7 +80,7 @@ class View:
         rows = np.flatnonzero(inside)
         return rows, np.floor(at[rows]).astype(np.int64), depth[rows]
 
-    def resized(self, width: int, height: int) -> "View":
+    def resized(self, width: int, height: int) -> View:
         """The same photo at another size, its pixels averaged over areas: never sharper than they were."""
         if (width, height) == (self.width, self.height):
             return self
@@ -86,7 +90,7 @@ class View:
             pixels = np.asarray(cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA), dtype=pixels.dtype)
         return replace(self, intrinsics=shrink @ self.intrinsics, width=width, height=height, pixels=pixels)
 
-    def at_most(self, side_px: int) -> "View":
+    def at_most(self, side_px: int) -> View:
         """The same photo, its longer side at most `side_px`."""
         scale = min(1.0, side_px / max(self.width, self.height))
         return self.resized(round(self.width * scale), round(self.height * scale))
@@ -110,7 +114,7 @@ class Workspace:
     seen: list[Rows]
     seen_at: list[Array]
 
-    def subset(self, rows: Sequence[int]) -> "Workspace":
+    def subset(self, rows: Sequence[int]) -> Workspace:
         """The same workspace with only these of its views, and all sparse points."""
         views, seen = [self.views[k] for k in rows], [self.seen[k] for k in rows]
         return replace(self, views=views, seen=seen, seen_at=[self.seen_at[k] for k in rows])
@@ -181,6 +185,8 @@ def read_views(folder: Path) -> list[View]:
 
 def read_model(folder: Path) -> pycolmap.Reconstruction:
     """Read a COLMAP model (binary or text); StageError that names the folder when it cannot be read."""
+    import pycolmap
+
     try:
         return pycolmap.Reconstruction(folder)
     except Exception as error:
@@ -211,6 +217,8 @@ def write_model(folder: Path, views: list[View]) -> None:
 
     Views with the same lens and size share a camera.
     """
+    import pycolmap
+
     model = pycolmap.Reconstruction()
     known: dict[tuple[float, ...], int] = {}
     for number, view in enumerate(views, start=1):

@@ -1,7 +1,7 @@
-"""Register two clouds of any known format on their own, without the workflow."""
+"""Register two clouds of any known format on their own, without the workflow, and fuse them."""
 
-from scenefuse.registration.register import register
 from scenefuse.stage import run
+from scenefuse.two_clouds.register import register
 
 if __name__ == "__main__":
     run(register)

@@ -13,6 +13,7 @@ from scenefuse.fusion.fuse_object import FROM_OBJECT, FROM_SCENE, together, with
 from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.version import VERSION
 
 
 @dataclass(frozen=True)
@@ -72,6 +73,7 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
     crs = write_scene(completed, completed_laz, whole, inputs.georeference_json)
     content = _report(whole, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
         "crs": quantity(crs, ""),
+        "version": quantity(VERSION, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)

@@ -36,7 +36,7 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
     crs = las_crs(source)
     unit, name = "scene units", None
     if crs is not None:
-        unit, name = _unit_and_name(crs)
+        unit, name = unit_and_name(crs)
     origin = near_origin(own.points)
     shift = Sim3(1.0, np.eye(3), origin)
     placed = replace(own, points=own.points - origin)
@@ -122,7 +122,7 @@ def _report(cloud: Cloud, unit: str, content: dict[str, Any]) -> dict[str, Any]:
     } | content
 
 
-def _unit_and_name(crs: str) -> tuple[str, str]:
+def unit_and_name(crs: str) -> tuple[str, str]:
     """The unit of a projected CRS, "m" for metres, and its name: an EPSG code where it has one, else its WKT."""
     import pyproj
 

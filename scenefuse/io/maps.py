@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError
@@ -11,6 +10,8 @@ from scenefuse.stage import StageError
 
 def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
     """Write an (H, W) float32 map of depths along the camera's z axis; 0 marks pixels without a depth."""
+    import pycolmap
+
     valid = depth[depth > 0]
     low, high = (float(valid.min()), float(valid.max())) if valid.size else (0.0, 0.0)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -19,6 +20,8 @@ def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
 
 def read_depth(path: Path) -> NDArray[np.float32]:
     """Read an (H, W) float32 map (depth or confidence); StageError when the file is missing or damaged."""
+    import pycolmap
+
     depth_map = pycolmap.DepthMap()
     try:
         depth_map.read(path)

@@ -12,7 +12,10 @@ import yaml
 
 from scenefuse.stage import StageError
 
-ROOT = Path(__file__).resolve().parents[2]
+PACKAGE = Path(__file__).resolve().parents[1]
+SHIPPED = PACKAGE / "shipped"
+ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
+"""Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's."""
 T = TypeVar("T")
 
 

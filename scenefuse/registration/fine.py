@@ -16,7 +16,6 @@ from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem,
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.score import Hypothesis
 from scenefuse.registration.uncertainty import Uncertainty, uncertainty_quantities, with_bending
-from scenefuse.sfm.bundle.spread import read_spread
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -43,6 +42,8 @@ class EvidenceFiles:
 
     def bending(self, pose: Sim3, centre: Array) -> tuple[Array | None, Array | None]:
         """(7, 7) covariances of both models around the object's centre (3,), None where they are not known."""
+        from scenefuse.sfm.bundle.spread import read_spread
+
         places = ((self.object_spread, centre), (self.scene_spread, pose.apply(centre)))
         of_object, of_scene = (None if path is None else read_spread(path).covariance_at(at) for path, at in places)
         return of_object, of_scene

@@ -1,15 +1,12 @@
-"""Registration on its own: two clouds in, a decision, a transform and a picture out; the workflow's steps in memory."""
+"""Registration of two clouds in memory: a decision and a transform, by the steps of the workflow."""
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from scenefuse.io.alignment_picture import draw_alignment
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.io.formats import las_crs
+from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
@@ -23,14 +20,13 @@ from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
 from scenefuse.registration.uncertainty import uncertainty_quantities
 from scenefuse.sfm.fiducials import ScenePoints, read_points
-from scenefuse.stage import StageError, quantity, write_json
+from scenefuse.stage import StageError, quantity
 from scenefuse.transforms import Array, Sim3
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
 # Points in which too few different ones are looked for before all are counted.
 SAMPLE = 20_000
-REGISTERED, UNREGISTERED = 0, 3
 Direction = tuple[float, float, float]
 # Wrong poses that the gate accepted on the planted trials of docs/results.md, with all three and with shape alone.
 PLANTED = {True: (0, 336, "with colours, gravity and depth maps"), False: (3, 224, "with shape alone")}
@@ -217,67 +213,6 @@ def cut_scene(
     return scene[cut.keep], said
 
 
-def register(
-    *,
-    object: Path,
-    scene: Path,
-    out: Path = Path("registered"),
-    format: Literal["ply", "laz", "las"] = "ply",
-    known: Known = Known(),
-    config: Path | None = None,
-    seed: int | None = None,
-) -> int:
-    """Find the place, size and orientation of one point cloud in another, or refuse.
-
-    Reads PLY, LAS, LAZ, E57, PCD, XYZ, PTS, TXT, ASC and CSV. Exit status: 0 registered, 3 unregistered, 1 bad input.
-    docs/register.md says how to read what it writes.
-
-    Args:
-        object: cloud of the object, in any frame and unit.
-        scene: cloud that shows the object.
-        out: folder for transform.json, picture.png and, if registered, object_in_scene.
-        format: of object_in_scene, which has the object's points in the scene's coordinates.
-        known: what is known beforehand.
-        config: YAML of settings that differ from the shipped ones, with the keys of config/config.yaml.
-        seed: of all random choices; the config's if not given.
-    """
-    start = time.perf_counter()
-    settings, shipped_seed = RegistrationSettings.read(config)
-    seed = shipped_seed if seed is None else seed
-    known.check()
-    if out.exists() and not out.is_dir():
-        raise StageError(f"--out {out} is a file; give a folder")
-    (up_object, up_scene), scales = known.ups(), known.scales()
-    ups = None if up_object is None or up_scene is None else (up_object, up_scene)
-    cloud, whole = read_cloud(object), read_cloud(scene)
-    box = None if known.crop_box is None else np.array(known.crop_box)
-    part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
-    found = register_clouds(cloud, part, settings, seed, ups=ups, scales=scales)
-    files = {"object": object, "scene": scene, "object_points": len(cloud), "scene_points": len(whole)}
-    evidence = evidence_of(cloud, part, ups)
-    context = {
-        "evidence": quantity(evidence, ""),
-        "searched": quantity(searched, ""),
-        "inputs": quantity(files, ""),
-        "seed": quantity(seed, ""),
-        "seconds": quantity(time.perf_counter() - start, "s"),
-    }
-    for earlier in ("picture.png", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"):
-        (out / earlier).unlink(missing_ok=True)
-    written = [out / "transform.json"]
-    write_json(written[0], report(found, ups) | context)
-    print("\n".join(summary(found, searched, ups, evidence)), flush=True)
-    pose = found.scene_from_object
-    if pose is not None:
-        written.append(out / "picture.png")
-        draw_alignment(written[-1], cloud, part, pose, seed)
-    if pose is not None and found.registered:
-        written.append(out / f"object_in_scene.{format}")
-        _write(written[-1], cloud.transformed(pose), las_crs(scene))
-    print(f"written    {', '.join(map(str, written))}", flush=True)
-    return REGISTERED if found.registered else UNREGISTERED
-
-
 def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, Any]:
     """The content of transform.json: names, values and units as in the workflow's fine.json and metrics.json."""
     content = {
@@ -359,11 +294,3 @@ def _at_most(cloud: Cloud, most: int, seed: int) -> Cloud:
     if len(cloud) <= most:
         return cloud
     return cloud[np.sort(np.random.default_rng(seed).permutation(len(cloud))[:most])]
-
-
-def _write(path: Path, cloud: Cloud, crs: str | None) -> None:
-    if path.suffix == ".ply":
-        write_cloud(path, cloud)
-        return
-    origin = np.floor(cloud.points.min(0))
-    write_laz(path, replace(cloud, points=cloud.points - origin), origin, crs)

@@ -1,4 +1,15 @@
-"""Style and script of the report page: no file beside it, no network, readable on paper."""
+"""A page in one file: style, script and pictures in it, no network, readable on paper."""
+
+import base64
+import io
+from html import escape
+from pathlib import Path
+
+from PIL import Image as Picture
+
+from scenefuse.report.view.view_page import view_library
+from scenefuse.report.view.view_script import VIEW_SCRIPT, VIEW_STYLE
+from scenefuse.stage import StageError
 
 STYLE = """
 :root { --ink: #1d2329; --soft: #5b6670; --line: #dfe3e7; --accent: #c7560b; }
@@ -47,3 +58,27 @@ for (const range of document.querySelectorAll(".range")) {
   });
 }
 """
+
+
+def document(title: str, body: list[str], has_views: bool) -> str:
+    """An HTML page of these parts; with the library that draws 3D views, if it has some."""
+    style, script = (STYLE + VIEW_STYLE, SCRIPT + VIEW_SCRIPT) if has_views else (STYLE, SCRIPT)
+    content = "\n".join([*body, *([view_library()] if has_views else [])])
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{style}</style>\n</head>\n'
+        f"<body>\n{content}\n<script>{script}</script>\n</body>\n</html>\n"
+    )
+
+
+def embedded(path: Path, alt: str) -> str:
+    """An <img> that holds the picture, as WebP: a third of the PNG's size; StageError where it is none."""
+    buffer = io.BytesIO()
+    try:
+        with Picture.open(path) as opened:
+            size = opened.size
+            opened.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
+    except OSError as error:
+        raise StageError(f"{path} is not a readable picture ({error}); draw the figures again") from None
+    data = base64.b64encode(buffer.getvalue()).decode()
+    return f'<img src="data:image/webp;base64,{data}" width="{size[0]}" height="{size[1]}" alt="{escape(alt)}">'

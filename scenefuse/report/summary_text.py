@@ -21,6 +21,7 @@ from scenefuse.report.tables import (
     truth_numbers,
 )
 from scenefuse.report.values import Fields, find, number, unit_of
+from scenefuse.version import VERSION
 
 WIDTH = 100
 _COLUMNS = ("value", *BESIDE)
@@ -41,7 +42,7 @@ def summary_text(
     done += f", {statuses.count('ungated')} fused without a check of the pose" if "ungated" in statuses else ""
     for item, row in zip(objects, records(tables["objects"])):
         lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
-    lines += _heading(done) + _runtime_lines(tables["runtime"])
+    lines += _heading(done) + _runtime_lines(tables["runtime"]) + _line("scenefuse", VERSION)
     return "\n".join(lines) + "\n"
 
 

@@ -1,20 +1,15 @@
 """One HTML page of a run that opens anywhere without a network: pictures embedded, tables, notes for reading them."""
 
-import base64
 import csv
-import io
 from dataclasses import replace
 from html import escape
 from pathlib import Path
 
-from PIL import Image as Picture
-
-from scenefuse.report.page import SCRIPT, STYLE
+from scenefuse.report.page import document, embedded
 from scenefuse.report.values import number
 from scenefuse.report.view.view_file import View, read_view
-from scenefuse.report.view.view_page import view_library, view_section
+from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import thin
-from scenefuse.report.view.view_script import VIEW_SCRIPT, VIEW_STYLE
 from scenefuse.stage import StageError, atomic_file
 
 PAGE_POINTS = 700_000
@@ -97,13 +92,7 @@ def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], titl
         *(_table_section(name, rows) for name, rows in tables.items() if rows),
         f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
     ]
-    style, script = (STYLE + VIEW_STYLE, SCRIPT + VIEW_SCRIPT) if views else (STYLE, SCRIPT)
-    content = "\n".join([*body, *([view_library()] if views else [])])
-    page = (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{style}</style>\n</head>\n'
-        f"<body>\n{content}\n<script>{script}</script>\n</body>\n</html>\n"
-    )
+    page = document(title, body, bool(views))
     with atomic_file(report) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{report}: {len(page) / 1e6:.1f} MB", flush=True)
@@ -156,8 +145,8 @@ def _object_section(folder: Path, registration: list[dict[str, str]], view: View
     before, after = figure_folder / "before.png", figure_folder / "after.png"
     if before.is_file() and after.is_file():
         parts.append(
-            f'<div class="slider"><figure class="before">{_image(before, "before")}<figcaption>before</figcaption>'
-            f'</figure><figure class="after">{_image(after, "after")}<figcaption>after</figcaption></figure></div>'
+            f'<div class="slider"><figure class="before">{embedded(before, "before")}<figcaption>before</figcaption>'
+            f'</figure><figure class="after">{embedded(after, "after")}<figcaption>after</figcaption></figure></div>'
             '<input class="range" type="range" min="0" max="100" value="50" aria-label="before and after">'
         )
     figures = [(figure_folder / f"{name}.png", caption) for name, caption in _OBJECT_FIGURES.items()]
@@ -210,17 +199,4 @@ def _read_table(path: Path) -> list[dict[str, str]]:
 
 
 def _picture(path: Path, caption: str) -> str:
-    return f"<figure>{_image(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
-def _image(path: Path, alt: str) -> str:
-    """The picture inside the page, as WebP: a third of the PNG's size."""
-    buffer = io.BytesIO()
-    try:
-        with Picture.open(path) as opened:
-            size = opened.size
-            opened.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
-    except OSError as error:
-        raise StageError(f"{path} is not a readable picture ({error}); draw the figures again") from None
-    data = base64.b64encode(buffer.getvalue()).decode()
-    return f'<img src="data:image/webp;base64,{data}" width="{size[0]}" height="{size[1]}" alt="{escape(alt)}">'
+    return f"<figure>{embedded(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -1,15 +1,20 @@
 """What a person marked: clicks on points, triangulated through the cameras, points in the scene frame, or labels."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.stage import StageError
 from scenefuse.workspace import read_model
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Array = NDArray[np.float64]
 CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]

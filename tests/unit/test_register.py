@@ -13,9 +13,10 @@ from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.register import Known, RegistrationSettings, register, register_clouds
+from scenefuse.registration.register import Known, RegistrationSettings, register_clouds
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
+from scenefuse.two_clouds.register import register
 
 ROOT = Path(__file__).resolve().parents[2]
 # Less work than shipped, where only the course of the computation matters.
@@ -114,7 +115,7 @@ def test_the_transform_is_kept_when_the_object_cannot_be_written(tmp_path, house
 
     write_cloud(tmp_path / "scene.ply", house.scene)
     write_cloud(tmp_path / "house.ply", house.object)
-    monkeypatch.setattr("scenefuse.registration.register.write_cloud", full_disk)
+    monkeypatch.setattr("scenefuse.two_clouds.register.write_cloud", full_disk)
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     with pytest.raises(StageError, match="could not be written"):
         register(object=tmp_path / "house.ply", scene=tmp_path / "scene.ply", out=tmp_path / "out")

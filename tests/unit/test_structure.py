@@ -11,14 +11,15 @@ ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 # In the order in which data flow; each imports only itself and what stands before it.
 PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
-PACKAGES += ["metrics", "report", "pick"]
+PACKAGES += ["metrics", "report", "pick", "two_clouds"]
 # Shared by all, and importing no package.
-SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records"]
+SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records", "version"]
 # The demo writes captures and knows nothing of the packages but how to read and write; config knows all settings.
 MAY_IMPORT = {name: {*SHARED, *PACKAGES[: PACKAGES.index(name) + 1]} for name in PACKAGES}
 MAY_IMPORT |= {name: set(SHARED) for name in SHARED}
 MAY_IMPORT["metrics"] |= {"demo.cameras"}
 MAY_IMPORT |= {"demo": {*SHARED, "io", "workspace", "demo"}, "config": {*SHARED, *PACKAGES, "demo"}}
+MAY_IMPORT |= {"new_project": {*SHARED, "io"}, "command_line": {*SHARED, *PACKAGES, "new_project"}}
 MOST_MODULES = 16
 CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
 CORE += ("appearance", "pose_refinement")

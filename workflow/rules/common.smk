@@ -11,11 +11,20 @@ from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
+from scenefuse.io.settings import ROOT as SHIPPED
 from scenefuse.machine import has_gpu, memory_mb
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
 
-ROOT = Path(workflow.basedir)
+# The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
+if workflow.modifier.path_modifier.replace_prefix("results") != "results":
+    raise WorkflowError(
+        "scenefuse names its files in commands and settings too, which `prefix` and `replace_prefix` of a module do not"
+        " reach; leave them out"
+    )
+ROOT = Path(str(workflow.current_basedir)).parents[1]
+if not (ROOT / "scripts").is_dir():
+    ROOT = SHIPPED
 # Jobs find the project's scripts, its package and this environment's Python without an activated shell.
 os.environ.update(
     SCENEFUSE=str(ROOT),

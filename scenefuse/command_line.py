@@ -1,0 +1,88 @@
+"""The command `scenefuse`: parts that hand over to what does the work; nothing is imported before it is needed."""
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+
+from scenefuse.version import VERSION
+
+ALL = "pip install 'scenefuse[all]'"
+OWN_SETTINGS = Path("config/config.yaml")
+
+
+def main() -> None:
+    """Run the part that the first word names with the others; an unknown one or none ends in a message and status 2."""
+    parser = argparse.ArgumentParser(
+        prog="scenefuse",
+        description="Complete single objects in a drone reconstruction by close-up photos, or a cloud by another.",
+        epilog="\n".join(f"{name:10}{part.__doc__}" for name, part in PARTS.items()),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"scenefuse {VERSION}")
+    parser.add_argument("part", choices=PARTS, help="what to do; scenefuse PART --help says more", metavar="PART")
+    part = parser.parse_args(sys.argv[1:2]).part
+    sys.argv = [f"scenefuse {part}", *sys.argv[2:]]
+    try:
+        PARTS[part]()
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.startswith("scenefuse"):
+            raise
+        sys.exit(f"error: scenefuse {part} needs {error.name}, which is not installed; {ALL}")
+
+
+def _register() -> None:
+    """lay one cloud on another, and fuse both"""
+    from scenefuse.stage import run
+    from scenefuse.two_clouds.register import register
+
+    run(register)
+
+
+def _nerf() -> None:
+    """train a NeRF on posed photos"""
+    from scenefuse.nerf.train_nerf import train_nerf
+    from scenefuse.stage import run
+
+    run(train_nerf)
+
+
+def _pick() -> None:
+    """click in a page what an object is in its photos"""
+    from scenefuse.pick.pick import pick
+    from scenefuse.stage import run
+
+    run(pick)
+
+
+def _init() -> None:
+    """make a folder for a project of your own"""
+    from scenefuse.new_project import init
+    from scenefuse.stage import run
+
+    run(init)
+
+
+def _run() -> None:
+    """run the workflow in this folder, by Snakemake and with its options"""
+    from scenefuse.io.settings import ROOT
+
+    if find_spec("snakemake") is None:
+        raise ModuleNotFoundError(name="snakemake")
+    words = sys.argv[1:]
+    if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
+        words = ["--configfile", str(OWN_SETTINGS), *words]
+    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), *words]
+    # The process becomes Snakemake: signals and the exit status are its own.
+    os.execv(sys.executable, command)
+
+
+PARTS: dict[str, Callable[[], None]] = {
+    "register": _register,
+    "init": _init,
+    "pick": _pick,
+    "run": _run,
+    "nerf": _nerf,
+}

@@ -1,0 +1,87 @@
+"""A folder for a project of one's own: tables, settings and a text that says what comes next."""
+
+import re
+from pathlib import Path
+
+import tyro
+
+from scenefuse.io.formats import READERS
+from scenefuse.io.settings import ROOT, schema_of
+from scenefuse.stage import StageError
+
+SCENES = ("scene", "photos", "cloud")
+OBJECTS = ("object", "scene", "photos", "cloud", "prompts", "fiducials")
+SETTINGS = """\
+# Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
+# {root}/config/README.md
+gpu: auto # GPUs that a stereo or training job asks for; auto: 1 where this machine has an NVIDIA card
+"""
+README = """\
+# {name}
+
+1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud.
+2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
+   In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.
+3. `scenefuse pick --configfile config/config.yaml --object NAME`: click on an object in its photos; not for a cloud.
+4. `scenefuse run -n` says what would run, `scenefuse run --cores 2` runs it; options are Snakemake's.
+5. Look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
+"""
+
+
+def init(folder: tyro.conf.Positional[Path], *, scene: Path | None = None, objects: tuple[Path, ...] = ()) -> None:
+    """Make a folder for a project of your own: config/scenes.tsv, config/objects.tsv, config/config.yaml, README.md.
+
+    Args:
+        folder: of the project; it may exist, but not hold a project.
+        scene: photos of the scene (a folder), or its cloud, for the first row of scenes.tsv.
+        objects: the same of objects in it (a folder or a video, or a cloud), for the rows of objects.tsv.
+
+    Raises:
+        StageError: the folder is a file or holds a project, a path does not exist, two names are the same, or there are
+            objects without a scene.
+    """
+    if objects and scene is None:
+        raise StageError("--objects needs --scene as well: an object lies in a scene")
+    names = [_name(path) for path in objects]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
+    lying_in = "" if scene is None else _name(scene)
+    scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder)]
+    rows = [{"object": name, "scene": lying_in} | _source(path, folder) for name, path in zip(names, objects)]
+    texts = {
+        "config/scenes.tsv": _table("scenes", SCENES, scenes),
+        "config/objects.tsv": _table("objects", OBJECTS, rows),
+        "config/config.yaml": SETTINGS.format(root=ROOT),
+        "README.md": README.format(name=folder.resolve().name),
+    }
+    for path in (folder / name for name in texts):
+        if path.exists() or (folder.exists() and not folder.is_dir()):
+            raise StageError(f"{path if folder.is_dir() else folder} exists already; give a new folder")
+    for name, text in texts.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text, encoding="utf-8")
+    print(f"{folder}/README.md says what comes next", flush=True)
+
+
+def _name(path: Path) -> str:
+    """A name for the tables from that of a file or folder."""
+    stem = path.stem if path.is_file() else path.resolve().name
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", stem).lstrip("-") or "_"
+
+
+def _source(path: Path, folder: Path) -> dict[str, str]:
+    """The cell of a row that names photos or a cloud, relative to the project where it lies in it."""
+    if not path.exists():
+        raise StageError(f"{path} does not exist; give a folder of photos, a video or a cloud")
+    place, project = path.resolve(), folder.resolve()
+    cell = place.relative_to(project) if place.is_relative_to(project) else place
+    is_cloud = path.is_file() and path.suffix.lower() in READERS
+    return {"cloud" if is_cloud else "photos": cell.as_posix()}
+
+
+def _table(kind: str, columns: tuple[str, ...], rows: list[dict[str, str]]) -> str:
+    """A table with these columns and rows, and what belongs in all columns that there may be."""
+    about = [f"# {name}: {column['description']}" for name, column in schema_of(kind)["properties"].items()]
+    lines = ["\t".join(columns), *("\t".join(row.get(name, "") for name in columns) for row in rows)]
+    return "\n".join([*about, *lines]) + "\n"

@@ -1,0 +1,1 @@
+"""Two clouds on their own, without the workflow: one registered in the other, both fused, and a page about it."""

@@ -1,0 +1,122 @@
+"""The page of a registration of two clouds: decision, 3D view before and after, picture, numbers, matrix."""
+
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.io.clouds import Cloud
+from scenefuse.report.page import document, embedded
+from scenefuse.report.values import flatten, number
+from scenefuse.report.view.view_file import View
+from scenefuse.report.view.view_page import view_section
+from scenefuse.report.view.view_points import REMOVED, merge, thin, within
+from scenefuse.stage import atomic_file, value
+from scenefuse.transforms import Array, Sim3, rotation_between
+from scenefuse.two_clouds.complete import Completed
+
+VIEW_POINTS = 300_000
+REACH = 0.35
+"""How far around the object the view shows the scene, over the object's diagonal."""
+AZIMUTH_DEG, ELEVATION_DEG = -60.0, 20.0
+UP = np.array([0.0, 0.0, 1.0])
+ROWS = {
+    "scale": "scale",
+    "scale_sd_log": "its standard deviation (log)",
+    "rotation_sd_deg": "standard deviation of the rotation",
+    "translation_sd": "standard deviation of the position",
+    "f_score": "F-score",
+    "margin": "margin to the best other pose",
+    "agreement.fitness": "share of the scene part with an object point within tau",
+    "agreement.fitness_source": "share of the object with a scene point within tau",
+    "agreement.inlier_rmse": "distance of these (RMS)",
+    "agreement.tau": "tau",
+    "evidence": "what the decision rests on",
+    "searched": "searched",
+    "version": "scenefuse",
+}
+"""Quantities of transform.json that the page lists."""
+
+
+def write_page(
+    page: Path, content: dict[str, Any], picture: Path, scene: Cloud, done: Completed | None, up: Array | None
+) -> None:
+    """Write one HTML file that needs no other and no network.
+
+    Args:
+        page: output.
+        content: of transform.json.
+        picture: of the alignment; left out where no pose was found.
+        scene: the scene before.
+        done: the scene completed; None where the pose was refused.
+        up: (3,) unit up direction in the scene; z where it is not known.
+    """
+    inputs, status = value(content, "inputs"), value(content, "status")
+    names = Path(inputs["object"]).name, Path(inputs["scene"]).name
+    title = f"{names[0]} in {names[1]}"
+    badge = f'<span class="badge {"ok" if status == "registered" else "no"}">{escape(status)}</span>'
+    parts = [f"<h1>{escape(title)}{badge}</h1>", f"<p>{escape(value(content, 'reason'))}</p>"]
+    if done is None:
+        parts.append("<p>The pose was refused, so there is no completed scene.</p>")
+    else:
+        parts += [_told(done), view_section("scene", title, view_of(names[0], scene, done, up))]
+    if picture.is_file():
+        caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
+        parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
+    parts.append(_table(content))
+    if "scene_from_object" in content:
+        rows = "\n".join(" ".join(f"{cell:.17g}" for cell in row) for row in value(content, "scene_from_object"))
+        parts.append(f"<h2>x_scene = M x_object</h2><pre>{rows}</pre>")
+    with atomic_file(page) as temporary:
+        temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
+
+
+def view_of(name: str, scene: Cloud, done: Completed, up: Array | None) -> View:
+    """The 3D view of the completed scene around what was added, before and after."""
+    level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
+    added = done.added if len(done.added) else done.scene
+    corners = np.percentile(added.points, [0.5, 99.5], axis=0)
+    middle = np.floor(corners.mean(0))
+    level = level @ Sim3(1.0, np.eye(3), -middle)
+    reach = (0.5 + REACH) * float(np.linalg.norm(corners[1] - corners[0]))
+    before, after = (
+        cloud[within(cloud.points, middle - reach, middle + reach, margin=0.0)].transformed(level)
+        for cloud in (scene, done.cloud)
+    )
+    low, high = np.percentile(added.transformed(level).points, [0.5, 99.5], axis=0)
+    points = merge(before, after)
+    points.fields["near"][:] = within(points.points, low, high)
+    thinned = thin(points, VIEW_POINTS)
+    found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
+    sources = {0: "scene"} | {code: f"added from {name}" for code in found}
+    return View(thinned, sources, "scene units", low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
+
+
+def _told(done: Completed) -> str:
+    """What became of the scene, in a paragraph."""
+    removed = int((~done.kept).sum())
+    said = [
+        f"{len(done.added):,} points of the object were added to {len(done.scene):,} of the scene"
+        + (f", {removed:,} of which were taken away" if removed else "; none was taken away")
+        + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
+        *done.notes,
+    ]
+    return f"<p>{escape('; '.join(said))}. <code>source</code> of completed.ply: 0 scene, 1 object.</p>"
+
+
+def _table(content: dict[str, Any]) -> str:
+    """The quantities of ROWS that there are."""
+    fields = flatten(content)
+    cells = [
+        f'<tr><td class="text">{escape(label)}</td><td class="text">{escape(number(fields[name]["value"]))}'
+        f"{escape(_unit(fields[name]['unit']))}</td></tr>"
+        for name, label in ROWS.items()
+        if name in fields
+    ]
+    return f'<h2>Numbers</h2><div class="wide"><table><tbody>{"".join(cells)}</tbody></table></div>'
+
+
+def _unit(unit: str) -> str:
+    """A unit behind its number; nothing for a pure number."""
+    return "" if unit in ("", "1") else f" {unit}"

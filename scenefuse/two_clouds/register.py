@@ -1,0 +1,178 @@
+"""Two files in; a decision, a transform, a picture and, if asked for, the completed scene out."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from scenefuse.io.alignment_picture import draw_alignment
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.io.formats import las_crs
+from scenefuse.registration.register import (
+    Known,
+    Registration,
+    RegistrationSettings,
+    cut_scene,
+    evidence_of,
+    register_clouds,
+    report,
+    summary,
+)
+from scenefuse.stage import StageError, atomic_file, quantity, write_json
+from scenefuse.transforms import Array, Sim3
+from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
+from scenefuse.two_clouds.page import write_page
+from scenefuse.version import VERSION
+
+REGISTERED, UNREGISTERED = 0, 3
+NOTHING = Known()
+OUTPUTS = (
+    *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
+    *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
+)
+"""All that a run may write; what an earlier one left of it is removed first."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """What a registration starts from.
+
+    Attributes:
+        object: the object's cloud, in its file's coordinates.
+        scene: the whole scene's, likewise.
+        part: the scene's points among which the object is looked for.
+        searched: what that part is, in words.
+        ups: unit up directions in the object's and the scene's coordinates; None where one is not known.
+    """
+
+    object: Cloud
+    scene: Cloud
+    part: Cloud
+    searched: str
+    ups: tuple[Array, Array] | None
+
+
+def register(
+    *,
+    object: Path,
+    scene: Path,
+    out: Path = Path("registered"),
+    format: Literal["ply", "laz", "las"] = "ply",
+    fuse: tyro.conf.UseCounterAction[int] = 0,
+    known: Known = NOTHING,
+    config: Path | None = None,
+    seed: int | None = None,
+) -> int:
+    """Find the place, size and orientation of one point cloud in another, or refuse.
+
+    Reads PLY, LAS, LAZ, E57, PCD, XYZ, PTS, TXT, ASC and CSV, and meshes as PLY, OBJ and GLB. Exit status: 0
+    registered, 3 unregistered, 1 bad input. docs/register.md says how to read what it writes.
+
+    Args:
+        object: cloud of the object, in any frame and unit.
+        scene: cloud that shows the object.
+        out: folder for transform.json, picture.png and, if registered, transform.txt and object_in_scene; what an
+            earlier run wrote there is removed.
+        format: of object_in_scene, which has the object's points in the scene's coordinates.
+        fuse: also write report.html and, if registered, the scene with the object in it: completed.ply, completed.json
+            and, of a scene in LAS or LAZ, completed.laz.
+        known: what is known beforehand.
+        config: YAML of settings that differ from the shipped ones, with the keys of config/config.yaml.
+        seed: of all random choices; the config's if not given.
+    """
+    start = time.perf_counter()
+    settings, shipped_seed = RegistrationSettings.read(config)
+    seed = shipped_seed if seed is None else seed
+    known.check()
+    scales = known.scales()
+    _clear(out, [object, scene, *(path for path in (known.fiducials, config) if path)])
+    given = _read(object, scene, settings, known)
+    found = register_clouds(given.object, given.part, settings, seed, ups=given.ups, scales=scales)
+    evidence = evidence_of(given.object, given.part, given.ups)
+    points = {"object_points": len(given.object), "scene_points": len(given.scene)}
+    content = report(found, given.ups) | {
+        "evidence": quantity(evidence, ""),
+        "searched": quantity(given.searched, ""),
+        "inputs": quantity({"object": object, "scene": scene} | points, ""),
+        "seed": quantity(seed, ""),
+        "version": quantity(VERSION, ""),
+        "seconds": quantity(time.perf_counter() - start, "s"),
+    }
+    written = [out / "transform.json"]
+    write_json(written[0], content)
+    print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
+    written += _write(out, format, given, found, scene, seed)
+    if fuse:
+        written += _fuse(out, given, found, content, known, config)
+    print(f"written    {', '.join(map(str, written))}", flush=True)
+    return REGISTERED if found.registered else UNREGISTERED
+
+
+def _clear(out: Path, inputs: list[Path]) -> None:
+    """Remove what an earlier run left: nobody takes its result for that of this one.
+
+    Raises:
+        StageError: the folder is a file, or an input is one of the files that would be removed.
+    """
+    if out.exists() and not out.is_dir():
+        raise StageError(f"--out {out} is a file; give a folder")
+    earlier = [out / name for name in OUTPUTS]
+    for path in inputs:
+        if path.exists() and path.resolve() in [other.resolve() for other in earlier]:
+            raise StageError(f"{path} is an input, and a run removes what lies in --out {out}; give another folder")
+    for path in earlier:
+        path.unlink(missing_ok=True)
+
+
+def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Known) -> Given:
+    up_object, up_scene = known.ups()
+    cloud, whole = read_cloud(object), read_cloud(scene)
+    box = None if known.crop_box is None else np.array(known.crop_box)
+    part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
+    ups = None if up_object is None or up_scene is None else (up_object, up_scene)
+    return Given(cloud, whole, part, searched, ups)
+
+
+def _write(out: Path, format: str, given: Given, found: Registration, scene: Path, seed: int) -> list[Path]:
+    """The picture of the best pose; of a registered one the matrix as text, and the object in the scene."""
+    pose = found.scene_from_object
+    if pose is None:
+        return []
+    written = [out / "picture.png"]
+    draw_alignment(written[0], given.object, given.part, pose, seed)
+    if found.registered:
+        written += [out / "transform.txt", out / f"object_in_scene.{format}"]
+        write_matrix(written[1], pose)
+        _write_placed(written[2], given.object.transformed(pose), las_crs(scene))
+    return written
+
+
+def write_matrix(path: Path, pose: Sim3) -> None:
+    """Write a similarity as four rows of four numbers, as CloudCompare and others read a matrix; no digit is lost."""
+    with atomic_file(path) as temporary:
+        np.savetxt(temporary, pose.matrix, fmt="%.17g")
+
+
+def _write_placed(path: Path, cloud: Cloud, crs: str | None) -> None:
+    if path.suffix == ".ply":
+        write_cloud(path, cloud)
+        return
+    origin = np.floor(cloud.points.min(0))
+    write_laz(path, replace(cloud, points=cloud.points - origin), origin, crs)
+
+
+def _fuse(
+    out: Path, given: Given, found: Registration, content: dict[str, Any], known: Known, config: Path | None
+) -> list[Path]:
+    """The completed scene, if registered, and the page."""
+    inputs = content["inputs"]["value"]
+    written, done = list[Path](), None
+    if found.registered and found.scene_from_object is not None:
+        done = complete(given.object, given.scene, given.part, found.scene_from_object, fusion_settings(config))
+        written += write_completed(out, done, inputs["object"], inputs["scene"])
+    page = out / "report.html"
+    write_page(page, content, out / "picture.png", given.scene, done, known.ups()[1])
+    return [*written, page]

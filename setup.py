@@ -1,0 +1,30 @@
+"""The wheel: beside the library, the files of the workflow, as scenefuse/shipped/; pyproject.toml has all the rest."""
+
+from pathlib import Path
+from shutil import copy2
+
+from setuptools import setup
+from setuptools.command.build_py import build_py
+
+CONFIG = ("config/config.yaml", "config/README.md", "config/examples")
+"""Not the demo's tables: an installed workflow works on those of a user."""
+SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG)
+
+
+class WithWorkflow(build_py):
+    """Copies SHIPPED; an editable install needs no copy and gets none."""
+
+    def run(self) -> None:
+        """Build the library, then copy."""
+        super().run()
+        if self.editable_mode:
+            return
+        for start in map(Path, SHIPPED):
+            for path in [start, *start.rglob("*")]:
+                if path.is_file() and "__pycache__" not in path.parts:
+                    target = Path(self.build_lib, "scenefuse/shipped", path)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    copy2(path, target)
+
+
+setup(cmdclass={"build_py": WithWorkflow})

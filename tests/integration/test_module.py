@@ -1,0 +1,86 @@
+"""The workflow as others use it: from either Snakefile, and as a module of another workflow."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from support.user_project import planned
+
+ROOT = Path(__file__).resolve().parents[2]
+OTHER = """
+configfile: "mine.yaml"
+
+
+module completion:
+    snakefile:
+        "{snakefile}"
+    config:
+        config["completion"]
+
+
+use rule * from completion as completion_*
+
+
+rule count_points:
+    input:
+        "results/scenes/yard/completed.ply",
+    output:
+        "points.txt",
+    default_target: True
+    shell:
+        "grep -a -m1 'element vertex' {{input}} > {{output}}"
+"""
+
+
+def plan(directory, *words):
+    command = [sys.executable, "-m", "snakemake", "--dry-run", *map(str, words)]
+    env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=directory, env=env, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+@pytest.fixture
+def yard(project):
+    """A user's project with photos and clicks, and its settings in mine.yaml."""
+    project.photos("flight")
+    project.photos("close")
+    (project.path / "clicks.tsv").touch()
+    (project.path / "prompts.tsv").touch()
+    project.write()
+    return project.path
+
+
+@pytest.mark.parametrize("snakefile", ["Snakefile", "workflow/Snakefile"])
+def test_either_snakefile_makes_everything_from_any_folder(yard, snakefile):
+    status, output = plan(yard, "--snakefile", ROOT / snakefile, "--configfile", "mine.yaml")
+    assert status == 0, output
+    assert {"all", "map_scene_photos", "complete_scene", "write_summary", "write_report"} <= planned(output)
+
+
+def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own(yard):
+    settings = (yard / "mine.yaml").read_text()
+    (yard / "mine.yaml").write_text("completion:\n" + "".join(f"  {line}\n" for line in settings.splitlines()))
+    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
+    status, output = plan(yard)
+    assert status == 0, output
+    rules = planned(output)
+    assert {"count_points", "completion_map_scene_photos", "completion_complete_scene"} <= rules
+    assert not {rule for rule in rules if not rule.startswith("completion_")} - {"count_points"}
+
+
+def test_a_prefix_would_not_reach_all_files_and_is_refused(yard):
+    text = OTHER.format(snakefile=ROOT / "workflow/Snakefile")
+    text = text.replace("    config:", "    prefix:\n        'part'\n    config:")
+    (yard / "mine.yaml").write_text("completion: { seed: 1 }\n")
+    (yard / "Snakefile").write_text(text)
+    status, output = plan(yard)
+    assert status != 0 and "`prefix` and `replace_prefix` of a module do not reach" in output
+
+
+def test_a_wrong_setting_of_the_module_is_named(yard):
+    (yard / "mine.yaml").write_text("completion: { fusion: { mod: fill } }\n")
+    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
+    status, output = plan(yard)
+    assert status != 0 and "fusion: unknown key 'mod'; did you mean 'mode'?" in output

@@ -1,0 +1,167 @@
+"""The package: what its parts need, what a wheel holds, and that it works without the repository."""
+
+import os
+import subprocess
+import sys
+import tomllib
+import zipfile
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from support.planted import plant
+from support.user_project import planned
+
+from scenefuse.io.clouds import read_cloud, write_cloud
+from scenefuse.new_project import init
+from scenefuse.stage import StageError
+from scenefuse.version import VERSION
+
+ROOT = Path(__file__).resolve().parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+CORE, ALL = PROJECT["dependencies"], PROJECT["optional-dependencies"]["all"]
+COMMAND = """
+import sys
+
+class Absent:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in {without}:
+            raise ModuleNotFoundError(f"No module named '{name}'", name=name)
+
+sys.meta_path.insert(0, Absent())
+from scenefuse.command_line import main
+main()
+"""
+
+
+def names(requirements):
+    return {Requirement(line).name for line in requirements}
+
+
+def scenefuse(*words, cwd, library=ROOT, without=()):
+    """Exit status and output of the command, in a process that cannot import some packages."""
+    program = COMMAND.replace("{without}", repr(list(without)))
+    env = os.environ | {"PYTHONPATH": str(library), "COLUMNS": "200"}
+    done = subprocess.run([sys.executable, "-c", program, *words], cwd=cwd, env=env, capture_output=True, text=True)
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_two_clouds_are_registered_and_fused_without_what_the_slim_install_leaves_out(tmp_path):
+    trial = plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
+    write_cloud(tmp_path / "house.ply", trial.object)
+    write_cloud(tmp_path / "yard.ply", trial.scene)
+    # Pygments comes with IPython, which k3d brings along.
+    absent = [name.replace("-", "_") for name in names(ALL) - {"pygments"}]
+    assert {"torch", "pycolmap", "snakemake", "nicegui", "onnxruntime"} <= set(absent)
+    words = ("register", "--object", "house.ply", "--scene", "yard.ply", "--fuse")
+    status, output = scenefuse(*words, cwd=tmp_path, without=absent)
+    assert status == 0, output
+    assert (read_cloud(tmp_path / "registered/completed.ply").fields["source"] == 1).any()
+
+
+def test_a_part_that_needs_more_says_what_to_install(tmp_path):
+    for part, package in (("nerf", "torch"), ("run", "snakemake")):
+        status, output = scenefuse(part, "--help", cwd=tmp_path, without=[package])
+        assert status == 1 and f"scenefuse {part} needs {package}" in output and "scenefuse[all]" in output
+
+
+def test_the_version_is_one():
+    assert yaml.safe_load((ROOT / "CITATION.cff").read_text())["version"] == VERSION
+    assert scenefuse("--version", cwd=ROOT) == (0, f"scenefuse {VERSION}\n")
+
+
+def test_an_unknown_part_is_named(tmp_path):
+    status, output = scenefuse("fuse", cwd=tmp_path)
+    assert status == 2 and "fuse" in output and "register" in output
+
+
+def test_what_is_pinned_is_what_the_package_asks_for():
+    lines = [line for line in (ROOT / "envs/requirements.txt").read_text().splitlines() if "==" in line]
+    pins = {Requirement(line).name: next(iter(Requirement(line).specifier)).version for line in lines}
+    pins["open3d-cpu"] = pins["open3d"]
+    for requirement in map(Requirement, [*CORE, *ALL]):
+        assert requirement.specifier.contains(pins[requirement.name]), requirement
+    assert set(pins) - {"pytest", "ruff", "mypy", "snakefmt"} == names([*CORE, *ALL])
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory):
+    """A wheel of what git knows and what is new here, built elsewhere: building leaves files behind."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.run(listed, cwd=ROOT, capture_output=True, text=True, check=True).stdout.splitlines():
+        if (ROOT / name).is_file() and not name.startswith(("tests/", "docs/")):
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            (source / name).write_bytes((ROOT / name).read_bytes())
+    command = [sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation", "--quiet", "-w", out, source]
+    done = subprocess.run(list(map(str, command)), capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(out.glob("*.whl"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
+    """A folder with the package as installed, for PYTHONPATH."""
+    folder = tmp_path_factory.mktemp("site")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def test_a_wheel_holds_the_library_and_the_workflow_and_not_the_tables_of_the_demo(wheel):
+    with zipfile.ZipFile(wheel) as archive:
+        held = set(archive.namelist())
+    assert wheel.name.startswith(f"scenefuse-{VERSION}-py3-none-any")
+    for folder in ("scripts", "workflow", "profiles", "envs"):
+        files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
+        assert {f"scenefuse/shipped/{path.relative_to(ROOT).as_posix()}" for path in files} <= held
+    assert {"scenefuse/shipped/Snakefile", "scenefuse/shipped/config/config.yaml", "scenefuse/stage.py"} <= held
+    assert not [name for name in held if name.endswith("/config/objects.tsv") or name.split("/")[0] == "tests"]
+
+
+def test_an_installed_package_makes_a_project_and_plans_its_run(installed, tmp_path):
+    rng = np.random.default_rng(0)
+    for folder in ("flight", "my house"):
+        (tmp_path / folder).mkdir()
+        for index in range(3):
+            cv2.imwrite(str(tmp_path / folder / f"{index}.jpg"), rng.integers(0, 255, (48, 64, 3), dtype=np.uint8))
+    words = ("init", "yard", "--scene", "flight", "--objects", "my house")
+    status, output = scenefuse(*words, cwd=tmp_path, library=installed)
+    assert status == 0, output
+    (tmp_path / "yard/clicks.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t10\t10\n")
+    table = tmp_path / "yard/config/objects.tsv"
+    table.write_text(table.read_text().replace("my house\t\t", "my house\t\tclicks.tsv"))
+    status, output = scenefuse("run", "-n", cwd=tmp_path / "yard", library=installed)
+    assert status == 0, output
+    assert {"map_scene_photos", "fuse_object", "complete_scene", "write_report"} <= planned(output)
+    assert "render_scene" not in planned(output)
+
+
+def test_an_empty_project_says_what_is_missing(installed, tmp_path):
+    assert scenefuse("init", "yard", cwd=tmp_path, library=installed)[0] == 0
+    status, output = scenefuse("run", "-n", cwd=tmp_path / "yard", library=installed)
+    assert status == 1 and "config/scenes.tsv has no rows; add one for each scene" in output
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"folder": Path("taken")}, "README.md exists already"),
+        ({"folder": Path("file")}, "file exists already"),
+        ({"folder": Path("new"), "objects": (Path("taken"),)}, "--scene as well"),
+        ({"folder": Path("new"), "scene": Path("nowhere")}, "nowhere does not exist"),
+        ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
+    ],
+)
+def test_a_project_that_cannot_be_made_is_one_sentence(tmp_path, monkeypatch, options, words):
+    monkeypatch.chdir(tmp_path)
+    for folder in ("taken", "a/x", "b/x"):
+        Path(folder).mkdir(parents=True)
+    Path("taken/README.md").touch()
+    Path("file").touch()
+    with pytest.raises(StageError, match=words):
+        init(**options)
+    assert not Path("new").exists()

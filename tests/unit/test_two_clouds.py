@@ -1,0 +1,223 @@
+"""The completed scene of two clouds on their own: what comes in, what stays, what the files and the page hold."""
+
+import json
+import re
+from dataclasses import replace
+
+import laspy
+import numpy as np
+import pyproj
+import pytest
+from scipy.spatial import cKDTree
+from support.cloud_files import UTM
+from support.planted import plant
+
+from scenefuse.fusion.modes import FusionSettings
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.registration.coarse import CoarseSettings
+from scenefuse.registration.decision import FineSettings
+from scenefuse.registration.register import RegistrationSettings
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import Sim3
+from scenefuse.two_clouds.complete import complete, write_completed
+from scenefuse.two_clouds.register import register
+from scenefuse.version import VERSION
+
+# Less work than shipped, where only the course of the computation matters.
+LITTLE = RegistrationSettings(
+    coarse=CoarseSettings(ransac_samples=5000, feature_scale_steps=1, scale_steps=9, candidates=4, keep=2),
+    fine=FineSettings(voxel_fraction=0.012, turn_steps=4),
+)
+FILL = FusionSettings(mode="fill")
+POSE = Sim3(2.0, np.eye(3), UTM)
+
+
+@pytest.fixture(scope="module")
+def house():
+    return plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
+
+
+def write_survey(path, cloud, crs="EPSG:25832", bright=257):
+    """A LAS or LAZ file as a surveyor has it: another point format, classes, intensities, an extra dimension."""
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = np.full(3, 0.001), np.floor(cloud.points.min(0))
+    if crs:
+        header.add_crs(pyproj.CRS.from_user_input(crs))
+    header.add_extra_dim(laspy.ExtraBytesParams("height", "f4"))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = cloud.points.T
+    las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * bright
+    las.classification = np.arange(len(cloud)) % 7
+    las.intensity = np.arange(len(cloud)) % 60_000
+    las.height = cloud.points[:, 2]
+    las.write(str(path))
+
+
+def sheet(low, high, color=(200, 100, 50)):
+    """A grid at z = 0, x from low to high, 2 wide, 0.1 apart."""
+    x, y = np.meshgrid(np.arange(low, high, 0.1), np.arange(0, 2, 0.1))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    return Cloud(points, None, np.tile(np.array(color, np.uint8), (len(points), 1)))
+
+
+def in_scene(cloud):
+    return cloud.transformed(Sim3(1.0, np.eye(3), UTM))
+
+
+def own(cloud):
+    """A cloud that POSE puts where `in_scene` puts `cloud`."""
+    return cloud.transformed(POSE.inverse() @ Sim3(1.0, np.eye(3), UTM))
+
+
+@pytest.fixture(scope="module")
+def fused(house, tmp_path_factory):
+    """The folder with yard.laz, house.ply, and in out/ what came of them."""
+    folder = tmp_path_factory.mktemp("fused")
+    write_survey(folder / "yard.laz", Cloud(house.scene.points + UTM, None, house.scene.colors))
+    write_cloud(folder / "house.ply", house.object)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+        files = {"object": folder / "house.ply", "scene": folder / "yard.laz"}
+        assert register(**files, out=folder / "out", fuse=True) == 0
+    return folder
+
+
+def test_a_scene_in_laz_is_completed_by_a_cloud_of_unknown_scale(fused, house):
+    out = fused / "out"
+    before, after = read_cloud(fused / "yard.laz"), read_cloud(out / "completed.ply")
+    added = after.fields["source"] == 1
+    assert np.array_equal(after.points[~added], before.points)
+    assert set(after.fields) == {"source", "photos", "match", "deviation", "world_deviation", "evidence"}
+    assert (after.fields["evidence"] == 0).all() and (after.fields["photos"] == 0).all()
+    # What came in is the object's surface, where the scene has none.
+    truth = house.scene_from_object.apply(house.object.points) + UTM
+    assert cKDTree(truth).query(after.points[added])[0].max() < 0.02 * house.diagonal
+    assert cKDTree(before.points).query(after.points[added])[0].min() >= spacing(before.points)
+    covered = [(cKDTree(c.points).query(truth)[0] < 0.03 * house.diagonal).mean() for c in (before, after)]
+    assert covered[0] < 0.99 < covered[1]
+    about = read_json(out / "completed.json")
+    assert value(about, "sources") == {"0": "scene", "1": "house"}
+    assert value(about, "added_points") == {"house": int(added.sum())} and value(about, "crs") == "EPSG:25832"
+    assert value(about, "mode") == "fill" and value(about, "removed_points") == 0
+    assert value(about, "version") == value(read_json(out / "transform.json"), "version") == VERSION
+
+
+def test_the_matrix_is_written_to_the_last_digit(fused):
+    matrix = np.loadtxt(fused / "out/transform.txt")
+    assert np.array_equal(matrix, value(read_json(fused / "out/transform.json"), "scene_from_object"))
+
+
+def test_a_laz_keeps_all_that_its_points_have(tmp_path):
+    scene, obj = in_scene(sheet(0, 4)), sheet(2, 8, (10, 20, 30))
+    write_survey(tmp_path / "yard.laz", scene)
+    read = read_cloud(tmp_path / "yard.laz")
+    done = complete(own(obj), read, read, POSE, FusionSettings(mode="fill", match_colors=False))
+    written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    assert [path.name for path in written] == ["completed.ply", "completed.laz", "completed.json"]
+    before, after = laspy.read(tmp_path / "yard.laz"), laspy.read(tmp_path / "completed.laz")
+    count = len(before.points)
+    for name in before.point_format.dimension_names:
+        assert np.array_equal(before[name], after[name][:count]), name
+    assert after.header.parse_crs().to_epsg() == 25832
+    assert (after.source[:count] == 0).all() and (after.source[count:] == 1).all() and len(done.added) > 0
+    new = np.stack([after.x, after.y, after.z], axis=1)[count:]
+    assert np.abs(new - done.added.points).max() <= 0.5e-3 + 1e-6
+    far = done.added.points[:, 0] - UTM[0] > 5  # beyond the seam, over which colours blend
+    assert (np.stack([after.red, after.green, after.blue], axis=1)[count:][far] == np.array([10, 20, 30]) * 257).all()
+    assert (after.classification[count:] == 0).all() and (after.return_number[count:] == 1).all()
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
+    scene, obj = in_scene(sheet(0, 4)), sheet(2, 8)
+    write_survey(tmp_path / f"yard.{ending}", scene, bright=1)
+    read = read_cloud(tmp_path / f"yard.{ending}")
+    done = complete(own(obj), read, read, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / f"yard.{ending}")
+    after = laspy.read(tmp_path / "completed.laz")
+    assert after.red.max() <= 255 and after.red[-1] > 100
+
+
+def test_a_completed_scene_takes_a_second_object(tmp_path):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
+    for number, (low, high) in enumerate([(2, 8), (6, 12)], 1):
+        out = tmp_path / str(number)
+        scene = tmp_path / "yard.laz" if number == 1 else tmp_path / "1/completed.laz"
+        read = read_cloud(scene)
+        done = complete(own(sheet(low, high)), read, read, POSE, FILL)
+        write_completed(out, done, tmp_path / "shed.ply", scene)
+    last = laspy.read(tmp_path / "2/completed.laz")
+    assert {(0, 0), (1, 0), (0, 1)} == set(zip(last.source.tolist(), last.source_after.tolist()))
+    assert any(
+        "'source' is 'source_after'" in note for note in value(read_json(tmp_path / "2/completed.json"), "notes")
+    )
+
+
+def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be(tmp_path, capsys):
+    scene, obj = in_scene(sheet(0, 4)), Cloud(sheet(2, 8).points)
+    scene.fields["height"] = scene.points[:, 2]
+    write_cloud(tmp_path / "yard.ply", scene)
+    read = read_cloud(tmp_path / "yard.ply")
+    done = complete(own(obj), read, read, POSE, FusionSettings())
+    written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.ply")
+    assert [path.name for path in written] == ["completed.ply", "completed.json"]
+    notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
+    for words in ("has no height", "grey in the scene", "neither side has photos"):
+        assert any(words in note for note in notes) and words in printed
+    added = read_cloud(written[0])
+    assert (added.colors[added.fields["source"] == 1] == 128).all()
+
+
+def test_an_object_beyond_the_coordinates_of_a_las_file_is_one_sentence(tmp_path):
+    scene, far = in_scene(sheet(0, 4)), sheet(2, 8)
+    far.points[-1, 0] = 4e6
+    write_survey(tmp_path / "yard.laz", scene)
+    read = read_cloud(tmp_path / "yard.laz")
+    done = complete(own(far), read, read, POSE, FILL)
+    with pytest.raises(StageError, match="coordinates of .*yard.laz end before the object"):
+        write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    assert not (tmp_path / "completed.laz").exists()
+
+
+def test_the_page_shows_the_decision_the_scene_in_3d_and_the_matrix_and_fetches_nothing(fused):
+    page = (fused / "out/report.html").read_text()
+    assert 'class="badge ok">registered' in page and "added from house.ply" in page
+    assert (fused / "out/transform.txt").read_text().splitlines()[0] in page
+    assert 'aria-label="3D view of house.ply in yard.laz"' in page and "data:image/webp" in page
+    assert not re.search(r'(src|href)="https?:', page)
+    view = json.loads(re.search(r'class="about">(.*?)</script>', page)[1])
+    assert view["points"]["after"] > 0 and view["total"]["after"] > view["total"]["before"]
+
+
+def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(tmp_path, house, monkeypatch):
+    strict = replace(LITTLE, fine=replace(LITTLE.fine, min_f_score=0.99))
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (strict, 0))
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("completed.ply", "completed.laz", "completed.json", "transform.txt", "report.html"):
+        (out / name).write_text("of an earlier run")
+    write_cloud(tmp_path / "house.ply", house.object)
+    write_cloud(tmp_path / "yard.ply", house.scene)
+    assert register(object=tmp_path / "house.ply", scene=tmp_path / "yard.ply", out=out, fuse=True) == 3
+    assert sorted(path.name for path in out.iterdir()) == ["picture.png", "report.html", "transform.json"]
+    page = (out / "report.html").read_text()
+    assert "unregistered" in page and "The pose was refused" in page
+
+
+def test_bad_input_leaves_nothing_of_an_earlier_run(tmp_path, house):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "completed.ply").write_text("of an earlier run")
+    (out / "mine.txt").write_text("a file of the user")
+    write_cloud(tmp_path / "house.ply", house.object)
+    with pytest.raises(StageError, match="does not exist"):
+        register(object=tmp_path / "house.ply", scene=tmp_path / "none.laz", out=out, fuse=True)
+    assert [path.name for path in out.iterdir()] == ["mine.txt"]
+
+
+def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
+    out = tmp_path / "out"
+    write_cloud(out / "completed.ply", house.scene)
+    with pytest.raises(StageError, match="is an input, and a run removes what lies in --out"):
+        register(object=tmp_path / "house.ply", scene=out / "completed.ply", out=out)
+    assert (out / "completed.ply").is_file()
