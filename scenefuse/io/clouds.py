@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from scenefuse.io.formats import COLOR, NORMAL, POSITION, bytes_of, read_columns
+from scenefuse.io.formats import COLOR, NORMAL, POSITION, Columns, bytes_of, read_columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 
@@ -150,23 +150,33 @@ def read_cloud(path: Path) -> Cloud:
 
 def read_counted(path: Path) -> tuple[Cloud, int]:
     """`read_cloud`, and how many rows without a finite position were left out."""
-    columns = read_columns(Path(path))
-    points = np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1)
-    finite = np.isfinite(points).all(1)
-    if not finite.all():
-        print(f"{path}: {np.sum(~finite)} of {len(points)} rows have no finite position and are left out", flush=True)
-        if not finite.any():
+    columns, left_out = finite_rows(read_columns(Path(path)))
+    if left_out:
+        count = left_out + len(columns["x"])
+        print(f"{path}: {left_out} of {count} rows have no finite position and are left out", flush=True)
+        if left_out == count:
             raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
-        points, columns = points[finite], {name: values[finite] for name, values in columns.items()}
+    return cloud_of(columns), left_out
+
+
+def finite_rows(columns: Columns) -> tuple[Columns, int]:
+    """The rows with a finite position, and how many were left out."""
+    finite = np.isfinite([columns[k] for k in POSITION]).all(0)
+    if finite.all():
+        return columns, 0
+    return {name: values[finite] for name, values in columns.items()}, int(np.sum(~finite))
+
+
+def cloud_of(columns: Columns, most_color: float | None = None) -> Cloud:
+    """The cloud of a file's columns; `most_color` is the greatest colour of the whole file where this is a part."""
     normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
     colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
-    cloud = Cloud(
-        points,
+    return Cloud(
+        np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1),
         None if normals is None else np.nan_to_num(normals.astype(np.float32)),
-        None if colors is None else bytes_of(colors),
+        None if colors is None else bytes_of(colors, most_color),
         {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
     )
-    return cloud, int(np.sum(~finite))
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
@@ -174,6 +184,13 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
 
     PLY allows no spaces in a field's name: they become underscores.
     """
+    vertex = records_of(cloud, path)
+    with atomic_file(path) as temporary:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+
+
+def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
+    """(N,) rows of a PLY, as `write_cloud` has them; `path` is for the note of a field that is called otherwise."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
@@ -186,8 +203,7 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
     vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         vertex[name] = values
-    with atomic_file(path) as temporary:
-        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+    return vertex
 
 
 def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
