@@ -130,7 +130,7 @@ def test_a_full_disk_is_said_before_anything_is_written(tmp_path, cloud, monkeyp
     usage = write_tiles.shutil.disk_usage(tmp_path)._replace(free=1000)
     monkeypatch.setattr(write_tiles.shutil, "disk_usage", lambda _: usage)
     with pytest.raises(
-        StageError, match=r"the disk is too full for .*a\.ply: it needs 0\.00082\d GB and 1e-06 GB are free"
+        StageError, match=r"the disk is too full for .*a\.ply: it needs 0\.00082 GB and 1e-06 GB are free"
     ):
         write(tmp_path / "a.ply", cloud)
     assert not list(tmp_path.iterdir())
