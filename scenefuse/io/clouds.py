@@ -1,6 +1,8 @@
 """Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -215,27 +217,54 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
         origin: (3,) coordinates of the cloud's local origin.
         crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
     """
+    ends = cloud.points.min(0, initial=np.inf), cloud.points.max(0, initial=-np.inf)
+    with laz_in_parts(path, cloud, ends if len(cloud) else (np.zeros(3), np.zeros(3)), origin, crs) as append:
+        append(cloud)
+
+
+@contextmanager
+def laz_in_parts(
+    path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
+    crs: str | None,
+) -> Iterator[Callable[[Cloud], None]]:  # fmt: skip
+    """`write_laz` for clouds of any size: gives a function that appends a part.
+
+    Args:
+        path: output, .laz or .las; it appears when all parts are written.
+        like: a cloud, perhaps empty, with the columns that all parts have.
+        box: two opposite corners (3,) of a box around all points, relative to `origin`.
+        origin: see `write_laz`.
+        crs: see `write_laz`.
+
+    Raises:
+        StageError: the disk is full.
+    """
     import laspy
     import pyproj
 
     header = laspy.LasHeader(point_format=7, version="1.4")
-    step = 0.001 if crs is not None else max(cloud.diagonal, 1e-300) * 1e-8
+    low, high = box
+    step = 0.001 if crs is not None else max(float(np.linalg.norm(high - low)), 1e-300) * 1e-8
     # LAS counts steps from the offset in 32 bits; without a CRS the points may lie anywhere.
-    middle = (cloud.points.min(0) + cloud.points.max(0)) / 2 if crs is None and len(cloud) else 0.0
+    middle = (low + high) / 2 if crs is None else 0.0
     header.scales, header.offsets = np.full(3, step), np.floor(origin + middle)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_user_input(crs))
-    names = _file_names(path, list(cloud.fields), set(header.point_format.dimension_names))
-    for name, values in cloud.fields.items():
+    names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
+    for name, values in like.fields.items():
         header.add_extra_dim(laspy.ExtraBytesParams(names[name], f"{values.dtype.kind}{values.dtype.itemsize}"))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (cloud.points + origin).T
-    if cloud.colors is not None:
-        las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * 257
-    for name, values in cloud.fields.items():
-        las[names[name]] = values
-    with atomic_file(path) as temporary:
-        las.write(str(temporary))
+
+    def append(part: Cloud) -> None:
+        points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+        points.x, points.y, points.z = (part.points + origin).T
+        if part.colors is not None:
+            points.red, points.green, points.blue = part.colors.astype(np.uint16).T * 257
+        for name, values in part.fields.items():
+            points[names[name]] = values
+        writer.write_points(points)
+
+    with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
+        yield append
 
 
 def _file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:
