@@ -134,9 +134,14 @@ def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) ->
 
 def sampled(points: NDArray[np.float64], most: int, seed: int) -> NDArray[np.float64]:
     """At most that many of (N, 3) points, drawn evenly."""
-    if len(points) <= most:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]
+    return points if len(points) <= most else points[sampled_rows(len(points), most, seed)]
+
+
+def sampled_rows(count: int, most: int, seed: int) -> NDArray[np.int64]:
+    """At most that many of `count` rows, drawn evenly."""
+    if count <= most:
+        return np.arange(count)
+    return np.random.default_rng(seed).choice(count, most, replace=False)
 
 
 def read_cloud(path: Path) -> Cloud:
