@@ -73,6 +73,13 @@ class Sim3:
         )
 
 
+def box_around(low: Array, high: Array, b_from_a: Sim3) -> tuple[Array, Array]:
+    """Corners (3,) of the axis-aligned box in frame b around a box of frame a from `low` (3,) to `high` (3,)."""
+    corners = [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
+    moved = b_from_a.apply(corners)
+    return moved.min(0), moved.max(0)
+
+
 def fit_sim3(x_in_a: Array, x_in_b: Array, weights: Array | None = None, scale: float | None = None) -> Sim3:
     """Weighted least-squares b_from_a for (N, 3) pairs (Umeyama 1991); with `scale` given it is not estimated.
 

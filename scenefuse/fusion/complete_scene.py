@@ -1,17 +1,19 @@
 """The completed scene: all registered objects in one cloud, each point naming where it is from."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.fusion.evidence import FIELDS, KEPT, MEASURED, unchecked
-from scenefuse.fusion.fuse_object import FROM_OBJECT, FROM_SCENE, together, with_source, write_scene
-from scenefuse.io.clouds import Cloud, read_cloud, spacing
+from scenefuse.fusion.changes import Changes, added_by, merged, read_changes, with_source
+from scenefuse.io.clouds import Cloud, laz_in_parts, records_of, spacing
+from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
+from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.sfm.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.version import VERSION
 
@@ -35,20 +37,21 @@ class CompletionInputs:
 def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: Path, report: Path) -> None:
     """Put into the scene what every object adds, and leave out what any takes away (method F3).
 
-    Where objects overlap, a later one's points that lie on an earlier one's are left out. The field `source` is 0 on
-    the scene's points and the object's place among the scene's objects, counted from 1, on what it added; the others
-    keep their number when one fails.
+    The scene is read and written part by part, so that memory does not grow with it. Where objects overlap, a later
+    one's points that lie on an earlier one's are left out. The field `source` is 0 on the scene's points and the
+    object's place among the scene's objects, counted from 1, on what it added; the others keep their number when one
+    fails.
 
     Args:
         inputs: see CompletionInputs.
-        completed: output PLY, the scene's frame.
+        completed: output PLY, the scene's frame, tile by tile; the points in the order of the scene's cloud.
         completed_laz: output LAZ of the same, in the CRS where the scene is georeferenced.
         report: output JSON: what each `source` is, the points that each object added, and the objects that are not in
             it, unregistered or failed, each with its reason.
     """
     start = time.perf_counter()
-    scene = unchecked(read_cloud(inputs.scene))
-    kept, added = np.ones(len(scene), dtype=bool), list[Cloud]()
+    scene = open_cloud(inputs.scene)
+    changes, added = list[Changes](), list[Cloud]()
     failed = {
         name: why_unfinished(inputs.jobs, name, f"{name}-full") or "its jobs did not run" for name in inputs.failed
     }
@@ -61,53 +64,86 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
         if value(fusion, "status") != "fused":
             unregistered[folder.name] = value(fusion, "reason")
             continue
-        if value(fusion, "checked_points"):
-            _take_away(scene, kept, read_cloud(folder / "checked.ply"))
-        mine = read_cloud(folder / "fused.ply")
-        mine = _apart(mine[mine.fields["source"] == FROM_OBJECT], added)
-        added.append(with_source(mine, number))
+        changes.append(read_changes(folder / "checked.ply"))
+        mine = with_source(_apart(added_by(folder / "fused.ply"), added), number)
+        added.append(mine)
         print(f"{folder.name}: {len(mine)} points", flush=True)
-    whole = with_source(scene[kept], FROM_SCENE)
-    for cloud in added:
-        whole = together(whole, cloud)
-    crs = write_scene(completed, completed_laz, whole, inputs.georeference_json)
-    content = _report(whole, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
-        "crs": quantity(crs, ""),
+    frame = None if inputs.georeference_json is None else scene_frame(read_json(inputs.georeference_json))
+    counts = _write(scene, merged(changes), added, frame, completed, completed_laz)
+    content = _report(counts, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
+        "crs": quantity(None if frame is None else frame.crs, ""),
         "version": quantity(VERSION, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(report, content)
 
 
-def _take_away(scene: Cloud, kept: NDArray[np.bool_], checked: Cloud) -> None:
-    """Mark in `kept` what an object took away, and put what photos know of the checked points into the scene's."""
-    rows = checked.fields["row"].astype(np.int64)
-    kept[rows[checked.fields["reason"] != KEPT]] = False
-    # What another object's photos measured stays known.
-    new = (checked.fields["evidence"] == MEASURED) | (scene.fields["evidence"][rows] != MEASURED)
-    for name in FIELDS:
-        scene.fields[name][rows[new]] = checked.fields[name][new]
+def _write(
+    scene: TiledCloud, changes: Changes, added: list[Cloud], frame: LocalFrame | GridFrame | None, ply: Path, laz: Path
+) -> dict[int, int]:
+    """Write the completed scene part by part: the scene's tiles in their order, then a tile for what each object adds.
+
+    Returns the number of points of each `source`.
+    """
+    left = np.diff(scene.starts) - changes.removed_in(scene.starts)
+    added = [cloud for cloud in added if len(cloud)]
+    boxes = np.concatenate([scene.low, scene.high], axis=1)[left > 0]
+    boxes = np.concatenate([boxes, *([[*cloud.points.min(0), *cloud.points.max(0)]] for cloud in added)])
+    table = np.zeros(len(boxes), ROW_OF_TILE)
+    table["count"] = [*left[left > 0], *map(len, added)]
+    for name, values in zip(BOX, boxes.T):
+        table[name] = values
+    like = changes.left_of(np.zeros(0, np.int64), scene.like)
+    like = replace(like, fields=dict(sorted(like.fields.items())))
+    row = records_of(like, ply).dtype
+    origin = np.zeros(3) if frame is None else frame.in_crs(np.zeros((1, 3)))[0]
+    box = boxes[:, :3].min(0), boxes[:, 3:].max(0)
+    with (
+        reserved(ply, row, int(table["count"].sum()), len(table)) as (file, _),
+        laz_in_parts(laz, like, box, origin, None if frame is None else frame.crs) as append,
+    ):
+        for cloud in chain((changes.left_of(*part) for part in scene.parts()), added):
+            part = _with_columns_of(like, cloud)
+            records = records_of(part, ply)
+            assert records.dtype == row
+            file.write(records.tobytes())
+            append(replace(part, points=part.points if frame is None else frame.in_crs(part.points) - origin))
+        file.write(table.tobytes())
+    return {0: int(left.sum())} | {int(cloud.fields["source"][0]): len(cloud) for cloud in added}
+
+
+def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
+    """A cloud with only the columns that another has; normals and colours that only the object has are left out."""
+    return replace(
+        cloud,
+        normals=None if like.normals is None else cloud.normals,
+        colors=None if like.colors is None else cloud.colors,
+        fields={name: cloud.fields[name] for name in like.fields},
+    )
 
 
 def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:
     """The points farther than a spacing from those that other objects added."""
     if not before or len(cloud) < 2:
         return cloud
-    there = np.concatenate([other.points for other in before])
-    return cloud[cKDTree(there).query(cloud.points, workers=threads())[0] > spacing(cloud.points)]
+    step = spacing(cloud.points)
+    low, high = cloud.points.min(0) - step, cloud.points.max(0) + step
+    there = np.concatenate([one.points[((one.points >= low) & (one.points <= high)).all(1)] for one in before])
+    if not len(there):
+        return cloud
+    return cloud[cKDTree(there).query(cloud.points, workers=threads())[0] > step]
 
 
 def _report(
-    whole: Cloud, points_before: int, names: list[str], unregistered: dict[str, str], failed: dict[str, str]
+    counts: dict[int, int], points_before: int, names: list[str], unregistered: dict[str, str], failed: dict[str, str]
 ) -> dict[str, dict[str, object]]:
     """What each `source` is and how many points it has."""
-    counts = np.bincount(whole.fields["source"], minlength=len(names) + 1)
-    added = {n: int(c) for n, c in zip(names, counts[1:]) if n not in unregistered and n not in failed}
+    added = {n: counts.get(k, 0) for k, n in enumerate(names, 1) if n not in unregistered and n not in failed}
     return {
         "sources": quantity({"0": "scene"} | {str(k): name for k, name in enumerate(names, 1)}, ""),
-        "points": quantity(len(whole), "points"),
-        "scene_points": quantity(int(counts[0]), "points"),
-        "removed_points": quantity(points_before - int(counts[0]), "points"),
+        "points": quantity(sum(counts.values()), "points"),
+        "scene_points": quantity(counts[0], "points"),
+        "removed_points": quantity(points_before - counts[0], "points"),
         "added_points": quantity(added, "points"),
         "unregistered": quantity(unregistered, ""),
         "failed": quantity(failed, ""),

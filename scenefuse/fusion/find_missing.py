@@ -9,12 +9,14 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cores import use_threads
+from scenefuse.fusion.changes import added_by, read_changes, together
 from scenefuse.fusion.evidence import around, with_normals
 from scenefuse.fusion.fuse_object import photos_of
 from scenefuse.fusion.missing import CLASSES, Missing, find_missing_surface
-from scenefuse.fusion.next_photos import UPWARDS, Plan, plan_stations
+from scenefuse.fusion.next_photos import CLEARANCE, UPWARDS, Plan, plan_stations, reach_of_stations
 from scenefuse.fusion.photo_check import Photos
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, voxel_downsample, write_cloud
+from scenefuse.io.tiles.tiled_cloud import AT_ONCE, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import GridFrame, LocalFrame, scene_frame
 from scenefuse.stage import atomic_file, quantity, read_json, threads, value, write_json
@@ -34,8 +36,12 @@ class MissingInputs:
 
     object: Path
     """Object cloud (PLY) in its own frame."""
-    fused_scene: Path
-    """PLY, the whole scene with the object in it."""
+    scene: Path
+    """Dense scene cloud (PLY)."""
+    fused: Path
+    """PLY of the fusion: what it added."""
+    checked: Path
+    """PLY of the fusion: what it changed in the scene."""
     fusion_json: Path
     """JSON of the fusion: where the object settled in the scene."""
     crop_json: Path
@@ -90,10 +96,11 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         return
     folders = inputs.object_workspace, inputs.masks
     obj, photos, masks = _in_scene(inputs, *folders, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
-    completed = with_normals(read_cloud(inputs.fused_scene))
-    missing = find_missing_surface(obj, completed[around(completed, obj)], photos, masks)
+    cameras = masks or photos[0].views
+    near, around_it = _surroundings(inputs, obj, cameras)
+    missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
     up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
-    plan = plan_stations(missing, obj, completed, masks or photos[0].views, up)
+    plan = plan_stations(missing, obj, around_it, cameras, up)
     write_cloud(outputs.missing, missing.cells)
     frame = scene_frame(read_json(inputs.georeference_json))
     rows = photo_rows(plan, up, frame)
@@ -101,6 +108,30 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     _write_geojson(outputs.geojson, rows)
     content = _report(missing, plan, unit) | {"seconds": quantity(time.perf_counter() - start, "s")}
     write_json(outputs.report, content)
+
+
+def _surroundings(inputs: MissingInputs, obj: Cloud, cameras: list[View]) -> tuple[Cloud, Cloud]:
+    """The scene after fusion, with normals, beside the object; and as far as anything may stand in a station's way.
+
+    Of more than AT_ONCE points, those farther off are thinned to a quarter of a camera's clearance, without normals.
+    """
+    scene, changes, added = open_cloud(inputs.scene), read_changes(inputs.checked), added_by(inputs.fused)
+    low, high = (end(obj.points, axis=0) for end in (np.min, np.max))
+    beside, reach = obj.diagonal, reach_of_stations(obj, cameras) if cameras else 0.0
+    tiles = scene.touching(low - max(beside, reach), high + max(beside, reach))
+    if np.diff(scene.starts)[tiles].sum() <= AT_ONCE:
+        whole = with_normals(together(changes.left_of(*scene.read(tiles)), added))
+        return whole, whole
+    near = with_normals(together(changes.left_of(*scene.near(low - beside, high + beside)), added))
+    far = [Cloud(near.points)]
+    for some in np.array_split(tiles, 1 + np.diff(scene.starts)[tiles].sum() // AT_ONCE):
+        points = changes.left_of(*scene.read(some)).points
+        outside = ((points < low - beside) | (points > high + beside)).any(1)
+        far.append(voxel_downsample(Cloud(points[outside]), CLEARANCE * obj.diagonal / 4))
+    around_it = concatenate(far)
+    normals = np.zeros((len(around_it), 3), np.float32)
+    normals[: len(near)] = near.normals
+    return near, replace(around_it, normals=normals)
 
 
 def _in_scene(

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cores import use_threads
+from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, together, with_source
 from scenefuse.fusion.evidence import (
-    FIELDS,
     KEPT,
     MEASURED,
+    NEAR,
     NERF_ONLY,
     REASONS,
     REPLACED,
@@ -28,6 +29,7 @@ from scenefuse.fusion.evidence import (
 from scenefuse.fusion.modes import (
     FEATHER_SPACINGS,
     FILL_SPACINGS,
+    NEAR_SPACINGS,
     FusionSettings,
     feathered,
     fuse_clouds,
@@ -35,15 +37,14 @@ from scenefuse.fusion.modes import (
     with_colors_of,
 )
 from scenefuse.fusion.photo_check import Photos, moved_photos, pack, read_photos
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud, write_laz
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.tiles.tiled_cloud import Rows, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.registration.uncertainty import Uncertainty
-from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import quantity, read_json, threads, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, box_around
 from scenefuse.workspace import read_workspace
 
-FROM_SCENE, FROM_OBJECT = 0, 1
 GREY = 128
 """Of the points of an object without colours in a scene that has some."""
 
@@ -67,7 +68,7 @@ class FusionInputs:
     scene_workspace: Path | None = None
     """The scene's, in the frame of its cloud; without it the scene is judged by the object's photos."""
     georeference_json: Path | None = None
-    """JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing."""
+    """JSON of the scene, for the unit of its lengths, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,9 @@ class FusionOutputs:
 
     fused: Path
     """PLY, the object's surroundings: the scene in the crop's box and what was added."""
-    fused_scene: Path
-    """PLY, the whole scene with what was added."""
-    fused_laz: Path
-    """LAZ of the same, in the CRS where the scene is georeferenced, else in scene units without one."""
     checked: Path
-    """PLY, the scene's points near the object: `row` in the scene's cloud, `reason` why it was taken away or 0."""
+    """PLY, the changes to the scene: its points near the object, with their `row` in its cloud, what photos know of
+    them, and the `reason` why each is taken away, or 0."""
     evidence: Path
     """JSON: what photos say of both sides' points."""
     report: Path
@@ -90,11 +88,11 @@ class FusionOutputs:
 
 @dataclass(frozen=True)
 class Fused:
-    """A scene with an object in it.
+    """A part of a scene with an object in it.
 
     Attributes:
-        scene: all of its points with `photos`, `match`, `deviation`, `evidence`.
-        rows: (M,) of the scene's points that were checked.
+        scene: its points with `photos`, `match`, `deviation`, `evidence`.
+        rows: (M,) of these points, those that were checked.
         reason: (M,) uint8, KEPT or why the point is taken away.
         added: the object's points that come in, with the same fields.
         gain: (3,) colour gain of the object.
@@ -114,12 +112,12 @@ class Fused:
 
     @property
     def removed(self) -> NDArray[np.int64]:
-        """(R,) rows of the scene's points that are taken away."""
+        """(R,) rows of the points that are taken away."""
         return self.rows[self.reason != KEPT]
 
     @property
     def kept(self) -> Cloud:
-        """The scene without them."""
+        """The part of the scene without them."""
         left = np.ones(len(self.scene), dtype=bool)
         left[self.removed] = False
         return self.scene[left]
@@ -138,41 +136,33 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     """
     start = time.perf_counter()
     use_threads(threads())
-    scene, part, obj = (read_cloud(path) for path in (inputs.scene, inputs.crop, inputs.object))
-    registration = read_json(inputs.fine_json)
+    whole, part, obj = open_cloud(inputs.scene), read_cloud(inputs.crop), read_cloud(inputs.object)
+    registration, crop_json = read_json(inputs.fine_json), read_json(inputs.crop_json)
     settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
-    if scene.normals is not None:
+    if whole.like.normals is not None:
         obj = with_normals(obj)
-    if not is_placed(registration):
+    placed, step = is_placed(registration), spacing(part.points)
+    pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
+    rows, scene = whole.near(*_region(obj, pose, crop_json, step))
+    if pose is None:
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
-        pose, fused, notes = None, _unchanged(obj, scene), []
+        fused, notes = _unchanged(obj, scene), []
+    elif settings.mode == "evidence":
+        fused = _by_evidence(obj, scene, pose, inputs, registration, settings)
     else:
-        pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-        if settings.mode == "evidence":
-            placed = obj.transformed(pose)
-            photos = (
-                photos_of(inputs.object_workspace, obj.points, pose),
-                photos_of(inputs.scene_workspace, placed.points),
-            )
-            fused = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
-            covariance = value(registration, "covariance") if "covariance" in registration else None
-            if covariance is not None:
-                added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
-                fused = replace(fused, added=added)
-        else:
-            fused = fuse_by_distance(obj, scene, part, pose, settings)
+        fused = fuse_by_distance(obj, scene, part, pose, settings)
     if scene.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         grey = np.full((len(fused.added), 3), GREY, np.uint8)
         fused = replace(fused, added=replace(fused.added, colors=grey))
     for note in notes:
         print(note, flush=True)
-    _write(fused, read_json(inputs.crop_json), inputs, outputs)
+    _write(fused, rows, crop_json, outputs)
     unit = length_unit(inputs.georeference_json)
     write_json(outputs.evidence, evidence_report(fused, unit))
     if pose is not None and fused.weighed is not None:
         pose = fused.weighed.settled @ pose
-    content = _report(fused, registration, spacing(part.points), unit) | {
+    content = _report(fused, registration, len(whole), step, unit) | {
         "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
         "mode": quantity(settings.mode, ""),
         "notes": quantity(([] if fused.weighed is None else list(fused.weighed.notes)) + notes, ""),
@@ -180,6 +170,31 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(outputs.report, content)
+
+
+def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: float) -> tuple[Array, Array]:
+    """Corners (3,) of the part of the scene that fusion reads: the crop's box, and what is near the object in place."""
+    scene_from_level = Sim3(1.0, np.array(value(crop_json, "level_from_scene")).T, np.zeros(3))
+    low, high = box_around(value(crop_json, "box_low"), value(crop_json, "box_high"), scene_from_level)
+    if pose is None:
+        return low, high
+    placed = obj.transformed(pose)
+    reach = NEAR * placed.diagonal + NEAR_SPACINGS * step
+    return np.minimum(low, placed.points.min(0) - reach), np.maximum(high, placed.points.max(0) + reach)
+
+
+def _by_evidence(
+    obj: Cloud, scene: Cloud, pose: Sim3, inputs: FusionInputs, registration: dict[str, Any], settings: FusionSettings
+) -> Fused:
+    """`fuse_by_evidence` of an object in its own frame, with what its pose adds to the deviations."""
+    placed = obj.transformed(pose)
+    photos = photos_of(inputs.object_workspace, obj.points, pose), photos_of(inputs.scene_workspace, placed.points)
+    fused = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
+    covariance = value(registration, "covariance") if "covariance" in registration else None
+    if covariance is None:
+        return fused
+    added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
+    return replace(fused, added=added)
 
 
 def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
@@ -223,7 +238,7 @@ def fuse_by_evidence(
 
     Args:
         obj: the object in the scene's frame, registered.
-        scene: the whole scene.
+        scene: the scene around it, or all of it.
         of_obj: the object's photos in the scene's frame.
         of_scene: the scene's photos that see the object.
         settings: see FusionSettings.
@@ -269,17 +284,18 @@ def photos_of(workspace: Path | None, points: Array, frame: Sim3 | None = None) 
     return moved_photos(photos, frame) if frame else photos
 
 
-def _write(fused: Fused, crop_json: dict[str, Any], inputs: FusionInputs, outputs: FusionOutputs) -> None:
-    """The clouds."""
+def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionOutputs) -> None:
+    """The clouds; rows: (N,) of the part of the scene in its cloud."""
     kept, added = with_source(fused.kept, FROM_SCENE), with_source(fused.added, FROM_OBJECT)
     write_cloud(outputs.fused, together(_in_box(kept, crop_json), added))
-    write_scene(outputs.fused_scene, outputs.fused_laz, together(kept, added), inputs.georeference_json)
     checked = fused.scene[fused.rows]
-    checked.fields["row"], checked.fields["reason"] = fused.rows.astype(np.uint32), fused.reason
+    checked.fields["row"], checked.fields["reason"] = rows[fused.rows].astype(np.uint32), fused.reason
     write_cloud(outputs.checked, checked)
 
 
-def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, unit: str) -> dict[str, Any]:
+def _report(
+    fused: Fused, registration: dict[str, Any], scene_points: int, scene_spacing: float, unit: str
+) -> dict[str, Any]:
     """What was added and taken away, with units."""
     added, weighed = fused.added, fused.weighed
     unconfirmed = None if weighed is None else int((weighed.obj.fields["evidence"] == NERF_ONLY).sum())
@@ -287,7 +303,7 @@ def _report(fused: Fused, registration: dict[str, Any], scene_spacing: float, un
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
         "registration": quantity(value(registration, "status"), ""),
         "reason": quantity(value(registration, "reason"), ""),
-        "scene_points": quantity(len(fused.scene), "points"),
+        "scene_points": quantity(scene_points, "points"),
         "checked_points": quantity(len(fused.rows), "points"),
         "removed_points": quantity(len(fused.removed), "points"),
         "added_points": quantity(len(added), "points"),
@@ -332,26 +348,3 @@ def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:
     low, high = np.array(value(crop_json, "box_low")), np.array(value(crop_json, "box_high"))
     levelled = cloud.points @ np.array(value(crop_json, "level_from_scene")).T
     return cloud[((levelled >= low) & (levelled <= high)).all(1)]
-
-
-def together(kept: Cloud, added: Cloud) -> Cloud:
-    """Both clouds in one; normals and colours that only the object has are left out, never those of the scene."""
-    return concatenate([kept, added]) if len(added) else kept
-
-
-def with_source(cloud: Cloud, source: int) -> Cloud:
-    """The cloud with its fields of evidence and `source`, wide enough for 65535 objects."""
-    known = {name: cloud.fields[name] for name in FIELDS}
-    return replace(cloud, fields=known | {"source": np.full(len(cloud), source, dtype=np.uint16)})
-
-
-def write_scene(ply: Path, laz: Path, cloud: Cloud, georeference: Path | None) -> str | None:
-    """Write a cloud in the scene's frame as PLY, and as LAZ in the scene's CRS; returns that CRS, None without one."""
-    write_cloud(ply, cloud)
-    frame = None if georeference is None else scene_frame(read_json(georeference))
-    if frame is None:
-        write_laz(laz, cloud, np.zeros(3), None)
-        return None
-    origin = frame.in_crs(np.zeros((1, 3)))[0]
-    write_laz(laz, replace(cloud, points=frame.in_crs(cloud.points) - origin), origin, frame.crs)
-    return frame.crs

@@ -16,6 +16,8 @@ FILL_SPACINGS = 1.5
 FILL_RESIDUALS = 1.5
 """Points are new at no less than this many median distances between the clouds where both exist, so that noise does not
 add a second layer."""
+NEAR_SPACINGS = 10.0
+"""Points of the scene within so many of its spacings of the object's box are held against it."""
 FEATHER_SPACINGS = 4.0
 """Width of the seam over which colours blend, in spacings of the scene."""
 LEAST_PAIRS = 50
@@ -62,14 +64,14 @@ def fuse_clouds(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, 
 
     Args:
         obj: the object in its own frame.
-        scene: the whole scene.
+        scene: the scene around it, or all of it.
         part: the scene's points on the object.
         scene_from_object: the registration.
         settings: see FusionSettings.
     """
     moved = obj.transformed(scene_from_object)
     step = spacing(part.points)
-    near = np.flatnonzero(_near(scene, moved, 10 * step))
+    near = np.flatnonzero(_near(scene, moved, NEAR_SPACINGS * step))
     near = near if len(near) else np.arange(len(scene))
     distance = cKDTree(scene.points[near]).query(moved.points, workers=threads())[0]
     fill = FILL_SPACINGS * step

@@ -79,8 +79,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     cells = missing.cells[missing.cells.fields["missing"] != UNTEXTURED]
     if len(cells) == 0 or not close_ups:
         return Plan([], 0.0)
-    middle = (obj.points.min(0) + obj.points.max(0)) / 2
-    distance = float(np.median([np.linalg.norm(view.centre - middle) for view in close_ups]))
+    middle, distance = _close_ups_from(obj, close_ups)
     apart = np.linalg.norm(around.points - middle, axis=1)
     beside = apart < BESIDE * obj.diagonal
     if not beside.any():
@@ -88,7 +87,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     assert around.normals is not None
     obstacles = voxel_downsample(Cloud(around.points[beside], around.normals[beside]), missing.side)
     others = voxel_downsample(
-        Cloud(around.points[beside | (apart < 2 * max(DISTANCES) * distance)]), CLEARANCE * obj.diagonal / 2
+        Cloud(around.points[beside | (apart < reach_of_stations(obj, close_ups))]), CLEARANCE * obj.diagonal / 2
     )
     step = max(missing.side, spacing(obstacles.points, quantile=SPARSEST))
     lens = sorted(close_ups, key=lambda view: view.intrinsics[0, 0] / view.width)[len(close_ups) // 2]
@@ -112,6 +111,17 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         stations.append(Station(photos[best], float(gains[best]) / len(cells)))
         left &= ~shown[best]
     return Plan(stations, float(shown.any(0).mean()) if len(photos) else 0.0)
+
+
+def _close_ups_from(obj: Cloud, close_ups: list[View]) -> tuple[Array, float]:
+    """The object's middle (3,), and how far from it its close-ups were taken."""
+    middle = (obj.points.min(0) + obj.points.max(0)) / 2
+    return middle, float(np.median([np.linalg.norm(view.centre - middle) for view in close_ups]))
+
+
+def reach_of_stations(obj: Cloud, close_ups: list[View]) -> float:
+    """How far from the object's middle things may stand in the way of a station."""
+    return 2 * max(DISTANCES) * _close_ups_from(obj, close_ups)[1]
 
 
 def _around(middle: Array, distance: float, up: Array) -> Array:

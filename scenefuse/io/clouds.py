@@ -1,6 +1,8 @@
 """Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from scenefuse.io.formats import COLOR, NORMAL, POSITION, bytes_of, read_columns
+from scenefuse.io.formats import COLOR, NORMAL, POSITION, Columns, bytes_of, read_columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 
@@ -132,9 +134,14 @@ def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) ->
 
 def sampled(points: NDArray[np.float64], most: int, seed: int) -> NDArray[np.float64]:
     """At most that many of (N, 3) points, drawn evenly."""
-    if len(points) <= most:
-        return points
-    return points[np.random.default_rng(seed).choice(len(points), most, replace=False)]
+    return points if len(points) <= most else points[sampled_rows(len(points), most, seed)]
+
+
+def sampled_rows(count: int, most: int, seed: int) -> NDArray[np.int64]:
+    """At most that many of `count` rows, drawn evenly."""
+    if count <= most:
+        return np.arange(count)
+    return np.random.default_rng(seed).choice(count, most, replace=False)
 
 
 def read_cloud(path: Path) -> Cloud:
@@ -150,23 +157,33 @@ def read_cloud(path: Path) -> Cloud:
 
 def read_counted(path: Path) -> tuple[Cloud, int]:
     """`read_cloud`, and how many rows without a finite position were left out."""
-    columns = read_columns(Path(path))
-    points = np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1)
-    finite = np.isfinite(points).all(1)
-    if not finite.all():
-        print(f"{path}: {np.sum(~finite)} of {len(points)} rows have no finite position and are left out", flush=True)
-        if not finite.any():
+    columns, left_out = finite_rows(read_columns(Path(path)))
+    if left_out:
+        count = left_out + len(columns["x"])
+        print(f"{path}: {left_out} of {count} rows have no finite position and are left out", flush=True)
+        if left_out == count:
             raise StageError(f"{path} holds no point with a finite position; look at what wrote it")
-        points, columns = points[finite], {name: values[finite] for name, values in columns.items()}
+    return cloud_of(columns), left_out
+
+
+def finite_rows(columns: Columns) -> tuple[Columns, int]:
+    """The rows with a finite position, and how many were left out."""
+    finite = np.isfinite([columns[k] for k in POSITION]).all(0)
+    if finite.all():
+        return columns, 0
+    return {name: values[finite] for name, values in columns.items()}, int(np.sum(~finite))
+
+
+def cloud_of(columns: Columns, most_color: float | None = None) -> Cloud:
+    """The cloud of a file's columns; `most_color` is the greatest colour of the whole file where this is a part."""
     normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
     colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
-    cloud = Cloud(
-        points,
+    return Cloud(
+        np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1),
         None if normals is None else np.nan_to_num(normals.astype(np.float32)),
-        None if colors is None else bytes_of(colors),
+        None if colors is None else bytes_of(colors, most_color),
         {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
     )
-    return cloud, int(np.sum(~finite))
 
 
 def write_cloud(path: Path, cloud: Cloud) -> None:
@@ -174,6 +191,13 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
 
     PLY allows no spaces in a field's name: they become underscores.
     """
+    vertex = records_of(cloud, path)
+    with atomic_file(path) as temporary:
+        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+
+
+def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
+    """(N,) rows of a PLY, as `write_cloud` has them; `path` is for the note of a field that is called otherwise."""
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", cloud.points.astype(np.float64).T))
     if cloud.normals is not None:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
@@ -186,8 +210,7 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
     vertex = np.empty(len(cloud), dtype=[(name, values.dtype) for name, values in columns.items()])
     for name, values in columns.items():
         vertex[name] = values
-    with atomic_file(path) as temporary:
-        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+    return vertex
 
 
 def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
@@ -199,27 +222,54 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
         origin: (3,) coordinates of the cloud's local origin.
         crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
     """
+    ends = cloud.points.min(0, initial=np.inf), cloud.points.max(0, initial=-np.inf)
+    with laz_in_parts(path, cloud, ends if len(cloud) else (np.zeros(3), np.zeros(3)), origin, crs) as append:
+        append(cloud)
+
+
+@contextmanager
+def laz_in_parts(
+    path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
+    crs: str | None,
+) -> Iterator[Callable[[Cloud], None]]:  # fmt: skip
+    """`write_laz` for clouds of any size: gives a function that appends a part.
+
+    Args:
+        path: output, .laz or .las; it appears when all parts are written.
+        like: a cloud, perhaps empty, with the columns that all parts have.
+        box: two opposite corners (3,) of a box around all points, relative to `origin`.
+        origin: see `write_laz`.
+        crs: see `write_laz`.
+
+    Raises:
+        StageError: the disk is full.
+    """
     import laspy
     import pyproj
 
     header = laspy.LasHeader(point_format=7, version="1.4")
-    step = 0.001 if crs is not None else max(cloud.diagonal, 1e-300) * 1e-8
+    low, high = box
+    step = 0.001 if crs is not None else max(float(np.linalg.norm(high - low)), 1e-300) * 1e-8
     # LAS counts steps from the offset in 32 bits; without a CRS the points may lie anywhere.
-    middle = (cloud.points.min(0) + cloud.points.max(0)) / 2 if crs is None and len(cloud) else 0.0
+    middle = (low + high) / 2 if crs is None else 0.0
     header.scales, header.offsets = np.full(3, step), np.floor(origin + middle)
     if crs is not None:
         header.add_crs(pyproj.CRS.from_user_input(crs))
-    names = _file_names(path, list(cloud.fields), set(header.point_format.dimension_names))
-    for name, values in cloud.fields.items():
+    names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
+    for name, values in like.fields.items():
         header.add_extra_dim(laspy.ExtraBytesParams(names[name], f"{values.dtype.kind}{values.dtype.itemsize}"))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = (cloud.points + origin).T
-    if cloud.colors is not None:
-        las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * 257
-    for name, values in cloud.fields.items():
-        las[names[name]] = values
-    with atomic_file(path) as temporary:
-        las.write(str(temporary))
+
+    def append(part: Cloud) -> None:
+        points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
+        points.x, points.y, points.z = (part.points + origin).T
+        if part.colors is not None:
+            points.red, points.green, points.blue = part.colors.astype(np.uint16).T * 257
+        for name, values in part.fields.items():
+            points[names[name]] = values
+        writer.write_points(points)
+
+    with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
+        yield append
 
 
 def _file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:

@@ -6,6 +6,8 @@ the precision of the file. Libraries are loaded when a file needs them.
 """
 
 import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
+from scenefuse.io.tiles.ply_header import read_header
 from scenefuse.stage import StageError
 
 Columns = dict[str, NDArray[Any]]
@@ -39,30 +42,46 @@ def read_columns(path: Path) -> Columns:
         )
     if not path.is_file():
         raise StageError(f"{path} does not exist; give the path of a cloud ({', '.join(READERS)})")
-    try:
+    with readable(path):
         columns = reader(path)
+    columns = checked(path, columns)
+    if len(columns["x"]) == 0:
+        raise StageError(f"{path} holds no points; look at what wrote it")
+    return columns
+
+
+@contextmanager
+def readable(path: Path) -> Iterator[None]:
+    """What a library says of a damaged file, as one sentence."""
+    try:
+        yield
     except (StageError, MemoryError):
         raise
     except Exception as error:  # each library has its own errors for a damaged file
         kind = path.suffix.removeprefix(".").upper()
         why = (str(error) or type(error).__name__).splitlines()[0]
         raise StageError(f"{path} is not a readable {kind} cloud ({why}); export it again") from None
+
+
+def checked(path: Path, columns: Columns) -> Columns:
+    """Columns by their common names; StageError where there are no positions."""
     columns = {_common_name(name): values for name, values in columns.items()}
     if not set(POSITION) <= set(columns):
         raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
-    if len(columns["x"]) == 0:
-        raise StageError(f"{path} holds no points; look at what wrote it")
     return columns
 
 
-def bytes_of(colors: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours (N, 3) as 0..255, from bytes, from 16 bits, or from fractions of 1; which one it is, the values tell."""
+def bytes_of(colors: NDArray[Any], most: float | None = None) -> NDArray[np.uint8]:
+    """Colours (N, 3) as 0..255, from bytes, from 16 bits, or from fractions of 1; which one it is, the greatest value
+    tells, or `most` where these are a part of the colours."""
     if colors.dtype == np.uint8:
         return colors
     values = np.nan_to_num(colors.astype(np.float64))
-    if values.max(initial=0) > 255:
+    if most is None:
+        most = values.max(initial=0)
+    if most > 255:
         values = values / 257
-    elif np.issubdtype(colors.dtype, np.floating) and values.max(initial=0) <= 1:
+    elif np.issubdtype(colors.dtype, np.floating) and most <= 1:
         values = values * 255
     return np.clip(np.rint(values), 0, 255).astype(np.uint8)
 
@@ -104,20 +123,57 @@ def _ply(path: Path) -> Columns:
     return sampled_columns(Mesh(vertices, faces, colors, None, np.full(len(faces), -1)))
 
 
+def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
+    """The columns of a binary PLY whose points come first, so many rows at a time."""
+    elements, offset = read_header(path) or ([], 0)
+    row = elements[0].row
+    assert row is not None and row.names is not None
+    names = [name for name in row.names if row[name].kind in "iuf"]
+    with open(path, "rb") as file:
+        file.seek(offset)
+        left = elements[0].count
+        while left:
+            rows = np.fromfile(file, row, min(left, at_once))
+            if not len(rows):
+                raise StageError(f"{path} is cut short: its last {left} points are missing; copy it again")
+            left -= len(rows)
+            yield {name: np.ascontiguousarray(rows[name]) for name in names}
+
+
 def _las(path: Path) -> Columns:
     """Positions, colours (unless all are black, which means none), and extra dimensions of one number."""
+    columns = _joined(_las_parts(path, -1))
+    if set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR):
+        columns = {name: values for name, values in columns.items() if name not in COLOR}
+    return columns
+
+
+def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
+    """The same, so many points at a time, and black colours too."""
     import laspy
 
-    las = laspy.read(path)
-    crs = _crs(las.header)
-    if crs is not None and crs.is_geographic:
-        raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
-    columns = {name: np.asarray(las[name]) for name in POSITION}
-    if set(COLOR) <= set(las.point_format.dimension_names):
-        colors = {name: np.asarray(las[name]) for name in COLOR}
-        columns |= colors if any(values.any() for values in colors.values()) else {}
-    extra = {name: np.asarray(las[name]) for name in las.point_format.extra_dimension_names}
-    return columns | {name: values for name, values in extra.items() if values.ndim == 1}
+    with laspy.open(path) as file:
+        crs = _crs(file.header)
+        if crs is not None and crs.is_geographic:
+            raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
+        form, count = file.header.point_format, 0
+        named = [*POSITION, *(COLOR if set(COLOR) <= set(form.dimension_names) else ())]
+        for points in file.chunk_iterator(at_once):
+            count += len(points)
+            extra = {name: np.asarray(points[name]) for name in form.extra_dimension_names}
+            yield {name: np.asarray(points[name]) for name in named} | {
+                name: values for name, values in extra.items() if values.ndim == 1
+            }
+        if count < file.header.point_count:
+            missing = file.header.point_count - count
+            raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+
+
+def _joined(parts: Iterator[Columns]) -> Columns:
+    found = list(parts)
+    if not found:
+        return {name: np.empty(0) for name in POSITION}
+    return found[0] if len(found) == 1 else {name: np.concatenate([part[name] for part in found]) for name in found[0]}
 
 
 def _crs(header: Any) -> Any:
@@ -133,52 +189,61 @@ def _crs(header: Any) -> Any:
 
 def _e57(path: Path) -> Columns:
     """All scans of the file, each moved by its pose; points marked as invalid are left out."""
+    return _joined(_e57_parts(path, 1 << 62))
+
+
+def _e57_parts(path: Path, at_once: int) -> Iterator[Columns]:
+    """The same, so many points at a time; colours where every scan has them."""
     import pye57
 
     file = pye57.E57(str(path))
     try:
-        scans = [_e57_scan(file, pye57.ScanHeader(node)) for node in file.data3d]
+        scans = [pye57.ScanHeader(node) for node in file.data3d]
+        colored = all("colorRed" in header.point_fields for header in scans)
+        for header in scans:
+            yield from _e57_scan(file, header, colored, at_once)
     finally:
         file.close()
-    if not scans:
-        return {name: np.empty(0) for name in POSITION}
-    common = [name for name in scans[0] if all(name in scan for scan in scans)]
-    return {name: np.concatenate([scan[name] for scan in scans]) for name in common}
 
 
-def _e57_scan(file: Any, header: Any) -> Columns:
+def _e57_scan(file: Any, header: Any, colored: bool, at_once: int) -> Iterator[Columns]:
     """One scan in the file's frame, read as float64: pye57's own reader fails on colours above 255."""
     from pye57 import libe57
-    from scipy.spatial.transform import Rotation
 
     spherical = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
     cartesian = ("cartesianX", "cartesianY", "cartesianZ")
-    color = ("colorRed", "colorGreen", "colorBlue")
+    color = ("colorRed", "colorGreen", "colorBlue") if colored else ()
     states = ("cartesianInvalidState", "sphericalInvalidState")
     wanted = [name for name in (*cartesian, *spherical, *color, *states) if name in header.point_fields]
-    columns = {name: np.empty(header.point_count) for name in wanted}
+    buffer = {name: np.empty(min(header.point_count, at_once)) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
-    for name, values in columns.items():
+    for name, values in buffer.items():
         buffers.append(libe57.SourceDestBuffer(file.image_file, name, values, len(values), True, True))
-    if header.point_count:
-        header.points.reader(buffers).read()
-    if cartesian[0] in columns:
-        points, state = np.stack([columns[name] for name in cartesian], axis=1), states[0]
-    else:
-        distance, azimuth, elevation = (columns[name] for name in spherical)
-        level = distance * np.cos(elevation)
-        points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
-        state = states[1]
-    turn, shift = np.eye(3), np.zeros(3)
-    if header.has_pose():
-        rotation, translation = header.pose["rotation"], header.pose["translation"]
-        turn = Rotation.from_quat([rotation[part].value() for part in "xyzw"]).as_matrix()
-        shift = np.array([translation[part].value() for part in "xyz"])
-    found = dict(zip(POSITION, (points @ turn.T + shift).T))
-    if color[0] in columns:
+    reader, turn, shift = header.points.reader(buffers) if header.point_count else None, *_e57_pose(header)
+    while reader is not None and (count := reader.read()):
+        columns = {name: values[:count] for name, values in buffer.items()}
+        if cartesian[0] in columns:
+            points, state = np.stack([columns[name] for name in cartesian], axis=1), states[0]
+        else:
+            distance, azimuth, elevation = (columns[name] for name in spherical)
+            level = distance * np.cos(elevation)
+            points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
+            state = states[1]
+        found = dict(zip(POSITION, (points @ turn.T + shift).T))
         found |= {name: columns[own].astype(np.uint16) for name, own in zip(COLOR, color)}
-    valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
-    return {name: values[valid] for name, values in found.items()}
+        valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
+        yield {name: values[valid] for name, values in found.items()}
+
+
+def _e57_pose(header: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Rotation (3, 3) and position (3,) of a scan in its file."""
+    from scipy.spatial.transform import Rotation
+
+    if not header.has_pose():
+        return np.eye(3), np.zeros(3)
+    rotation, translation = header.pose["rotation"], header.pose["translation"]
+    turn = Rotation.from_quat([rotation[part].value() for part in "xyzw"]).as_matrix()
+    return turn, np.array([translation[part].value() for part in "xyz"])
 
 
 def _pcd(path: Path) -> Columns:
@@ -294,6 +359,16 @@ def _numbers(line: str) -> list[float]:
         return [float(cell) for cell in line.split(_separator(line))]
     except ValueError:
         return []
+
+
+def part_reader(path: Path) -> Callable[[Path, int], Iterator[Columns]] | None:
+    """What reads so many points of a file at a time; None where it has to be read whole."""
+    ending = path.suffix.lower()
+    if ending != ".ply":
+        return {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts}.get(ending)
+    elements = (read_header(path) or ([], 0))[0]
+    plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
+    return _ply_parts if plain and not any(element.name == "face" for element in elements) else None
 
 
 READERS = {

@@ -1,13 +1,17 @@
 """A user's cloud or mesh in the place of photos: a scene's dense cloud, or an object's."""
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefuse.io.clouds import Cloud, read_counted, spacing, write_cloud
-from scenefuse.io.formats import las_crs
+from scenefuse.io.clouds import Cloud, cloud_of, concatenate, finite_rows, spacing, write_cloud
+from scenefuse.io.formats import COLOR, las_crs
+from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
+from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.stage import StageError, quantity, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -15,6 +19,8 @@ from scenefuse.transforms import Array, Sim3
 LEAST_POINTS = 200
 # Positions below this share of the points, and above the same share, are strays: they do not move the origin.
 STRAY_PERCENT = 1.0
+# Of a larger cloud, its place is found from every so manyth point: from so many at least.
+SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
 
@@ -24,7 +30,7 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
-        cloud: output PLY in the scene's frame.
+        cloud: output PLY in the scene's frame, tile by tile (`open_cloud`); however large, it is never all in memory.
         report: output JSON: points, spacing, notes.
         georeference_json: output JSON: `crs` (null where the file names none), `length_unit`, `origin_in_crs` and
             `crs_from_scene`, the shift back into the file's coordinates.
@@ -32,16 +38,23 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
     Raises:
         StageError: the file is missing, damaged, in degrees, of an unknown ending, or has too few different points.
     """
-    own, content = _imported(source)
+    parts = columns_in_parts(source)
+    own = _survey(source, parts)
     crs = las_crs(source)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
-    origin = near_origin(own.points)
+    origin = near_origin(own.sample)
     shift = Sim3(1.0, np.eye(3), origin)
-    placed = replace(own, points=own.points - origin)
-    write_cloud(cloud, placed)
-    write_json(report, _report(placed, unit, content) | {"backend": quantity("imported", "")})
+
+    def placed() -> Iterator[Cloud]:
+        return (replace(part, points=part.points - origin) for part in _clouds(parts, own))
+
+    write_tiled(cloud, placed, own.count, own.sample - origin)
+    tiles = open_cloud(cloud)
+    diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
+    content = _report(source, own, tiles.spacing(), diagonal, unit)
+    write_json(report, content | {"backend": quantity("imported", "")})
     place = {
         "length_unit": quantity(unit, ""),
         "crs": quantity(name, ""),
@@ -62,14 +75,15 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     Raises:
         StageError: as of `import_scene_cloud`.
     """
-    own, content = _imported(source)
-    origin = near_origin(own.points)
-    placed = replace(own, points=own.points - origin)
+    parts = columns_in_parts(source)
+    own = _survey(source, parts)
+    whole = concatenate(list(_clouds(parts, own)))
+    origin = near_origin(whole.points)
+    placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
-    write_json(
-        report, _report(placed, "object units", content) | {"object_from_file": quantity(shift.matrix, "object units")}
-    )
+    content = _report(source, own, spacing(placed.points), placed.diagonal, "object units")
+    write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
 
 
 def near_origin(points: Array) -> Array:
@@ -82,44 +96,91 @@ def near_origin(points: Array) -> Array:
     return np.asarray(np.round(middle / step) * step + 0.0)
 
 
-def _imported(source: Path) -> tuple[Cloud, dict[str, Any]]:
-    """A user's cloud with unit normals or none and without further fields, and what became of the rest."""
-    cloud, left_out = read_counted(source)
-    different = len(np.unique(cloud.points, axis=0))
+@dataclass(frozen=True)
+class _Survey:
+    """What has to be known of all of a file's points before any is written.
+
+    Attributes:
+        count: of the rows with a finite position.
+        left_out: rows without.
+        sample: (S, 3) positions of every so manyth of them: of all up to SAMPLE.
+        unit_normals: whether there are normals, all of unit length; None where there are none.
+        most_color: the greatest colour; None where there are none.
+        unused: names of further columns.
+    """
+
+    count: int
+    left_out: int
+    sample: Array
+    unit_normals: bool | None
+    most_color: float | None
+    unused: list[str]
+
+
+def _survey(source: Path, parts: ColumnParts) -> _Survey:
+    """Go through a file once.
+
+    Raises:
+        StageError: it is damaged, or has too few different points.
+    """
+    count, left_out, every, sample = 0, 0, 1, np.zeros((0, 3))
+    unit_normals, most_color, unused = None, None, set[str]()
+    for columns in parts():
+        columns, without = finite_rows(columns)
+        part = cloud_of(columns)
+        sample = np.concatenate([sample, part.points[-count % every :: every]])
+        while len(sample) > 2 * SAMPLE:
+            sample, every = sample[::2], 2 * every
+        count, left_out, unused = count + len(part), left_out + without, unused | set(part.fields)
+        if part.normals is not None:
+            off = np.abs(np.linalg.norm(part.normals, axis=1) - 1) > UNIT_TOLERANCE
+            unit_normals = unit_normals is not False and not off.any()
+        if part.colors is not None:
+            here = max(float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0)) for name in COLOR)
+            most_color = max(here, most_color or 0.0)
+    if count == 0:
+        what = "point with a finite position" if left_out else "points"
+        raise StageError(f"{source} holds no {what}; look at what wrote it")
+    different = len(np.unique(sample, axis=0))
     if different < LEAST_POINTS:
         raise StageError(
-            f"{source} has only {different} different positions among its {len(cloud)} points; {LEAST_POINTS} or more"
+            f"{source} has only {different} different positions among its {count} points; {LEAST_POINTS} or more"
             " are needed to place it"
         )
-    notes = [f"{left_out} rows without a finite position were left out"] if left_out else []
-    normals = cloud.normals
-    if normals is not None:
-        length = np.linalg.norm(normals, axis=1, keepdims=True)
-        if (np.abs(length - 1) > UNIT_TOLERANCE).any():
-            notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
-            normals = None
-        else:
-            normals = (normals / length).astype(np.float32)
+    if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
+        most_color = None  # Formats with colours are used for points without, which are black then.
+    return _Survey(count, left_out, sample, unit_normals, most_color, sorted(unused))
+
+
+def _clouds(parts: ColumnParts, own: _Survey) -> Iterator[Cloud]:
+    """The file's points in parts, with unit normals or none, colours as bytes or none, and no further fields."""
+    for columns in parts():
+        cloud = cloud_of(finite_rows(columns)[0], own.most_color)
+        normals = None
+        if own.unit_normals and cloud.normals is not None:
+            normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
+        yield Cloud(cloud.points, normals, None if own.most_color is None else cloud.colors)
+
+
+def _report(source: Path, own: _Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
+    """What was taken over, and what became of the rest; printed too."""
+    notes = [f"{own.left_out} rows without a finite position were left out"] if own.left_out else []
+    if own.unit_normals is False:
+        notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
     for note in notes:
         print(note, flush=True)
-    if cloud.fields:
-        print(f"not used: the columns {', '.join(sorted(cloud.fields))}", flush=True)
-    content = {
+    if own.unused:
+        print(f"not used: the columns {', '.join(own.unused)}", flush=True)
+    return {
+        "points": quantity(own.count, "1"),
+        "spacing": quantity(step, unit),
+        "diagonal": quantity(diagonal, unit),
         "source": quantity(source.name, ""),
-        "columns_not_used": quantity(sorted(cloud.fields), ""),
-        "has_colors": quantity(cloud.colors is not None, ""),
-        "has_normals": quantity(normals is not None, ""),
+        "columns_not_used": quantity(own.unused, ""),
+        "has_colors": quantity(own.most_color is not None, ""),
+        "has_normals": quantity(bool(own.unit_normals), ""),
         "notes": quantity(notes, ""),
     }
-    return Cloud(cloud.points, normals, cloud.colors), content
-
-
-def _report(cloud: Cloud, unit: str, content: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "points": quantity(len(cloud), "1"),
-        "spacing": quantity(spacing(cloud.points), unit),
-        "diagonal": quantity(cloud.diagonal, unit),
-    } | content
 
 
 def unit_and_name(crs: str) -> tuple[str, str]:

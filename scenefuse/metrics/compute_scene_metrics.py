@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from scenefuse.io.clouds import read_cloud
+from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of
 from scenefuse.stage import quantity, read_json, value, write_json
 
@@ -21,15 +22,17 @@ def compute_scene_metrics(
         seed: of samples and of the random clouds that give the null values.
         settings: see MetricSettings.
     """
-    whole, known = read_cloud(completed), read_json(completed_json)
+    whole, known = open_cloud(completed), read_json(completed_json)
     numbers = {name: int(number) for number, name in value(known, "sources").items()}
     parts = []
     for folder in objects:
         if value(known, "added_points").get(folder.name, 0) == 0:
             continue
         crop = folder / "registration/full"
-        before, diagonal = read_cloud(crop / "crop.ply").points, value(read_json(crop / "crop.json"), "diagonal")
-        parts.append(completion_of(before, whole, numbers[folder.name], float(diagonal)))
+        before, diagonal = read_cloud(crop / "crop.ply").points, float(value(read_json(crop / "crop.json"), "diagonal"))
+        # What an object adds lies no farther from its crop than the object is wide.
+        around = whole.near(before.min(0) - diagonal, before.max(0) + diagonal)[1]
+        parts.append(completion_of(before, around, numbers[folder.name], diagonal))
     found = completion_metrics(parts, settings, seed) | {"objects": quantity(len(parts), "objects")}
     for name, item in found.items():
         print(f"{name:34s} {item['value']} {item['unit']}", flush=True)

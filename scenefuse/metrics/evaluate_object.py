@@ -7,9 +7,12 @@ from typing import Any
 import numpy as np
 
 from scenefuse.demo.cameras import read_cameras as read_true_cameras
-from scenefuse.io.clouds import read_cloud, sampled
+from scenefuse.fusion.changes import after_fusion
+from scenefuse.io.clouds import Cloud, read_cloud, sampled
 from scenefuse.io.pictures import read_gray
+from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.metrics.object_truth import (
+    MARGIN,
     ObjectTruth,
     cloud_results,
     depth_results,
@@ -29,7 +32,7 @@ from scenefuse.metrics.truth import (
 from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.sfm.undistort import undistort_picture
 from scenefuse.stage import quantity, read_json, setting, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, box_around
 from scenefuse.workspace import read_cameras, read_views
 
 
@@ -69,10 +72,12 @@ class EvaluationInputs:
     """The orbit's truth folder."""
     alignment_json: Path | None = None
     """JSON of the alignment from shared features, measured like a variant, or nothing."""
-    before: Path | None = None
-    """Scene cloud before fusion, scene frame; the whole scene or the object's surroundings."""
-    after: Path | None = None
-    """The same after fusion; absent when nothing was fused."""
+    scene: Path | None = None
+    """Scene cloud before fusion, scene frame."""
+    fused: Path | None = None
+    """What fusion added, and the object's surroundings; absent when nothing was fused."""
+    checked: Path | None = None
+    """What fusion changed in the scene; as `fused`."""
 
 
 def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settings: ObjectEvaluationSettings) -> None:
@@ -118,14 +123,25 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
         result |= {f"alignment_{name}": entry for name, entry in errors.items() if name != "status"}
     flight = read_true_cameras(inputs.truth_scene / "cameras.json")
     surface = surface_to_find(known, flight)
-    for when, path in (("before", inputs.before), ("after", inputs.after)):
-        if path is not None:
-            of_scene = scene_scores(truth_from_scene.apply(read_cloud(path).points), known, surface)
-            for ending, scores in of_scene.items():
-                result |= {f"scene_{name}_{when}_{ending}": quantity(score, "1") for name, score in scores.items()}
+    for when, cloud in _around_object(inputs, known, truth_from_scene).items():
+        for ending, scores in scene_scores(truth_from_scene.apply(cloud.points), known, surface).items():
+            result |= {f"scene_{name}_{when}_{ending}": quantity(score, "1") for name, score in scores.items()}
     result["variants"] = variants
     write_json(report, result)
     print_results(result)
+
+
+def _around_object(inputs: EvaluationInputs, known: ObjectTruth, truth_from_scene: Sim3) -> dict[str, Cloud]:
+    """The scene around the object before fusion, and after it, where there is one."""
+    if inputs.scene is None:
+        return {}
+    scene, margin = open_cloud(inputs.scene), 2 * MARGIN * known.diagonal
+    low, high = known.surface.min(0) - margin, known.surface.max(0) + margin
+    box = box_around(low, high, truth_from_scene.inverse())
+    found = {"before": scene.near(*box)[1]}
+    if inputs.fused is not None and inputs.checked is not None:
+        found["after"] = after_fusion(scene, inputs.checked, inputs.fused, *box)
+    return found
 
 
 def _mask_results(inputs: EvaluationInputs) -> dict[str, Any]:

@@ -5,9 +5,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.io.clouds import read_cloud, sampled
+from scenefuse.io.clouds import sampled_rows
+from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.metrics.truth import (
     HIDDEN,
     Mesh,
@@ -24,7 +26,7 @@ from scenefuse.metrics.truth import (
 )
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.stage import quantity, read_json, setting, value, write_json
-from scenefuse.transforms import Array
+from scenefuse.transforms import Array, Sim3
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,12 @@ def evaluate_scene(
     meshes = [read_mesh(truth / "meshes" / f"{name}.ply") for name in ["world", *content["objects"]]]
     posed = read_posed(model, cameras)
     fit = fit_cameras(posed, cameras)
-    points = fit.truth_from_model.apply(read_cloud(cloud).points)
     georeference_error = _georeference_error(read_json(georeference_json), content, posed, cameras)
     result = {
         **camera_results(fit, len(cameras.names)),
         "georeference_error_median": quantity(georeference_error, "m"),
         "georeference_scale_error_pct": quantity(100 * abs(fit.truth_from_model.scale - 1), "%"),
-        **_cloud_results(points, content, meshes, cameras, settings.samples, seed),
+        **_cloud_results(open_cloud(cloud), fit.truth_from_model, content, meshes, cameras, settings.samples, seed),
         "truth_from_scene": quantity(fit.truth_from_model.matrix, "m"),
     }
     write_json(report, result)
@@ -81,16 +82,18 @@ def evaluate_scene(
 
 
 def _cloud_results(
-    points: Array, content: dict[str, Any], meshes: list[Mesh], cameras: Cameras, samples: int, seed: int
-) -> dict[str, Any]:
-    """Distance of the cloud (N, 3) in the truth's frame from the surface, and the share of the terrain it covers."""
+    cloud: TiledCloud, truth_from_cloud: Sim3, content: dict[str, Any], meshes: list[Mesh], cameras: Cameras,
+    samples: int, seed: int,
+) -> dict[str, Any]:  # fmt: skip
+    """Distance of the cloud from the true surface, and the share of the terrain it covers."""
     gsd = float(value(content, "ground_sampling_distance"))
     scene = cast_together(meshes)
-    to_truth = distances(scene, sampled(points, samples, seed))
+    drawn = sampled_rows(len(cloud), samples, seed)
+    to_truth = distances(scene, truth_from_cloud.apply(cloud.rows(drawn).points))
     low, high = (np.array(corner) for corner in value(content, "mapped_area"))
     ground = sample_surface(within(meshes[0], low, high), samples, seed)
     seen = visible(scene, cameras, ground, HIDDEN)[1].sum(0) >= 3
-    covered = nearest(ground[seen], points) <= 3 * gsd
+    covered = _covered(ground[seen], cloud, truth_from_cloud, 3 * gsd)
     return {
         "ground_sampling_distance": quantity(gsd, "m"),
         "cloud_distance_median": quantity(float(np.median(to_truth)), "m"),
@@ -98,6 +101,16 @@ def _cloud_results(
         "cloud_distance_median_over_gsd": quantity(float(np.median(to_truth)) / gsd, "1"),
         "terrain_covered": quantity(float(covered.mean()), "1"),
     }
+
+
+def _covered(ground: Array, cloud: TiledCloud, truth_from_cloud: Sim3, reach: float) -> NDArray[np.bool_]:
+    """(M,) which of (M, 3) samples of the ground, in the truth's frame, have a point of the cloud within reach."""
+    found = np.zeros(len(ground), dtype=bool)
+    for _, part in cloud.parts():
+        points = truth_from_cloud.apply(part.points)
+        near = ((ground >= points.min(0) - reach) & (ground <= points.max(0) + reach)).all(1) & ~found
+        found[near] = nearest(ground[near], points) <= reach
+    return found
 
 
 def _georeference_error(report: dict[str, Any], truth: dict[str, Any], posed: Posed, cameras: Cameras) -> float | None:

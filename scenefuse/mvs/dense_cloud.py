@@ -11,8 +11,9 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.io.maps import read_depth, write_depth
+from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.io.units import length_unit
 from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.mvs.votes import neighbours, vote
@@ -92,7 +93,7 @@ def fuse_depth_maps(
     print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
     measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
     content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
-    write_cloud(cloud, kept)
+    write_tiled(cloud, lambda: [kept], len(kept), kept.points)
     content |= {"depth_maps": quantity(len(maps), "1"), "outvoted_share": quantity(outvoted, "1")}
     write_json(report, content)
 

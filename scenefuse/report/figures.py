@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
-from scenefuse.io.clouds import Cloud, read_cloud, spacing
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
+from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
@@ -23,6 +24,8 @@ CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
 MISSING_COLORS = {NEVER_SEEN: (214, 38, 31), UNTEXTURED: (52, 101, 196), CONTRADICTED: (150, 60, 170)}
 Discs = list[tuple[Cloud, NDArray[np.float32]]]
 """Clouds and the radii of their points' discs."""
+MOST_DRAWN = 2_000_000
+"""Points of a scene in its figure; of more, every so manyth."""
 VIEW_POINTS = 150_000
 """Of an object's 3D view: with three objects and a scene, the page stays well below 15 MB."""
 
@@ -90,13 +93,16 @@ def draw_scene(
     Raises:
         StageError: an input is missing.
     """
-    cloud = read_cloud(dense)
+    scene = open_cloud(dense)
+    every = max(1, -(-len(scene) // MOST_DRAWN))
+    cloud = concatenate([part for _, part in scene.parts(every)])
     views = [] if georeferenced is None else read_views(georeferenced)
     centres = np.array([view.centre for view in views]).reshape(-1, 3)
     shown = [folder for folder in objects if folder.name not in failed]
     boxes = {f.name: _box_corners(read_cloud(f / "registration/full/crop.ply").points) for f in shown}
     cameras = "given as a cloud, no cameras" if georeferenced is None else f"cameras (red): {len(centres)}"
-    note = f"{len(cloud):,} points, {cameras}, objects (boxes): {len(boxes)}"
+    drawn = "" if every == 1 else f" (one in {every} is drawn)"
+    note = f"{len(scene):,} points{drawn}, {cameras}, objects (boxes): {len(boxes)}"
     save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
 
 

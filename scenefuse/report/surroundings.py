@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.fusion.changes import after_fusion
 from scenefuse.fusion.fuse_object import is_placed
 from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.report.object_sheet import inner
 from scenefuse.report.values import find, flatten, load, number, unit_of
 from scenefuse.stage import StageError, read_json, value
-from scenefuse.transforms import Array, Sim3, rotation_between
+from scenefuse.transforms import Array, Sim3, box_around, rotation_between
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
 REACH = (0.35, 0.35, 0.15)
@@ -55,8 +57,10 @@ class FigureInputs:
     """The object's name, for titles."""
     scene: Path
     """The scene's dense cloud, scene frame."""
-    fused_scene: Path
-    """The whole scene after fusion, with the field `source` (0 scene, 1 object)."""
+    fused: Path
+    """The object's surroundings after fusion, with the field `source` (0 scene, 1 object)."""
+    checked: Path
+    """What fusion changed in the scene."""
     crop: Path
     """The object's part of the scene, scene frame."""
     crop_json: Path
@@ -99,10 +103,9 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     shown = placed if fused and placed is not None else crop
     low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
     reach = np.array(REACH) * float(np.linalg.norm(high - low))
-    before, after = (
-        _inside(read_cloud(path).transformed(level), low - reach, high + reach)
-        for path in (inputs.scene, inputs.fused_scene)
-    )
+    scene, box = open_cloud(inputs.scene), box_around(low - reach, high + reach, level.inverse())
+    clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
+    before, after = (_inside(cloud.transformed(level), low - reach, high + reach) for cloud in clouds)
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"

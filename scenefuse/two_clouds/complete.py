@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, together, with_source
 from scenefuse.fusion.evidence import unchecked, with_normals
-from scenefuse.fusion.fuse_object import FROM_OBJECT, FROM_SCENE, GREY, possible, together, with_source
+from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.formats import COLOR, las_crs

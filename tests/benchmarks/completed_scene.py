@@ -21,14 +21,9 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from scenefuse.demo.cameras import read_cameras
+from scenefuse.fusion.changes import FROM_OBJECT, together
 from scenefuse.fusion.evidence import MEASURED, around
-from scenefuse.fusion.fuse_object import (
-    FROM_OBJECT,
-    fuse_by_distance,
-    fuse_by_evidence,
-    together,
-    uncertainty_on_scene,
-)
+from scenefuse.fusion.fuse_object import fuse_by_distance, fuse_by_evidence, uncertainty_on_scene
 from scenefuse.fusion.modes import FusionSettings
 from scenefuse.fusion.photo_check import LEAST_PHOTOS, moved_photos, read_photos
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing

@@ -64,7 +64,7 @@ def test_the_house_is_found_and_fills_the_scene_in_its_own_coordinates(project, 
     added = truth.inverse().apply(after.xyz[source == 1])
     low, high = trial.object.points.min(0), trial.object.points.max(0)
     assert ((added > low - 0.05 * (high - low)) & (added < high + 0.05 * (high - low))).all()
-    assert set(read_cloud(folder / "fused_scene.ply").fields["evidence"]) == {0}  # no photo was asked
+    assert set(read_cloud(folder / "fused.ply").fields["evidence"]) == {0}  # no photo was asked
 
 
 def test_what_was_not_made_is_said_in_words(project):

@@ -63,12 +63,13 @@ def test_masks_find_the_house_in_the_scene_where_fiducials_do(finished):
 def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(finished):
     house = finished / "results/objects/house"
     truth = json.loads((house / "truth.json").read_text())
-    fused = read_cloud(house / "fused_scene.ply")
+    fused, checked = read_cloud(house / "fused.ply"), read_cloud(house / "checked.ply")
     scene = read_cloud(finished / "results/scenes/demo/dense.ply")
     added = fused.fields["source"] == 1
     removed = sum(json.loads((house / "evidence.json").read_text())["scene_removed"]["value"].values())
-    assert (~added).sum() == len(scene) - removed
-    assert (house / "fused_scene.laz").stat().st_size > 0
+    assert (checked.fields["reason"] > 0).sum() == removed
+    assert np.array_equal(scene.points[checked.fields["row"].astype(int)], checked.points)
+    assert not (house / "fused_scene.ply").exists()  # only where it is asked for
     assert added.sum() > 0 and (fused.fields["photos"][added] >= 3).all()
     for threshold in ("1pct", "2pct"):
         assert truth[f"scene_f_score_after_{threshold}"]["value"] > truth[f"scene_f_score_before_{threshold}"]["value"]
@@ -76,16 +77,19 @@ def test_fusion_completes_the_scene_and_keeps_the_provenance_of_every_point(fini
 
 def test_the_completed_scene_holds_what_the_object_adds(finished):
     scene = finished / "results/scenes/demo"
-    completed, alone = (
-        read_cloud(path) for path in (scene / "completed.ply", finished / "results/objects/house/fused_scene.ply")
+    house = finished / "results/objects/house"
+    completed, fused, checked = (
+        read_cloud(path) for path in (scene / "completed.ply", house / "fused.ply", house / "checked.ply")
     )
-    assert np.allclose(completed.points, alone.points)
-    assert np.array_equal(completed.fields["source"], alone.fields["source"])
+    dense, added = read_cloud(scene / "dense.ply"), fused[fused.fields["source"] == 1]
+    kept = np.delete(dense.points, checked.fields["row"][checked.fields["reason"] > 0].astype(int), axis=0)
+    assert np.array_equal(completed.points, np.concatenate([kept, added.points]))
+    assert np.array_equal(completed.fields["source"], np.repeat([0, 1], [len(kept), len(added)]))
     assert json.loads((scene / "completed.json").read_text())["sources"]["value"] == {"0": "scene", "1": "house"}
     assert (scene / "completed.laz").stat().st_size > 0
     of_scene, of_house = (
         json.loads((folder / "metrics.json").read_text())["completion"]
-        for folder in (scene, finished / "results/objects/house")
+        for folder in (scene, house)
     )
     for name in ("surface_variation", "surface_variation_null", "nue", "primitive_fitting_score_after"):
         assert of_scene[name]["value"] == pytest.approx(of_house[name]["value"], rel=0.05)
@@ -123,6 +127,11 @@ def test_an_edited_setting_reruns_only_what_depends_on_it(finished, snakemake, t
     tiny = yaml.safe_load((ROOT / "tests/data/tiny.yaml").read_text())
     (tmp_path / "edited.yaml").write_text(yaml.safe_dump(tiny | edit))
     assert planned(snakemake(finished, "--dry-run", config=tmp_path / "edited.yaml").stdout) == rules | SUMMARY
+
+
+def test_the_scene_with_one_object_is_a_target(finished, snakemake):
+    result = snakemake(finished, "results/objects/house/fused_scene.laz", "--dry-run")
+    assert planned(result.stdout) == {"complete_scene_with_object"}
 
 
 def test_one_object_is_a_target(finished, snakemake):

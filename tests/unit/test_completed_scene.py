@@ -52,8 +52,6 @@ def run(folder, scene, objects, mode="fill", refused=(), failed=()):
             ),
             outputs=FusionOutputs(
                 fused=mine / "fused.ply",
-                fused_scene=mine / "fused_scene.ply",
-                fused_laz=mine / "fused_scene.laz",
                 checked=mine / "checked.ply",
                 evidence=mine / "evidence.json",
                 report=mine / "fusion.json",

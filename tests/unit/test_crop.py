@@ -198,7 +198,8 @@ def own_points(trial):
 def test_masks_vote_for_the_object_and_against_what_is_around_it(orbit):
     folder, trial = orbit
     own = np.arange(len(trial.scene)) < own_points(trial)
-    votes = vote(trial.scene.points, folder / "undistorted", folder / "masks", trial.scene_from_object, 0.8)
+    photos = read_masked_views(folder / "undistorted", folder / "masks", 0.8)
+    votes = vote(trial.scene.points, photos, trial.scene_from_object, 0.8)
     assert votes.object[own].mean() > 0.95 and votes.other[own].mean() < 0.02
     low, high = trial.fiducials.min(0) - 0.05 * trial.diagonal, trial.fiducials.max(0) + 0.05 * trial.diagonal
     outside = ~own & ((trial.scene.points < low) | (trial.scene.points > high))[:, :2].any(1)
@@ -209,7 +210,7 @@ def test_masks_vote_for_the_object_and_against_what_is_around_it(orbit):
     assert len(votes.own) > 300 and ((votes.own > low) & (votes.own < high))[:, :2].all()
     # Through a wrong similarity the masks meet other points, or none.
     moved = Sim3(1.0, np.eye(3), np.array([0.5 * trial.diagonal, 0, 0])) @ trial.scene_from_object
-    wrong = vote(trial.scene.points, folder / "undistorted", folder / "masks", moved, 0.8)
+    wrong = vote(trial.scene.points, photos, moved, 0.8)
     assert wrong.object[own].mean() < 0.6
 
 
@@ -223,9 +224,9 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
     behind = middle - [0.8 * trial.diagonal, 0, 0] + np.random.default_rng(0).normal(0, 0.004, (50, 3)) * trial.diagonal
     on_it = np.array([middle, middle + 0.02 * trial.diagonal])
     both = np.concatenate([behind, on_it])
-    votes = vote(both, folder / "undistorted", tmp_path / "masks", trial.scene_from_object, 0.8)
-    views = read_masked_views(folder / "undistorted", tmp_path / "masks", 0.8)[0]
-    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), views)
+    photos = read_masked_views(folder / "undistorted", tmp_path / "masks", 0.8)
+    votes = vote(both, photos, trial.scene_from_object, 0.8)
+    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), photos.views)
     assert ((inside == 3) & (shown == 3)).mean() > 0.8
     assert not votes.object[:50].any()
 
@@ -233,7 +234,7 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
 def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     """A fence between some of the cameras and the house; their masks show no house."""
     folder, trial = orbit
-    views = read_masked_views(folder / "undistorted", folder / "masks", 0.8)[0]
+    views = read_masked_views(folder / "undistorted", folder / "masks", 0.8).views
     middle, size = trial.fiducials.mean(0), trial.diagonal
     rng = np.random.default_rng(0)
     y, z = rng.uniform(-2 * size, 2 * size, 200000), rng.uniform(-size, size, 200000)

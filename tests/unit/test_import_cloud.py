@@ -1,5 +1,7 @@
 """Clouds in the place of photos: their frame, their coordinates, and what does without photos."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from support.cloud_files import UTM, write_e57
@@ -35,7 +37,7 @@ def imported_scene(path, source):
 
 def write_as(path, cloud):
     """The cloud as a file of the path's kind."""
-    if path.suffix == ".laz":
+    if path.suffix in (".laz", ".las"):
         write_laz(path, Cloud(cloud.points - UTM, None, cloud.colors), UTM, "EPSG:32632")
     elif path.suffix == ".e57":
         write_e57(path, [(cloud.points, cloud.colors, np.array([1.0, 0, 0, 0]), np.zeros(3))])
@@ -54,6 +56,37 @@ def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path
     in_float32 = found.points.astype(np.float32) + value(georeference, "origin_in_crs")
     assert np.allclose(in_float32, cloud.points, atol=6e-4)
     assert value(report, "points") == 500 and value(report, "source") == name
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.xyz"])
+def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkeypatch):
+    turned = np.random.default_rng(1).normal(size=(500, 3))
+    source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
+    whole, *jsons = imported_scene(tmp_path, source)
+    monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
+    found, *others = imported_scene(tmp_path, source)
+    assert jsons == others and np.array_equal(found.points, whole.points)
+    assert np.array_equal(found.colors, cloud.colors)
+    assert (found.normals is None) == (name != "a.ply") and np.array_equal(found.normals, whole.normals)
+
+
+def test_colors_of_16_bits_are_told_from_bytes_by_the_whole_file(tmp_path, cloud, monkeypatch):
+    colors = np.zeros((500, 3), np.uint16)
+    colors[-1] = [65535, 257, 0]
+    columns = dict(zip(("red", "green", "blue"), colors.T))
+    write_cloud(tmp_path / "a.ply", Cloud(cloud.points, None, None, columns))
+    monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
+    assert imported_scene(tmp_path, tmp_path / "a.ply")[0].colors[-1].tolist() == [255, 1, 0]
+
+
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply"])
+def test_a_file_that_is_cut_short_is_one_sentence(tmp_path, cloud, name, monkeypatch):
+    monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
+    source = write_as(tmp_path / name, cloud)
+    source.write_bytes(source.read_bytes()[:-3000])
+    with pytest.raises(StageError, match=f"{name} is (cut short: its last|not a readable)"):
+        imported_scene(tmp_path, source)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_a_crs_is_kept_and_gives_the_unit_and_latitudes(tmp_path, cloud):

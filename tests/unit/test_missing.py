@@ -7,6 +7,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from support.changed_scene import write_changes
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.fusion.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
@@ -164,15 +165,16 @@ def files(tmp_path, half):
     for view in masks:
         cv2.imwrite(str(tmp_path / "masks" / view.name), view.pixels.astype(np.uint8) * 255)
     write_cloud(tmp_path / "object.ply", cloud)
-    write_cloud(tmp_path / "fused.ply", cloud)
+    write_cloud(tmp_path / "dense.ply", cloud)
+    write_changes(tmp_path, cloud, cloud[:0])
     fusion = {"status": "fused", "reason": "", "scene_from_object": Sim3.identity().matrix}
     write_json(tmp_path / "fusion.json", {k: quantity(v, "") for k, v in fusion.items()})
     write_json(tmp_path / "crop.json", {"level_from_scene": quantity(np.eye(3), "")})
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", ""), **{
         f"origin_{k}": quantity(v, "") for k, v in (("latitude_deg", 47.4), ("longitude_deg", 8.5), ("altitude_m", 400))
     }})  # fmt: skip
-    names = ("object.ply", "fused.ply", "fusion.json", "crop.json", "georeference.json", "object", "scene", "masks")
-    inputs = MissingInputs(*(tmp_path / name for name in names))
+    names = ("object.ply", "dense.ply", "fused.ply", "checked.ply", "fusion.json", "crop.json", "georeference.json")
+    inputs = MissingInputs(*(tmp_path / name for name in (*names, "object", "scene", "masks")))
     outputs = MissingOutputs(*(tmp_path / name for name in ("missing.ply", "next.csv", "next.geojson", "missing.json")))
     return inputs, outputs
 

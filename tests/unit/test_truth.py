@@ -9,6 +9,7 @@ import numpy as np
 import open3d as o3d
 import pycolmap
 import pytest
+from support.changed_scene import write_changes
 
 from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
@@ -107,8 +108,9 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ground = tr.sample_surface(plate, 60000, 2)
     write_cloud(root / "object.ply", Cloud(object_from_truth.apply(surface)))
     half = surface[surface[:, 0] < 0]
-    write_cloud(root / "before.ply", Cloud(scene_from_truth.apply(np.concatenate([half, ground]))))
-    write_cloud(root / "after.ply", Cloud(scene_from_truth.apply(np.concatenate([surface, ground]))))
+    before = Cloud(scene_from_truth.apply(np.concatenate([half, ground])))
+    write_cloud(root / "before.ply", before)
+    write_changes(root, before, Cloud(scene_from_truth.apply(surface[surface[:, 0] >= 0])))
     exact = scene_from_truth @ TRUTH_FROM_OBJECT
     wrong = Sim3(exact.scale * 1.02, exact.rotation, exact.translation)
     for variant, transform in (("full", exact), ("no_scale", wrong)):
@@ -164,8 +166,9 @@ def object_of(planted: Path, folder: Path, **other: Path) -> dict:
         cloud=planted / "object.ply",
         variants=[planted / name / "fine.json" for name in ("full", "no_scale", "no_crop")],
         alignment_json=planted / "no_scale/fine.json",
-        before=planted / "before.ply",
-        after=planted / "after.ply",
+        scene=planted / "before.ply",
+        fused=planted / "fused.ply",
+        checked=planted / "checked.ply",
         scene_json=folder / "s.json",
         truth_scene=planted / "truth/scene",
         truth_object=planted / "truth/thing",
@@ -235,7 +238,8 @@ def test_a_scene_is_scored_by_its_points_on_the_object_alone(planted: Path) -> N
     known = read_object_truth(
         planted / "undistorted", planted / "truth/scene", planted / "truth/thing", samples=5000, seed=0
     )
-    scene = TRUTH_FROM_SCENE.apply(read_cloud(planted / "after.ply").points)
+    clouds = [read_cloud(planted / name).points for name in ("before.ply", "fused.ply")]
+    scene = TRUTH_FROM_SCENE.apply(np.concatenate(clouds))
     beside = np.array([[1.1, 0, 0.5], [1.3, 0, 0.5], [0.0, 0.9, 0.02]])  # near the box; outside; on the ground
     assert around_object(beside, known).tolist() == [True, False, False]
     assert scene_scores(scene, known, known.surface)["1pct"]["precision"] > 0.999

@@ -4,6 +4,7 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from support.changed_scene import write_changes
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
@@ -164,7 +165,8 @@ def capture(tmp_path_factory):
     source = np.repeat(np.uint8([0, 1]), [len(scene), len(added)])
     pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
     write_cloud(folder / "dense.ply", scene)
-    write_cloud(folder / "fused_scene.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
+    write_cloud(folder / "completed.ply", Cloud(fused.points, None, fused.colors, {"source": source}))
+    write_changes(folder, scene, added)
     write_cloud(folder / "box/registration/full/crop.ply", half)
     write_cloud(folder / "object.ply", whole.transformed(pose.inverse()))
     top = np.stack([*(a.ravel() for a in np.meshgrid(np.linspace(-0.5, 0.5, 20), [-0.1, 0, 0.1])), np.ones(60)], axis=1)
@@ -202,7 +204,8 @@ def draw(capture, fine, figures):
     inputs = FigureInputs(
         name="box",
         scene=capture / "dense.ply",
-        fused_scene=capture / "fused_scene.ply",
+        fused=capture / "fused.ply",
+        checked=capture / "checked.ply",
         crop=capture / "box/registration/full/crop.ply",
         crop_json=capture / "crop.json",
         object_cloud=capture / "object.ply",
@@ -270,14 +273,15 @@ def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path
 
 
 def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(capture, tmp_path):
-    scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "fused_scene.ply")
+    scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
     far = Cloud(np.array([[900.0, 0, 0]]), None, np.uint8([RED]))
     write_cloud(tmp_path / "dense.ply", join(scene, far))
-    write_json(tmp_path / "completed.json", {"sources": quantity({"0": "scene", "1": "box"}, "")})
+    about = {"sources": quantity({"0": "scene", "1": "box"}, ""), "scene_points": quantity(len(scene), "points")}
+    write_json(tmp_path / "completed.json", about)
     write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
     jsons = {"completed_json": tmp_path / "completed.json", "georeference_json": tmp_path / "georeference.json"}
     dense = tmp_path / "dense.ply"
-    view_scene(dense=dense, completed=capture / "fused_scene.ply", **jsons, folder=tmp_path / "view")
+    view_scene(dense=dense, completed=capture / "completed.ply", **jsons, folder=tmp_path / "view")
     view = read_view(tmp_path / "view")
     assert (view.sources, view.unit) == ({0: "scene", 1: "box"}, "m")
     assert view.cloud.points.max() < 10 and len(view.cloud) == len(fused)

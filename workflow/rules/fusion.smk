@@ -2,9 +2,10 @@
 #
 # INPUTS    results/objects/{object}/object.ply, undistorted/, registration/full/; results/scenes/{scene}/dense.ply, undistorted/;
 #           config: fusion
-# OUTPUTS   results/objects/{object}/fused.ply, fused_scene.ply, fused_scene.laz, checked.ply, evidence.json, fusion.json
+# OUTPUTS   results/objects/{object}/fused.ply, checked.ply, evidence.json, fusion.json
 #           results/objects/{object}/missing.ply, missing.json, next_photos.csv, next_photos.geojson
 #           results/scenes/{scene}/completed.ply, completed.laz, completed.json
+#           results/objects/{object}/fused_scene.ply, fused_scene.laz, fused_scene.json      where they are asked for
 
 
 rule fuse_object:
@@ -21,8 +22,6 @@ rule fuse_object:
         georeference=in_scene("georeference.json"),
     output:
         fused="results/objects/{object}/fused.ply",
-        scene="results/objects/{object}/fused_scene.ply",
-        laz="results/objects/{object}/fused_scene.laz",
         checked="results/objects/{object}/checked.ply",
         evidence="results/objects/{object}/evidence.json",
         report="results/objects/{object}/fusion.json",
@@ -46,15 +45,17 @@ rule fuse_object:
     shell:
         "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-json {input.crop_json}"
         " --fine-json {input.fine} {params.photos}"
-        " --georeference-json {input.georeference} --fused {output.fused} --fused-scene {output.scene}"
-        " --fused-laz {output.laz} --checked {output.checked} --evidence {output.evidence} --report {output.report} {params.options} &> {log}"
+        " --georeference-json {input.georeference} --fused {output.fused} --checked {output.checked} --evidence {output.evidence}"
+        " --report {output.report} {params.options} &> {log}"
 
 
 rule find_missing:
     """Surface of the fused object that no photo confirms, and where to stand next (F5, F6)."""
     input:
         cloud="results/objects/{object}/object.ply",
-        fused_scene="results/objects/{object}/fused_scene.ply",
+        scene=in_scene("dense.ply"),
+        fused="results/objects/{object}/fused.ply",
+        checked="results/objects/{object}/checked.ply",
         fusion="results/objects/{object}/fusion.json",
         crop_json="results/objects/{object}/registration/full/crop.json",
         object_workspace=if_photographed(POSED),
@@ -83,7 +84,8 @@ rule find_missing:
     message:
         "{wildcards.object}: what is still missing"
     shell:
-        "exec python {params.script} --object {input.cloud} --fused-scene {input.fused_scene} --fusion-json {input.fusion}"
+        "exec python {params.script} --object {input.cloud} --scene {input.scene} --fused {input.fused} --checked {input.checked}"
+        " --fusion-json {input.fusion}"
         " --crop-json {input.crop_json} {params.photos} --georeference-json {input.georeference}"
         " --missing {output.missing} --next-photos {output.photos} --geojson {output.geojson} --report {output.report} &> {log}"
 
@@ -119,3 +121,27 @@ rule complete_scene:
         "exec python {params.script} --scene {input.scene} --objects {params.objects} --georeference-json {input.georeference}"
         " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-laz {output.laz}"
         " --report {output.report} &> {log}"
+
+
+use rule complete_scene as complete_scene_with_object with:
+    # The scene with one of its objects alone; nothing needs it.
+    input:
+        scene=in_scene("dense.ply"),
+        georeference=in_scene("georeference.json"),
+        objects="results/objects/{object}/fused.ply",
+        checked="results/objects/{object}/checked.ply",
+        fusions="results/objects/{object}/fusion.json",
+    output:
+        cloud="results/objects/{object}/fused_scene.ply",
+        laz="results/objects/{object}/fused_scene.laz",
+        report="results/objects/{object}/fused_scene.json",
+    log:
+        "results/logs/complete_scene_with_object/{object}.log",
+    benchmark:
+        "results/benchmarks/complete_scene_with_object/{object}.tsv"
+    params:
+        objects="results/objects/{object}",
+        script=script("fusion/complete_scene.py"),
+        code=code("fusion/complete_scene.py"),
+    message:
+        "{wildcards.object}: the scene with it"

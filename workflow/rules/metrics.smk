@@ -141,9 +141,10 @@ rule evaluate_object:
             allow_missing=True,
         ),
         alignment="results/objects/{object}/alignment.json",
-        before=in_scene("dense.ply"),
-        after="results/objects/{object}/fused_scene.ply",
-        scene=in_scene("truth.json"),
+        scene=in_scene("dense.ply"),
+        fused="results/objects/{object}/fused.ply",
+        checked="results/objects/{object}/checked.ply",
+        scene_json=in_scene("truth.json"),
         truth=object_truth,
     output:
         "results/objects/{object}/truth.json",
@@ -166,6 +167,6 @@ rule evaluate_object:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --workspace {input.workspace} --sparse {input.sparse} --undistorted {input.undistorted}"
-        " --masks {input.masks} --stages {input.stages} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --before {input.before} --after {input.after}"
-        " --scene-json {input.scene} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
+        " --masks {input.masks} --stages {input.stages} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --scene {input.scene} --fused {input.fused}"
+        " --checked {input.checked} --scene-json {input.scene_json} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --report {output} --seed {params.seed} {params.options} &> {log}"

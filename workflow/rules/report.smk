@@ -48,7 +48,8 @@ rule draw_object:
     """The object before and after, and every step between (the paper's Figures 2, 3 and 5)."""
     input:
         scene=in_scene("dense.ply"),
-        fused_scene="results/objects/{object}/fused_scene.ply",
+        fused="results/objects/{object}/fused.ply",
+        checked="results/objects/{object}/checked.ply",
         crop="results/objects/{object}/registration/full/crop.ply",
         crop_json="results/objects/{object}/registration/full/crop.json",
         cloud="results/objects/{object}/object.ply",
@@ -90,7 +91,7 @@ rule draw_object:
     message:
         "{wildcards.object}: figures"
     shell:
-        "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused-scene {input.fused_scene}"
+        "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused {input.fused} --checked {input.checked}"
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
         " --metrics-json {input.metrics} --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
         " {params.photos} --figures {output} &> {log}"

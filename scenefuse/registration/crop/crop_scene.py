@@ -4,15 +4,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.clouds import Cloud, spacing, write_cloud
+from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
-from scenefuse.registration.crop.one_photo import crop_grown, locate_clicks
+from scenefuse.registration.crop.one_photo import MOST_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.registration.crop.parts import MIN_PART, parts
-from scenefuse.registration.crop.vote import Votes, vote
+from scenefuse.registration.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.sfm.fiducials import Labels, ScenePoints, locate, read_points
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
@@ -22,6 +22,10 @@ UP = np.array([0.0, 0.0, 1.0])
 # Fewer points than this give no features to register by.
 MIN_POINTS = 200
 MIN_FIDUCIALS = 4
+# Points of a scene in which an object is searched without any mark.
+MOST_WHOLE = 10_000_000
+# How far from clicks a crop may reach, in their extents: it grows, and looks for ground around what it has become.
+GROWN_EXTENTS = 2 * MOST_GROWTH
 
 
 @dataclass(frozen=True)
@@ -74,9 +78,9 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
     Raises:
         StageError: nothing marks the object, the marks are wrong or contradict each other, or too few points are left.
     """
-    scene = read_cloud(inputs.scene)
-    cut, marks = _cut(scene, inputs, settings)
-    part = scene[cut.keep]
+    scene = open_cloud(inputs.scene)
+    near, cut, marks = _cut(scene, inputs, settings)
+    part = near[cut.keep]
     write_cloud(crop, part)
     unit = length_unit(inputs.georeference_json)
     about = {
@@ -84,56 +88,74 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
         "fiducials": quantity(marks.fiducials, unit),
         "voted_points": quantity(marks.voted, "1"),
     }
-    write_json(report, about | _report(scene, part, cut, unit))
+    write_json(report, about | _report(len(scene), part, cut, unit))
 
 
-def _cut(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
-    """The crop by what marks the object, in this order: masks where photos are linked, then the user's file."""
+def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+    """The part of the scene that was read, and the crop of it by what marks the object, in this order: masks where
+    photos are linked, then the user's file."""
     if settings.whole_scene:
-        cut = whole(scene)
+        if len(scene) > MOST_WHOLE:
+            raise StageError(
+                f"nothing marks the object, and the scene has {len(scene)} points; without marks it is searched in at"
+                f" most {MOST_WHOLE}: mark it (column fiducials of the objects table)"
+            )
+        near = scene.read(np.arange(len(scene.low)))[1]
+        cut = whole(near)
         print(cut.notes[0], flush=True)
-        return cut, Marks("none", np.zeros((0, 3)))
+        return near, cut, Marks("none", np.zeros((0, 3)))
     if settings.mode == "masks" and inputs.alignment_json is not None:
         alignment = read_json(inputs.alignment_json)
         if value(alignment, "found") or inputs.fiducials is None:
             return crop_by_masks(scene, inputs, settings)
-        cut, marks = crop_by_file(scene, inputs, settings)
+        near, cut, marks = crop_by_file(scene, inputs, settings)
         note = (
             f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
             f" ({value(alignment, 'reason')})"
         )
         print(note, flush=True)
-        return replace(cut, notes=[note, *cut.notes]), marks
+        return near, replace(cut, notes=[note, *cut.notes]), marks
     return crop_by_file(scene, inputs, settings)
 
 
-def crop_by_file(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
-    """The crop by labels in photos of the scene (`crop_grown`) or by fiducials (`crop_marked`)."""
-    names, points, other, left_out = _located(scene, inputs, settings)
+def around_marks(marks: Array, settings: CropSettings, extents: float = 1.0) -> tuple[Array, Array]:
+    """Corners (3,) of the part of a scene that a crop around marks (F, 3) depends on, its ground included.
+
+    It is as wide as the marks' box, its margin, and so many of its diagonals on each side, and of any height.
+    """
+    low, high = marks.min(0), marks.max(0)
+    reach = (settings.margin + extents) * float(np.linalg.norm(high - low)) * np.array([1, 1, np.inf])
+    return low - reach, high + reach
+
+
+def crop_by_file(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+    """The crop by labels in photos of the scene (`crop_grown`) or by fiducials (`crop_marked`), and the part read."""
+    names, points, clicks = _located(scene, inputs, settings)
     assert inputs.fiducials is not None
-    if other is None:
-        return crop_marked(scene, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
-    cut = crop_grown(scene, points, UP, settings, other)
-    cut = replace(cut, notes=[*left_out, *cut.notes])
+    if clicks is None:
+        near = scene.near(*around_marks(points, settings))[1]
+        return near, crop_marked(near, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
+    near = scene.near(*around_marks(points, settings, GROWN_EXTENTS))[1]
+    cut = crop_grown(near, points, UP, settings, clicks.other(near.points))
+    cut = replace(cut, notes=[*clicks.left_out, *cut.notes])
     _announce(cut, str(inputs.fiducials))
-    return cut, Marks("clicks", points)
+    return near, cut, Marks("clicks", points)
 
 
 def _located(
-    scene: Cloud, inputs: CropInputs, settings: CropSettings
-) -> tuple[list[str], Array, NDArray[np.bool_] | None, list[str]]:
-    """Names and positions (F, 3) in the scene frame of what the user's file marks; for labels, which of the scene's
-    points (N,) are something else by them (None for fiducials), and the clicks that were left out."""
+    scene: TiledCloud, inputs: CropInputs, settings: CropSettings
+) -> tuple[list[str], Array, SceneClicks | None]:
+    """Names and positions (F, 3) in the scene frame of what the user's file marks; of labels, all that they say."""
     if inputs.fiducials is None:
         raise StageError("cropping by fiducials needs --fiducials; give them, or mode masks and its files")
     if inputs.sparse is None:
-        return *points_in(inputs.fiducials, inputs.georeference_json), None, []
+        return *points_in(inputs.fiducials, inputs.georeference_json), None
     marked = read_points(inputs.fiducials)
     if isinstance(marked, Labels):
         found = locate_clicks(marked, inputs.sparse, scene)
-        return found.names, found.inside, found.other, found.left_out
+        return found.names, found.inside, found
     names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
-    return names, points, None, []
+    return names, points, None
 
 
 def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str], Array]:
@@ -153,9 +175,9 @@ def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str
     return marked.points, marked.positions - origin
 
 
-def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> tuple[Crop, Marks]:
-    """`crop_cloud` around the scene points that the object's masks vote for, and its SfM points (C3); checked by the
-    fiducials or clicks where there are some.
+def crop_by_masks(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+    """`crop_cloud` around the scene points that the object's masks vote for, and its SfM points (C3), and the part of
+    the scene that was read; checked by the fiducials or clicks where there are some.
 
     Raises:
         StageError: a file is missing, the alignment has no pose, the masks mark nothing, or the fiducials mark
@@ -165,16 +187,22 @@ def crop_by_masks(scene: Cloud, inputs: CropInputs, settings: CropSettings) -> t
         raise StageError(
             "cropping by masks needs --alignment-json, --workspace and --masks; give them, or mode fiducials"
         )
-    votes = votes_of(scene, inputs.alignment_json, inputs.workspace, inputs.masks, settings)
-    cut = crop_cloud(scene, np.concatenate([scene.points[votes.object], votes.own]), UP, settings, votes.other)
+    pose = _alignment(inputs.alignment_json)
+    masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
+    low, high = around_marks(pose.apply(masked.own), settings)
+    sight = masked.sight(pose)
+    near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
+    votes = votes_of(near, masked, pose, settings, len(scene))
+    cut = crop_cloud(near, np.concatenate([near.points[votes.object], votes.own]), UP, settings, votes.other)
     notes = [f"marked by the votes of {inputs.masks} through the alignment from shared features, not by fiducials"]
     points = np.zeros((0, 3))
     if inputs.fiducials is not None:
-        names, points, _, left_out = _located(scene, inputs, settings)
-        notes += [*left_out, *_check_inside(names, points, cut, inputs.fiducials)]
+        names, points, clicks = _located(scene, inputs, settings)
+        notes += [] if clicks is None else clicks.left_out
+        notes += _check_inside(names, points, cut, inputs.fiducials)
     cut = replace(cut, notes=notes + cut.notes)
     _announce(cut, str(inputs.masks))
-    return cut, Marks("masks", points, int(votes.object.sum()))
+    return near, cut, Marks("masks", points, int(votes.object.sum()))
 
 
 def _check_inside(names: list[str], points: Array, cut: Crop, path: Path) -> list[str]:
@@ -193,28 +221,28 @@ def _check_inside(names: list[str], points: Array, cut: Crop, path: Path) -> lis
     return [f"{len(outside)} of {len(names)} marks of {path} lie outside the box: {', '.join(outside)}"]
 
 
-def votes_of(scene: Cloud, alignment_json: Path, workspace: Path, masks: Path, settings: CropSettings) -> Votes:
-    """The masks' votes on the scene's points, without loose parts among those that they vote for.
-
-    Raises:
-        StageError: the alignment has no pose, or too few photos have a mask.
-    """
-    alignment = read_json(alignment_json)
+def _alignment(path: Path) -> Sim3:
+    """scene_from_object of an alignment's JSON; StageError where it has none."""
+    alignment = read_json(path)
     if not value(alignment, "found"):
         raise StageError(
             "there are no fiducials, and shared features give no alignment of the object with the scene"
-            f" ({value(alignment, 'reason')}; see {alignment_json}): click on the object in one of the scene's photos"
+            f" ({value(alignment, 'reason')}; see {path}): click on the object in one of the scene's photos"
             " and name the file in the column fiducials of the objects table, or add photos of the object that"
             " show its surroundings too, from as far away as the scene's"
         )
-    pose = Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))
-    votes = vote(scene.points, workspace, masks, pose, settings.min_votes)
+    return Sim3.from_matrix(np.array(value(alignment, "scene_from_object")))
+
+
+def votes_of(near: Cloud, masked: Masked, pose: Sim3, settings: CropSettings, scene_points: int) -> Votes:
+    """The masks' votes on the scene's points near the object, without loose parts among those that they vote for."""
+    votes = vote(near.points, masked, pose, settings.min_votes)
     chosen = np.flatnonzero(votes.object)
     if len(chosen) > 1:
-        part_of, counts = parts(scene.points[chosen], 3 * spacing(scene.points[chosen]))
+        part_of, counts = parts(near.points[chosen], 3 * spacing(near.points[chosen]))
         chosen = chosen[(counts >= MIN_PART * len(chosen))[part_of]]
-    print(f"{len(chosen)} of {len(scene)} scene points by the votes of the masks", flush=True)
-    return replace(votes, object=np.isin(np.arange(len(scene)), chosen))
+    print(f"{len(chosen)} of {scene_points} scene points by the votes of the masks", flush=True)
+    return replace(votes, object=np.isin(np.arange(len(near)), chosen))
 
 
 def crop_marked(
@@ -256,7 +284,7 @@ def _check_near(names: list[str], points: Array, cloud: Cloud, path: Path) -> No
         )
 
 
-def _report(scene: Cloud, part: Cloud, cut: Crop, unit: str) -> dict[str, object]:
+def _report(scene_points: int, part: Cloud, cut: Crop, unit: str) -> dict[str, object]:
     """The stage JSON of a crop."""
     ground = cut.ground
     return {
@@ -265,7 +293,7 @@ def _report(scene: Cloud, part: Cloud, cut: Crop, unit: str) -> dict[str, object
         "level_from_scene": quantity(cut.level_from_scene, ""),
         "box_low": quantity(cut.low, unit),
         "box_high": quantity(cut.high, unit),
-        "scene_points": quantity(len(scene), "1"),
+        "scene_points": quantity(scene_points, "1"),
         "box_points": quantity(int(cut.in_box.sum()), "1"),
         "crop_points": quantity(len(part), "1"),
         "diagonal": quantity(part.diagonal, unit),

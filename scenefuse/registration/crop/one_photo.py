@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.io.clouds import Cloud
+from scenefuse.io.tiles.tiled_cloud import Rows, TiledCloud
 from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud
 from scenefuse.sfm.fiducials import Labels
@@ -27,6 +28,8 @@ LEAST_ADDED = 0.01
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
 MOST_GROWTH = 3.0
+# Which end of a box each of its corners has along x, y, z.
+CORNERS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)], dtype=bool)
 # The outermost share of the kept points on each side marks nothing.
 STRAYS = 0.005
 
@@ -38,57 +41,79 @@ class SceneClicks:
     Attributes:
         names: of the inside clicks, for messages.
         inside: (F, 3) where they are, in the scene frame.
-        other: (N,) bool over the scene's points, True for those nearer to a click outside than to any inside, or off a
-            box.
+        outside: (O, 3) the same of clicks outside.
+        boxes: photos with the box that was clicked in them.
         left_out: clicks where the scene has no point, a sentence each.
     """
 
     names: list[str]
     inside: Array
-    other: NDArray[np.bool_]
+    outside: Array
+    boxes: list[tuple[View, PhotoClicks]]
     left_out: list[str]
 
+    def other(self, points: Array) -> NDArray[np.bool_]:
+        """(N,) points (N, 3) that are something else: nearer to a click outside than to any inside, or off a box."""
+        found = np.zeros(len(points), dtype=bool)
+        for view, clicks in self.boxes:
+            found |= _off_box(clicks, *view.project(points))
+        if len(self.outside):
+            near = [cKDTree(side).query(points, workers=threads())[0] for side in (self.outside, self.inside)]
+            found |= near[0] < near[1]
+        return found
 
-def locate_clicks(labels: Labels, sparse: Path, scene: Cloud) -> SceneClicks:
+
+def locate_clicks(labels: Labels, sparse: Path, scene: TiledCloud) -> SceneClicks:
     """Where labelled pixels of scene photos are in the scene: on the nearest points of the dense cloud there (C5).
 
     Args:
         labels: pixels of the scene's photos, inside and outside the object, or a box around it.
         sparse: COLMAP model of these photos.
-        scene: dense cloud in the model's frame.
+        scene: dense cloud in the model's frame; what lies along the clicks is read of it.
 
     Raises:
         StageError: as `clicks_per_photo`; fewer than three inside clicks meet the scene.
     """
     views = read_views(sparse)
-    step = spacing(scene.points)
+    step = scene.spacing()
     names: list[str] = []
     sides: tuple[list[Array], list[Array]] = ([], [])
     left_out: list[str] = []
-    other = np.zeros(len(scene), dtype=bool)
+    boxes = []
     for row, clicks in clicks_per_photo(labels, sparse, views, {}).items():
         view = views[row]
-        pixels, depth = view.project(scene.points)
+        points = scene.read(_behind(clicks.pixels, scene, step, view))[1].points
+        pixels, depth = view.project(points)
         for pixel, inside in zip(clicks.pixels, clicks.inside):
             name = f"{'inside' if inside else 'outside'} ({pixel[0]:.0f}, {pixel[1]:.0f}) in {view.name}"
-            found = _on_surface(scene.points, pixels, depth, pixel, step, view)
+            found = _on_surface(points, pixels, depth, pixel, step, view)
             if found is None:
                 left_out.append(f"the click {name} of {labels.path} meets no point of the scene: left out")
             else:
                 sides[int(inside)].append(found)
                 names += [name] * bool(inside)
-        other |= _off_box(clicks, pixels, depth)
+        if clicks.box is not None:
+            boxes.append((view, clicks))
     if len(sides[1]) < LEAST_INSIDE:
         about = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
             f"{labels.path} has {len(sides[1])} clicks inside the object that meet points of the scene, {LEAST_INSIDE}"
             f" are needed{about}: click on the object's ends, in a photo that shows it well"
         )
-    inside = np.array(sides[1])
-    if sides[0]:
-        near = [cKDTree(np.array(side)).query(scene.points, workers=threads())[0] for side in sides]
-        other |= near[0] < near[1]
-    return SceneClicks(names, inside, other, left_out)
+    return SceneClicks(names, np.array(sides[1]), np.array(sides[0]).reshape(-1, 3), boxes, left_out)
+
+
+def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
+    """The tiles of a scene that a photo may show about one of (K, 2) pixels; those that reach behind it too."""
+    corners = np.where(CORNERS[:, None], scene.high, scene.low)
+    at, depth = view.project(corners.reshape(-1, 3))
+    at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
+    reach = np.maximum(
+        AROUND_PX, AROUND_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step)
+    )
+    low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
+    shown = ((pixels[:, None] >= low) & (pixels[:, None] <= high)).all(2).any(0)
+    return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= step)))
 
 
 def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: float, view: View) -> Array | None:

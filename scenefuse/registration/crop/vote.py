@@ -23,6 +23,8 @@ SLACK = 0.005
 CELL_SPACINGS, HIDDEN_CELLS = 4, 2
 # Photos that must show a point, and the share of all that must have it in their frame.
 MIN_SHOWN, MIN_FRAMED = 3, 1 / 4
+# Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
+FAR_EXTENTS = 4.0
 # How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
 NEAR_OWN, MIN_OWN = 0.15, 10
 
@@ -42,7 +44,27 @@ class Votes:
     own: Array
 
 
-def vote(points: Array, workspace: Path, masks: Path, scene_from_object: Sim3, min_share: float) -> Votes:
+@dataclass(frozen=True)
+class Masked:
+    """An object's photos with their masks.
+
+    Attributes:
+        views: with `pixels` True on the mask, grown by 0.5 % of the photo's width.
+        own: (K, 3) SfM points on the object, in its frame.
+    """
+
+    views: list[View]
+    own: Array
+
+    def sight(self, scene_from_object: Sim3) -> Array:
+        """(K + V, 3) the own points and the cameras in the scene; cameras farther away than FAR_EXTENTS come nearer."""
+        own = scene_from_object.apply(self.own)
+        eyes = scene_from_object.apply(np.array([view.centre for view in self.views]))
+        far = FAR_EXTENTS * float(np.linalg.norm(np.ptp(own, axis=0)))
+        return np.concatenate([own, np.clip(eyes, own.min(0) - far, own.max(0) + far)])
+
+
+def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: float) -> Votes:
     """Project every point of a scene into an object's masks.
 
     A photo votes on a point that falls into its frame and that no nearer scene point hides; three votes make a
@@ -51,15 +73,11 @@ def vote(points: Array, workspace: Path, masks: Path, scene_from_object: Sim3, m
 
     Args:
         points: (N, 3) in the scene frame.
-        workspace: undistorted COLMAP workspace of the object.
-        masks: folder of {name}.png, non-zero on the object.
+        masked: of `read_masked_views`.
         scene_from_object: the similarity.
         min_share: of the photos that vote on a point, how many must have it inside the mask.
-
-    Raises:
-        StageError: too few photos have a mask, or too few SfM points lie inside.
     """
-    views, own = read_masked_views(workspace, masks, min_share)
+    views, own = masked.views, masked.own
     in_object = scene_from_object.inverse().apply(points)
     framed, shown, inside = count(in_object, views)
     decided = shown >= MIN_SHOWN
@@ -70,12 +88,11 @@ def vote(points: Array, workspace: Path, masks: Path, scene_from_object: Sim3, m
     return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
 
 
-def read_masked_views(workspace: Path, masks: Path, min_share: float) -> tuple[list[View], Array]:
-    """At most 60 of an object's photos, spread evenly, with their masks, and the SfM points (K, 3) on the object.
+def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
+    """At most 60 of an object's photos, spread evenly, with their masks, and the SfM points on the object.
 
-    The views' `pixels` are True on the mask, grown by 0.5 % of the photo's width. An SfM point is on the object when it
-    is inside the mask in `min_share` of the photos that observe it, three or more; the outermost 1 % on each side are
-    left out.
+    An SfM point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or
+    more; the outermost 1 % on each side are left out.
 
     Args:
         workspace: undistorted COLMAP workspace of the object.
@@ -109,7 +126,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> tuple[l
             " the masks, and take sharper photos of the object"
         )
     low, high = np.percentile(own, [1, 99], axis=0)
-    return found, own[((own >= low) & (own <= high)).all(1)]
+    return Masked(found, own[((own >= low) & (own <= high)).all(1)])
 
 
 def _with_grown_mask(view: View, path: Path) -> View:

@@ -5,14 +5,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.clouds import Cloud, concatenate
+from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import read_json, value
+from scenefuse.transforms import Array
 
 VIEW_POINTS = 250_000
 """Of a scene's view; see the note at that of an object."""
+MOST_READ = 2_000_000
+"""Of a larger scene one in so many points is looked at, that there are no more than these, and all near the objects."""
 AZIMUTH_DEG, ELEVATION_DEG = -60.0, 35.0
 """As in the scene's figure, a little higher: the objects do not hide each other."""
 
@@ -23,26 +27,54 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     Args:
         dense: the scene's cloud.
         completed: the scene with its objects, in the same frame.
-        completed_json: says what the numbers of the field `source` mean.
+        completed_json: says what the numbers of the field `source` mean, and how many points are the scene's.
         georeference_json: says the unit of the scene's lengths.
         folder: where both files are written.
 
     Raises:
         StageError: an input is missing or damaged.
     """
-    before, after = read_cloud(dense), read_cloud(completed)
-    sources = {int(number): name for number, name in value(read_json(completed_json), "sources").items()}
+    scene, whole, about = open_cloud(dense), open_cloud(completed), read_json(completed_json)
+    sources = {int(number): name for number, name in value(about, "sources").items()}
+    every = max(1, -(-len(scene) // MOST_READ))
+    boxes = _objects(whole, value(about, "scene_points"))
+    before, after = _read(scene, every, boxes), _read(whole, every, boxes)
     # Stray points far out would take the precision of the positions, and the picture.
-    low, high = np.percentile(before.points, [0.1, 99.9], axis=0)
+    low, high = np.percentile(before.points[_evenly(before.points, every)], [0.1, 99.9], axis=0)
     before, after = (cloud[within(cloud.points, low, high, margin=0.1)] for cloud in (before, after))
-    low, high = np.percentile(before.points, [1, 99], axis=0)
+    low, high = np.percentile(before.points[_evenly(before.points, every)], [1, 99], axis=0)
+    counts = (len(before), len(after)) if every == 1 else (len(scene), len(whole))
     points = merge(before, after)
     points.fields["near"][:] = _near_objects(points)
     thinned = thin(points, VIEW_POINTS)
     unit = length_unit(georeference_json)
-    view = View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
+    view = View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, *counts)
     write_view(folder, view)
     print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points", flush=True)
+
+
+def _objects(completed: TiledCloud, scene_points: int) -> list[tuple[Array, Array]]:
+    """Boxes around what each object added: its tile lies behind those of the scene's points."""
+    tiles = np.flatnonzero(completed.starts[:-1] >= scene_points)
+    return list(zip(completed.low[tiles], completed.high[tiles]))
+
+
+def _read(cloud: TiledCloud, every: int, boxes: list[tuple[Array, Array]]) -> Cloud:
+    """One in so many points of a cloud, and all in some boxes and of objects."""
+    found = []
+    for _, part in cloud.parts():
+        chosen = _evenly(part.points, every) | (part.fields.get("source", np.zeros(len(part))) != 0)
+        for low, high in boxes if every > 1 else []:
+            chosen |= within(part.points, low, high)
+        found.append(part[chosen])
+    return concatenate(found)
+
+
+def _evenly(points: Array, every: int) -> NDArray[np.bool_]:
+    """(N,) one in so many points, by a hash of where they are: the same ones before and after."""
+    bits = np.ascontiguousarray(points).view(np.uint64)
+    mixed = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(1)
+    return np.asarray((mixed >> np.uint64(33)) % np.uint64(every) == 0)
 
 
 def _near_objects(points: Cloud) -> NDArray[np.bool_]:

@@ -1,0 +1,18 @@
+"""What the fusion of an object writes, made by hand."""
+
+import numpy as np
+
+from scenefuse.fusion.changes import FROM_OBJECT, with_source
+from scenefuse.fusion.evidence import KEPT, REPLACED, unchecked
+from scenefuse.io.clouds import write_cloud
+
+
+def write_changes(folder, scene, added, rows=(), removed=(), evidence=0):
+    """fused.ply with the added points, and checked.ply with some rows of a scene, of which some are taken away."""
+    rows = np.array(rows, dtype=np.int64)
+    checked = unchecked(scene[rows])
+    checked.fields["evidence"][:] = evidence
+    checked.fields["row"] = rows.astype(np.uint32)
+    checked.fields["reason"] = np.where(np.isin(rows, removed), REPLACED, KEPT).astype(np.uint8)
+    write_cloud(folder / "checked.ply", checked)
+    write_cloud(folder / "fused.ply", with_source(unchecked(added), FROM_OBJECT))
