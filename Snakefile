@@ -32,6 +32,11 @@ include: "workflow/rules/metrics.smk"
 include: "workflow/rules/report.smk"
 
 
+if config["object"]["recipe"] == "paper":
+
+    include: "workflow/rules/paper.smk"
+
+
 rule all:
     default_target: True
     input:

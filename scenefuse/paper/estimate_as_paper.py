@@ -112,7 +112,7 @@ def estimate_as_paper(
     raw = predict(networks.depth, frames, supervision)
     placed = place(raw, networks, frames, views, pose_source, seed)
     content: Content = {
-        "workspace": quantity(workspace.name, ""),
+        "workspace": quantity(outputs.posed.name, ""),
         "photos": quantity(len(views.names), "1"),
         "photos_held_out": quantity(int(views.held_out.sum()), "1"),
         "width_px": quantity(views.images.shape[2], "px"),

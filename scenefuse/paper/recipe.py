@@ -1,6 +1,6 @@
 """The paper's constants (He et al. 2026, section 4.2.2 and Table 1), and values for what it names without a number.
 
-docs/paper.md lists which is which. The length of the stages is a setting: in config/paper.yaml they sum to its 60 epochs.
+docs/paper.md lists which is which. How long stages are is a setting; in config/paper.yaml they sum to its 60 epochs.
 """
 
 from scenefuse.nerf.field import FieldSettings
