@@ -122,6 +122,7 @@ def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Te
 def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Supervision, recipe: Recipe) -> Objective:
     """Monodepth2's loss of depth and motion together: minimum reprojection over the neighbours, auto-mask, smoothness.
 
+    The auto-mask is that of full size, as there: on small photos of an object in their middle it leaves nothing at all.
     With target depths (stage 3) the depth network is also held to these, and the pose network to what the frames look
     like through them.
     """
@@ -134,7 +135,8 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
         depth = depth_from_disparity(disparity, NEAR, FAR)
         sources = frames.sources[chosen]
         moves = torch.stack([networks.pose(small[chosen], small[of]) for of in sources.T], 1)
-        error, counts = reprojection_error(scale, chosen, sources, depth, moves, scale.unmoved[chosen])
+        unmoved = scale.unmoved[chosen] if scale is scales[-1] else None
+        error, counts = reprojection_error(scale, chosen, sources, depth, moves, unmoved)
         parts = {
             "photometric": masked_mean(error, counts),
             "smoothness": smoothness(disparity, frames.images[chosen], frames.masks[chosen]),

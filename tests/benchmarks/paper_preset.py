@@ -3,7 +3,7 @@
 make demo; then python tests/benchmarks/paper_preset.py --results results --objects sculpture
 
 The paper's stages 1 to 4, cloud, crop, registration and fusion run from the demo's scene, undistorted photos and masks:
-once on the poses that the pose network chains, once on SfM's. Where a stage ends in an error, its message is the row, and
+once on the poses that the pose network chains, once on SfM's. Where a stage ends in an error, the table says so, and
 what follows is empty. A second call goes on where the first was stopped. `null` is what chance gives: cameras that all
 stand in their middle, depth that is the same all over a photo, a random cloud in the place of the object's points.
 """
@@ -40,7 +40,7 @@ from scenefuse.registration.problem import Inputs
 from scenefuse.stage import StageError, read_json, run, value
 from scenefuse.transforms import Sim3
 
-# Tables 2 and 3 of the paper, on its own captures: house, balloon, sculpture. Its RMSE has no unit that can be compared.
+# Tables 2 and 3 of the paper, on its own captures: house, balloon, sculpture. Its RMSE is in another unit.
 PUBLISHED = {
     "fitness": (0.9302, 0.9916, 0.9207),
     "normal_consistency": (0.6023, 0.6210, 0.7948),
@@ -51,6 +51,15 @@ PUBLISHED = {
 OBJECTS = ("house", "balloon", "sculpture")
 REGISTRATION = ("fitness", "inlier_rmse_over_diagonal", "normal_consistency")
 COMPLETION = ("surface_variation", "nue", "primitive_fitting_score")
+SCORES = {"0.5": "05pct", "1": "1pct", "2": "2pct"}
+POSES = {
+    "trajectory error over extent": "trajectory_error_chain_over_extent",
+    "rotation error of the chain (deg)": "rotation_error_chain_deg",
+    "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
+}
+COLUMNS = {"chain": "paper preset, chained poses", "sfm": "paper preset, SfM's poses"}
+# Of the true depth maps that the null is measured on.
+WIDTH_PX = 160
 
 
 def reconstruct(folder: Path, of: Path, settings: dict[str, Any], source: PoseSource) -> None:
@@ -126,34 +135,15 @@ def join(folder: Path, of: Path, scene: Path, fiducials: Path, settings: dict[st
 
 
 def of_run(folder: Path, known: ObjectTruth, true: Sim3, settings: dict[str, Any]) -> dict[str, Any]:
-    """All measures of a run, as far as it came; lengths in % of the object's diagonal, depths and cloud against truth."""
+    """All measures of a run, as far as it came; lengths in % of the object's diagonal, errors against the truth."""
     limits = build(ObjectEvaluationSettings, settings["evaluation"]["object"])
-    rows: dict[str, Any] = {}
-    for number in (1, 3):
-        if (folder / f"stage{number}.json").is_file():
-            report = read_json(folder / f"stage{number}.json")
-            rows |= {f"{name}, stage {number}": value(report, key) for name, key in POSES.items() if key in report}
-    stages = [folder / f"stage{number}" for number in (1, 2, 3, 4) if (folder / f"stage{number}.json").is_file()]
-    depths = depth_results(stages, known, limits.max_photos)
-    for stage in stages:
-        error = value(depths, f"{stage.name}_depth_error")
-        rows[f"depth error, {stage.name} (%)"] = None if error is None else 100 * error
-    for number in (2, 4):
-        if (folder / f"stage{number}.json").is_file():
-            report = read_json(folder / f"stage{number}.json")
-            rows[f"held-out PSNR, stage {number} (dB)"] = value(report, "psnr_held_out")
-            rows[f"rays, stage {number} (million)"] = _rays(report) / 1e6
+    rows = of_stages(folder, known, limits.max_photos)
     if (folder / "object.ply").is_file():
-        points = read_cloud(folder / "object.ply").points
-        cloud = cloud_results(known.fit.truth_from_model.apply(points), known, limits.samples, settings["seed"])
-        rows |= {
-            "cloud: F 0.5 %": value(cloud, "cloud_f_score_05pct"),
-            "cloud: F 1 %": value(cloud, "cloud_f_score_1pct"),
-        }
-    fine = next(
-        (path for path in (folder / "fine.json", folder / "registration/full/fine.json") if path.is_file()), None
-    )
-    if fine is not None:
+        points = known.fit.truth_from_model.apply(read_cloud(folder / "object.ply").points)
+        cloud = cloud_results(points, known, limits.samples, settings["seed"])
+        rows |= {f"cloud: F {name} %": value(cloud, f"cloud_f_score_{key}") for name, key in SCORES.items()}
+    fine = folder / "fine.json" if (folder / "fine.json").is_file() else folder / "registration/full/fine.json"
+    if fine.is_file() and (folder / "metrics.json").is_file():
         pose = Sim3.from_matrix(np.array(value(read_json(fine), "scene_from_object")))
         middle = known.fit.truth_from_model.inverse().apply(known.middle)
         error = registration_error(pose, true, middle, known.diagonal)
@@ -165,11 +155,22 @@ def of_run(folder: Path, known: ObjectTruth, true: Sim3, settings: dict[str, Any
     return rows
 
 
-POSES = {
-    "trajectory error over extent": "trajectory_error_chain_over_extent",
-    "rotation error of the chain (deg)": "rotation_error_chain_deg",
-    "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
-}
+def of_stages(folder: Path, known: ObjectTruth, max_photos: int) -> dict[str, Any]:
+    """What each of the four stages that are there came to: poses, depth, renders, rays and seconds."""
+    rows: dict[str, Any] = {}
+    reports = {n: read_json(folder / f"stage{n}.json") for n in (1, 2, 3, 4) if (folder / f"stage{n}.json").is_file()}
+    for number in reports.keys() & {1, 3}:
+        of_poses = {f"{name}, stage {number}": key for name, key in POSES.items() if key in reports[number]}
+        rows |= {name: value(reports[number], key) for name, key in of_poses.items()}
+    depths = depth_results([folder / f"stage{number}" for number in reports], known, max_photos)
+    for number, report in reports.items():
+        error = value(depths, f"stage{number}_depth_error")
+        rows[f"depth error, stage {number} (%)"] = None if error is None else 100 * error
+        rows[f"seconds, stage {number}"] = value(report, "seconds")
+    for number in reports.keys() & {2, 4}:
+        rows[f"held-out PSNR, stage {number} (dB)"] = value(reports[number], "psnr_held_out")
+        rows[f"rays, stage {number} (million)"] = _rays(reports[number]) / 1e6
+    return rows
 
 
 def _rays(report: dict[str, Any]) -> float:
@@ -195,7 +196,7 @@ def of_chance(of: Path, paper: Path, known: ObjectTruth, settings: dict[str, Any
     return {
         **{f"trajectory error over extent, stage {number}": still for number in (1, 3)},
         **{f"rotation error of one motion (deg), stage {number}": motion for number in (1, 3)},
-        **{f"depth error, stage{number} (%)": flat_depth_error(known) for number in (1, 2, 3, 4)},
+        **{f"depth error, stage {number} (%)": flat_depth_error(known) for number in (1, 2, 3, 4)},
         **{name: value(found, name) for name in REGISTRATION},
         **{name: value(completion, f"{name}_null") for name in COMPLETION},
     }
@@ -205,15 +206,11 @@ def flat_depth_error(known: ObjectTruth) -> float:
     """Median error of the median depth of the object in each photo, taken everywhere, in % of the diagonal."""
     errors = []
     for view, _ in known.posed[:: max(1, len(known.posed) // 8)]:
-        true, hit = true_depth(
-            known.everything, view, known.fit.truth_from_model, (160, round(160 * view.height / view.width))
-        )
+        size = WIDTH_PX, round(WIDTH_PX * view.height / view.width)
+        true, hit = true_depth(known.everything, view, known.fit.truth_from_model, size)
         own = true[hit == 0]
         errors.append(np.abs(own - np.median(own)))
     return 100 * float(np.median(np.concatenate(errors))) / known.diagonal
-
-
-COLUMNS = {"chain": "paper preset, chained poses", "sfm": "paper preset, SfM's poses"}
 
 
 def paper_preset(
