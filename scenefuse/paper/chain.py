@@ -55,8 +55,9 @@ def place_chain(own: Array, known: Array) -> Chain:
         fit = fit_sim3(own[:, :3, 3], known[:, :3, 3])
     except ValueError as error:
         raise StageError(
-            f"the chain of the pose network's motions is no trajectory ({error}): it has learned no motion from these "
-            "frames; set object.stage1.pose_source to sfm to run the later stages from SfM's poses"
+            f"the pose network's motions make no trajectory around the object ({error}): either it has learned no "
+            "motion from these frames, or the camera moved along one line; walk around the object, or set "
+            "object.stage1.pose_source to sfm, which runs the later stages from SfM's poses"
         ) from None
     placed = own.copy()
     placed[:, :3, :3], placed[:, :3, 3] = fit.rotation @ own[:, :3, :3], fit.apply(own[:, :3, 3])
