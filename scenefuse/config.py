@@ -81,6 +81,14 @@ class ChunkSettings:
 
 
 @dataclass(frozen=True)
+class RecipeSettings:
+    """Whose method makes the object."""
+
+    recipe: Literal["scenefuse", "paper"] = setting("scenefuse")
+    """`paper` follows the letter of He et al. from depth to fusion (docs/paper.md); use it by config/paper.yaml."""
+
+
+@dataclass(frozen=True)
 class HoldOutSettings:
     """What is left out of the training."""
 
@@ -92,8 +100,9 @@ class HoldOutSettings:
 class PoseSourceSettings:
     """Where poses come from."""
 
-    pose_source: Literal["sfm", "network"] = setting("sfm")
-    """Whose poses the training stages use; with `network` those that the photos and a depth network give."""
+    pose_source: Literal["sfm", "network", "chain"] = setting("sfm")
+    """Whose poses the training stages use; with `network` those that the photos and a depth network give, with `chain`
+    the pose network's motions one after the other (recipe `paper` only, which knows `chain` and `sfm`)."""
 
 
 @dataclass(frozen=True)
@@ -120,7 +129,7 @@ SECTIONS: dict[str, list[Any]] = {
     "scene.undistort": [UndistortSettings()],
     "scene.depth_maps": [DepthMapSettings()],
     "scene.dense_cloud": [DenseCloudSettings()],
-    "object": [HoldOutSettings()],
+    "object": [RecipeSettings(), HoldOutSettings()],
     "object.frames": [FrameSettings()],
     "object.features": [FeatureSettings()],
     "object.matches": [MatchSettings()],

@@ -25,15 +25,20 @@ class DepthPrior:
         confidence: (V, H, W) float32 in 0..1.
         refined_share: share of the prior's pixels that photos moved.
         confident_share: share of the training photos' masks with a prior.
+        order: (V, H, W) float32, the same depths before anything was checked: their order is learned (method N3); None
+            where that of `depths` is.
     """
 
     depths: NDArray[np.float32]
     confidence: NDArray[np.float32]
     refined_share: float
     confident_share: float
+    order: NDArray[np.float32] | None = None
 
 
-def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreement: float) -> DepthPrior:
+def read_prior(
+    folder: Path, views: Views, settings: RefinementSettings, agreement: float, order_of_all: bool = False
+) -> DepthPrior:
     """Read a stage's depth maps, move them to where photos match, and keep what photos do not contradict and two other
     maps confirm.
 
@@ -44,6 +49,7 @@ def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreeme
         views: photos, masks and cameras at the NeRF's size.
         settings: of the refinement by photos.
         agreement: largest difference of depth that agrees, share of the object's diagonal.
+        order_of_all: whether the order of all depths is learned, and not of the confident ones only.
     """
     training = np.flatnonzero(~views.held_out)
     names = [views.names[i] for i in training]
@@ -55,16 +61,18 @@ def read_prior(folder: Path, views: Views, settings: RefinementSettings, agreeme
     depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
     depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
+    everything = depths
     matched = refine_by_photos(seen, seen.object_from_cam, depths, settings)
     refined = float(matched.moved.sum() / max(int((depths > 0).sum()), 1))
     depths = np.where(matched.inconsistent, 0, matched.depths)
     confidence = np.where(matched.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
     depths = np.where(confidence > 0, depths, 0)
     shape = views.masks.shape
-    whole = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-    whole[0][training], whole[1][training] = depths, confidence
+    whole = tuple(np.zeros(shape, np.float32) for _ in range(3))
+    for place, of_training in zip(whole, (depths, confidence, everything)):
+        place[training] = of_training
     share = float((confidence > 0).sum() / max(int(seen.masks.sum()), 1))
-    return DepthPrior(*whole, refined, share)
+    return DepthPrior(whole[0], whole[1], refined, share, whole[2] if order_of_all else None)
 
 
 def _scaled(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -113,7 +113,7 @@ def refine_depth(
     networks.load(state)
     networks.depth.restart()
     predicted, _ = read_maps(earlier.previous, crops, device)
-    rendered = _read_rendered(earlier.rendered, *read_maps(earlier.rendered, crops, device)) * photos.masks
+    rendered = read_rendered(earlier.rendered, *read_maps(earlier.rendered, crops, device)) * photos.masks
     blend = blend_depths(predicted, rendered, photos)
     supervision = _supervision(inputs.channels, blend, predicted, photos)
     recipe = Recipe(settings.epochs, settings.warmup_epochs, settings.batch_photos, coarse_share=0.0)
@@ -157,7 +157,7 @@ def blend_depths(predicted: Tensor, rendered: Tensor, photos: DepthPhotos) -> Bl
     return Blend(depth, weight, shares)
 
 
-def _read_rendered(folder: Path, depth: Tensor, confidence: Tensor) -> Tensor:
+def read_rendered(folder: Path, depth: Tensor, confidence: Tensor) -> Tensor:
     """Rendered depth where it is confident; an error if there is none at all."""
     if not (depth > 0).any():
         raise StageError(f"{folder}/depth_maps holds no depth for any photo of the object; run stage 2 again")

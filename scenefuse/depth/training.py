@@ -1,5 +1,6 @@
 """Training the depth and pose networks on the photos of one object; a killed training resumes where it stopped."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -29,10 +30,8 @@ from scenefuse.stage import StageError, quantity, threads
 LEARNING_RATE = 1e-3
 MAX_GRADIENT = 1.0
 SOURCES_PER_STEP = 3
-# Weights of equation (5) as in Monodepth2, and of relative depth errors at SfM points and against a target map.
+# Weight of equation (5) as in Monodepth2; the other losses have 1.
 SMOOTHNESS_WEIGHT = 1e-3
-ANCHOR_WEIGHT = 1.0
-TARGET_WEIGHT = 1.0
 # Relative depth errors count in full from here, and no more beyond: only an outlier can be so far off.
 SMALL_ERROR, LARGE_ERROR = 0.005, 0.1
 # Share of a half-size pixel that is object, for it to count.
@@ -59,6 +58,10 @@ class Networks:
         self.pose.load_state_dict(state["pose"])
 
 
+# The losses of (B,) chosen photos at a step, by name; the generator draws what is random.
+Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
+
+
 @dataclass(frozen=True)
 class Recipe:
     """How long the networks are trained; the stages fill it from their own settings.
@@ -74,6 +77,10 @@ class Recipe:
     warmup_epochs: int
     batch_photos: int
     coarse_share: float
+
+    def steps(self, photos: DepthPhotos) -> int:
+        """Steps of the whole training."""
+        return self.epochs * -(-int(photos.trained.sum()) // self.batch_photos)
 
 
 @dataclass(frozen=True)
@@ -109,19 +116,34 @@ def new_networks(channels: int, photos: DepthPhotos) -> Networks:
 def train_networks(
     networks: Networks, photos: DepthPhotos, supervision: Supervision, recipe: Recipe, checkpoint: Path, seed: int
 ) -> list[dict[str, float]]:
-    """Train both networks in place and return one row of mean losses per epoch.
+    """Train both networks in place on photos of known poses and return one row of mean losses per epoch.
 
     Batches and sources depend on the seed and the step only, so a resumed run equals an uninterrupted one.
 
     Raises:
         StageError: the training diverged.
     """
+    points, weights = _padded(photos)
+    scales = [PhotoScale(photos, shrink) for shrink in (2, 1)]
+    coarse = recipe.coarse_share * recipe.steps(photos)
+
+    def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
+        scale = scales[0] if step < coarse else scales[1]
+        parts = _losses(networks, photos, supervision, scale, chosen, generator)
+        parts["anchor"] = _anchor(parts.pop("depth"), points[chosen], weights[chosen])
+        return parts
+
+    return optimise(networks, photos, losses, recipe, checkpoint, seed)
+
+
+def optimise(
+    networks: Networks, photos: DepthPhotos, losses_of: Objective, recipe: Recipe, checkpoint: Path, seed: int
+) -> list[dict[str, float]]:
+    """Minimise an objective by Adam, with warm-up and cosine; arguments, result and errors as of `train_networks`."""
     batches = _batches(np.flatnonzero(photos.trained), recipe, seed)
     steps, warmup = len(batches), len(batches) * recipe.warmup_epochs / max(recipe.epochs, 1)
     parameters = [*networks.depth.parameters(), *networks.pose.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=LEARNING_RATE)
-    points, weights = _padded(photos)
-    scales = [_Scale(photos, shrink) for shrink in (2, 1)]
     losses: list[dict[str, float]] = []
 
     def state() -> dict[str, Any]:
@@ -137,11 +159,8 @@ def train_networks(
         for step in range(len(losses), steps):
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * learning_rate_factor(step, steps, warmup)
-            scale = scales[0] if step < recipe.coarse_share * steps else scales[1]
-            chosen = torch.as_tensor(batches[step])
             generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-            parts = _losses(networks, photos, supervision, scale, chosen, generator)
-            parts["anchor"] = _anchor(parts.pop("depth"), points[chosen], weights[chosen])
+            parts = losses_of(torch.as_tensor(batches[step]), step, generator)
             losses.append({name: float(value.detach()) for name, value in parts.items()})
             require_finite(losses[-1])  # the gradient of sampling at a NaN would end the process without a word
             optimizer.zero_grad(set_to_none=True)
@@ -194,7 +213,7 @@ def load_networks(path: Path) -> dict[str, Any]:
     return state
 
 
-class _Scale:
+class PhotoScale:
     """The photos at one size, and the error of every pair of photos as they are (for the auto-mask)."""
 
     def __init__(self, photos: DepthPhotos, shrink: int) -> None:
@@ -214,7 +233,7 @@ def _losses(
     networks: Networks,
     photos: DepthPhotos,
     supervision: Supervision,
-    scale: _Scale,
+    scale: PhotoScale,
     chosen: Tensor,
     generator: torch.Generator,
 ) -> dict[str, Tensor]:
@@ -226,14 +245,14 @@ def _losses(
     sources = photos.sources[chosen][:, columns]
     moves = photos.source_from_target(chosen[:, None], sources)
     unmoved = scale.unmoved[chosen][:, columns]
-    photometric, counts = _reprojection(scale, chosen, sources, depth, moves, unmoved)
+    photometric, counts = reprojection_error(scale, chosen, sources, depth, moves, unmoved)
     small, one = small_photos(photos), sources[:, :1]
     found = networks.pose(small[chosen], small[one[:, 0]])[:, None]
-    error, seen = _reprojection(scale, chosen, one, depth.detach(), found, None)
+    error, seen = reprojection_error(scale, chosen, one, depth.detach(), found, None)
     return {
         "photometric": masked_mean(photometric, counts),
         "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
-        "target": _against_target(depth, supervision, chosen, photos.near),
+        "target": error_against_target(depth, supervision, chosen, photos.near),
         "pose": masked_mean(error, seen) + pose_error(found[:, 0], moves[:, 0], networks.pose.unit),
         "depth": depth,
     }
@@ -241,17 +260,14 @@ def _losses(
 
 def _total(parts: dict[str, Tensor]) -> Tensor:
     """The loss that is minimised."""
-    return (
-        parts["photometric"]
-        + SMOOTHNESS_WEIGHT * parts["smoothness"]
-        + ANCHOR_WEIGHT * parts["anchor"]
-        + TARGET_WEIGHT * parts["target"]
-        + parts["pose"]
-    )
+    total = parts["photometric"] + SMOOTHNESS_WEIGHT * parts["smoothness"]
+    for name in ("anchor", "target", "pose"):
+        total = total + parts[name] if name in parts else total
+    return total
 
 
-def _reprojection(
-    scale: _Scale, chosen: Tensor, sources: Tensor, depth: Tensor, moves: Tensor, unmoved: Tensor | None
+def reprojection_error(
+    scale: PhotoScale, chosen: Tensor, sources: Tensor, depth: Tensor, moves: Tensor, unmoved: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """Minimum reprojection error of (B,) targets over (B, S) sources, and where it counts.
 
@@ -269,7 +285,7 @@ def _reprojection(
     return smallest, counts & (scale.masks[chosen] > 0)
 
 
-def _against_target(depth: Tensor, supervision: Supervision, chosen: Tensor, near: float) -> Tensor:
+def error_against_target(depth: Tensor, supervision: Supervision, chosen: Tensor, near: float) -> Tensor:
     """Huber loss on the relative depth error against the target maps; zero without them."""
     if supervision.target is None or supervision.target_weight is None:
         return depth.new_zeros(())

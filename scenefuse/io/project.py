@@ -65,7 +65,10 @@ def read_project(config: Mapping[str, Any]) -> Project:
                 f"{settings['objects']}: object '{name}' has a truth, but its scene '{row['scene']}' is a cloud, and"
                 " the evaluation compares cameras; empty the cell"
             )
-    return Project(settings, scenes, objects, _variants(settings["registration"]))
+    wrong = _recipe_problem(settings["object"])
+    if wrong:
+        raise StageError(f"config, {wrong}")
+    return Project(settings, scenes, objects, _variants(settings))
 
 
 def _checked_table(name: str, kind: str) -> dict[str, Row]:
@@ -92,8 +95,22 @@ def _cloud_problem(row: Row) -> str:
     return ""
 
 
-def _variants(registration: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+def _recipe_problem(settings: Mapping[str, Any]) -> str:
+    """What is wrong with the recipe of the objects and its source of poses; "" where nothing is."""
+    recipe, source = settings["recipe"], settings["stage1"]["pose_source"]
+    if recipe == "paper" and source == "network":
+        return "object.stage1.pose_source: recipe 'paper' knows chain and sfm; poses by matches are not the paper's"
+    if recipe != "paper" and source == "chain":
+        return "object.stage1.pose_source: 'chain' is of recipe 'paper'; set object.recipe to paper, or sfm or network"
+    return ""
+
+
+def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Settings of the variants that run; with recipe `paper` the paper's registration is the one that is fused."""
     defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
+    registration = settings["registration"]
+    if settings["object"]["recipe"] == "paper":
+        defined["full"] = defined["paper"]
     chosen = registration["variants"]
     unknown = next((name for name in chosen if name not in defined), None)
     if unknown is not None:

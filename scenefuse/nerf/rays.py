@@ -33,6 +33,8 @@ class PhotoTensors:
         center: (V, 3) float32 camera centres.
         depths: (V, H, W) float32 prior depth along z in nerf units, 0 where there is none.
         confidence: (V, H, W) float32 in 0..1, weight of the prior.
+        order: (V, H, W) float32 depth along z in nerf units whose order alone is learned, 0 where there is none; None
+            to learn that of the prior, where it is confident.
     """
 
     images: Tensor
@@ -43,6 +45,7 @@ class PhotoTensors:
     center: Tensor
     depths: Tensor
     confidence: Tensor
+    order: Tensor | None = None
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -50,7 +53,7 @@ class PhotoTensors:
     def select(self, index: NDArray[np.int64]) -> "PhotoTensors":
         """The photos at these indices."""
         chosen = torch.from_numpy(np.asarray(index, dtype=np.int64))
-        return PhotoTensors(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
+        return PhotoTensors(**{name: part[chosen] for name, part in vars(self).items() if part is not None})
 
     def camera(self, view: int) -> tuple[Tensor, Tensor, Tensor]:
         """Intrinsics (3, 3), rotation (3, 3) and centre (3,) of one photo."""
@@ -89,6 +92,7 @@ class RayBatch:
         depth: (R,) float32 prior along z, 0 without one.
         confidence: (R,) float32.
         edge: (R,) float32.
+        order: (R,) float32 depth along z whose order is learned, or None; see `PhotoTensors`.
     """
 
     view: Tensor
@@ -99,10 +103,11 @@ class RayBatch:
     depth: Tensor
     confidence: Tensor
     edge: Tensor
+    order: Tensor | None = None
 
     def to(self, device: torch.device) -> "RayBatch":
         """The same on a device."""
-        return RayBatch(*(getattr(self, name).to(device) for name in self.__dataclass_fields__))
+        return RayBatch(**{name: part.to(device) for name, part in vars(self).items() if part is not None})
 
 
 def dilate(masks: Tensor, radius_px: int) -> Tensor:
@@ -179,6 +184,7 @@ def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, imag
         photos.depths[view, down, across],
         photos.confidence[view, down, across],
         pool.edge[view, down, across],
+        None if photos.order is None else photos.order[view, down, across],
     )
 
 

@@ -109,14 +109,16 @@ def train_object_nerf(
             surface found.
     """
     start = time.monotonic()
-    device = _prepare(settings.device)
+    device = prepare_device(settings.device)
     given = _read(inputs, settings, hold_out_every)
     nerf = new_nerf(settings.field, torch.from_numpy(given.volume.hull), len(given.trained), seed, device)
     warm = given.earlier is not None and given.earlier["model"]["settings"] == nerf.state()["settings"]
     if given.earlier is not None and warm:
         go_on_from(nerf, given.earlier["model"])
     photos = given.photos.select(given.trained)
-    weight = photo_weights(measured_sharpness(photos.images, photos.masks), photos.center)
+    weight = torch.ones(len(photos))
+    if settings.recipe.appearance:
+        weight = photo_weights(measured_sharpness(photos.images, photos.masks), photos.center)
     training = Training(photos, settings.schedule, settings.recipe, settings.losses, warm, seed, weight)
     checkpoint = checkpoints / _key(given, settings, device, seed) / "state.pt"
     what = f"{len(given.trained)} photos, hull {given.volume.hull.mean():.1%} of the cube, {training.steps} steps"
@@ -148,7 +150,7 @@ def train_object_nerf(
 def photo_tensors(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None, exact: bool) -> PhotoTensors:
     """All photos in the unit cube's frame, with the depth prior if there is one; grey mattes only where `exact`."""
     rotation = np.stack([nerf_from_object.rotation @ pose[:3, :3] for pose in views.object_from_cam])
-    nothing = np.zeros(views.masks.shape, np.float32)
+    nothing, scale = np.zeros(views.masks.shape, np.float32), np.float32(nerf_from_object.scale)
     depths, confidence = (nothing, nothing) if prior is None else (prior.depths, prior.confidence)
     return PhotoTensors(
         torch.from_numpy(views.images),
@@ -159,6 +161,7 @@ def photo_tensors(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None
         torch.from_numpy(nerf_from_object.apply(views.object_from_cam[:, :3, 3]).astype(np.float32)),
         torch.from_numpy((depths * nerf_from_object.scale).astype(np.float32)),
         torch.from_numpy(confidence),
+        None if prior is None or prior.order is None else torch.from_numpy(prior.order * scale),
     )
 
 
@@ -188,12 +191,13 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
     volume = find_volume(outlines, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
     prior = None
     if inputs.prior is not None:
-        prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement)
+        all_ranked = settings.recipe.order_of_all
+        prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement, all_ranked)
     photos = photo_tensors(views, volume.nerf_from_object, prior, exact=settings.recipe.mask_band_px == 0)
     return _Given(views, trained, volume, prior, photos, earlier)
 
 
-def _prepare(device: str) -> str:
+def prepare_device(device: str) -> str:
     """Set threads, arithmetic and memory for training; cpu or cuda.
 
     Raises:

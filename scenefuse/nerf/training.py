@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from scenefuse.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
 from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
-from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
+from scenefuse.nerf.field import EdgeRates, Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.pose_refinement import corrected
@@ -29,6 +29,8 @@ from scenefuse.stage import setting
 # Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
 ADAM_BETAS, ADAM_EPSILON = (0.9, 0.99), 1e-15
 OCCUPANCY_EVERY = 16
+# Steps between looks at which rows of the grid show edges.
+EDGES_EVERY = 4
 # The grid drops no cell in the first tenth of a training: the densities there mean nothing yet.
 PRUNE_FROM = 0.1
 # Samples fall to their last number by the middle of the training, when the grid knows the surface.
@@ -40,7 +42,7 @@ POSES_FROM = 0.2
 # Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
 # again when they are better. A warm training finds them at its start too.
 APPEARANCE_AT = (0.15, 0.4)
-# Where a prior expects the surface, at most this share of a ray's samples lies within this distance of it.
+# Where a prior expects the surface, this share of a ray's samples lies within this distance of it, as shipped.
 PRIOR_SHARE, PRIOR_HALF_WIDTH = 0.6, 0.04
 # A step's random numbers come from a seed of their own, so that a resumed training draws the same ones.
 SEED_STRIDE = 1_000_003
@@ -81,7 +83,16 @@ class NerfRecipe:
     coarse_until: float = 0.3
     """Share of the steps after which all levels are open (method N9)."""
     edge_boost: float = 1.0
-    """The paper's adaptive grid: gradients of fine levels are multiplied by 1 + this at edges (method N9)."""
+    """Gradients of fine levels are multiplied by 1 + this at edges; Adam divides most of it out again (method N9)."""
+    edge_rate: float = 0.0
+    """The paper's adaptive grid: steps of fine levels are up to 1 + this times as long at edges (method N9)."""
+    order_of_all: bool = False
+    """Whether the ranking loss takes all depths of the earlier stage, and not only those of the prior that photos and
+    views confirm: where the absolute loss has them too, there is nothing left to rank (method N3)."""
+    prior_share: float = PRIOR_SHARE
+    """Where a prior expects the surface, at most this share of a ray's samples lies near it."""
+    appearance: bool = True
+    """Whether gains and vignetting of the photos are found (method N15), and blurred photos count less."""
     pose_learning_rate: float = 0.0
     """The paper's pose refinement: learning rate of the camera poses, 0 keeps them (method N11)."""
     mask_band_px: int = 2
@@ -189,22 +200,25 @@ def train(
     pool = pixel_pool(training.photos, training.recipe.mask_band_px)
     pose = nn.Parameter(nerf.pose.clone())
     optimizer = _optimizer(nerf.field, pose)
+    rates = EdgeRates.of(nerf.field, training.recipe.edge_rate)
     done = 0
 
     def state() -> State:
-        return {"model": nerf.state(), "optimizer": optimizer.state_dict(), "pose": pose.detach(), "step": done}
+        own = {"optimizer": optimizer.state_dict(), "pose": pose.detach(), "edges": rates.use, "step": done}
+        return {"model": nerf.state(), **own}
 
     saved = load_checkpoint(checkpoint, like=state())
     if saved is not None:
         done = _resume(saved, nerf, optimizer, pose)
+        rates.use = saved["edges"].to(rates.use.device)
         report(f"resumed at step {done} of {training.steps}")
     progress = Progress(training.steps, done, report)
     with checkpointed(checkpoint, state) as step_done:
         for step in range(done, training.steps):
             _prepare(nerf, training, step)
             batch = _draw(training, pool, step, nerf.field.table.device)
-            terms, samples = _loss_terms(nerf, training, batch, pose, step)
-            _descend(optimizer, training, terms, step)
+            terms, samples = _loss_terms(nerf, training, batch, pose, step, rates)
+            _descend(nerf.field, optimizer, training, terms, step, rates)
             progress.add(step, {name: float(term.detach()) for name, term in terms.items()}, len(batch.view), samples)
             done = step + 1
             step_done(done)
@@ -239,7 +253,8 @@ def _prepare(nerf: Nerf, training: Training, step: int) -> None:
     if step % OCCUPANCY_EVERY == 0 and (step or training.warm):
         prune = training.warm or progress > PRUNE_FROM
         nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step, prune)
-    if step in {round(share * training.steps) for share in APPEARANCE_AT} or (step == 0 and training.warm):
+    due = step in {round(share * training.steps) for share in APPEARANCE_AT} or (step == 0 and training.warm)
+    if due and training.recipe.appearance:
         nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos)
 
 
@@ -249,7 +264,14 @@ def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) 
     return batch.to(device)
 
 
-def _descend(optimizer: torch.optim.Optimizer, training: Training, terms: dict[str, Tensor], step: int) -> None:
+def _descend(
+    field: Field,
+    optimizer: torch.optim.Optimizer,
+    training: Training,
+    terms: dict[str, Tensor],
+    step: int,
+    edges: EdgeRates,
+) -> None:
     """One step of Adam on the weighted sum of the losses, at this step's rates; gradients are cleared."""
     training.weights.total({name: term for name, term in terms.items() if name != "psnr"}).backward()
     factor = learning_rate_factor(step, training.steps, training.warmup_steps, LOWEST_RATE)
@@ -257,27 +279,30 @@ def _descend(optimizer: torch.optim.Optimizer, training: Training, terms: dict[s
     rates = recipe.grid_learning_rate, recipe.learning_rate, recipe.pose_learning_rate
     for group, rate in zip(optimizer.param_groups, rates):
         group["lr"] = rate * factor
-    optimizer.step()
+    edges.step(field, optimizer)
     optimizer.zero_grad(set_to_none=True)
 
 
 @dataclass(frozen=True)
 class _Rays:
-    """R rays of a batch: origin (R, 3), unit direction (R, 3), the prior on them, and its confidence (R,) in 0..1."""
+    """R rays of a batch: origin (R, 3), unit direction (R, 3), the prior on them and its confidence (R,) in 0..1, and
+    the depth (R,) along them whose order is learned, with its weight (R,)."""
 
     origin: Tensor
     direction: Tensor
     prior: RayPrior
     confidence: Tensor
+    order: Tensor
+    order_weight: Tensor
 
 
 def _loss_terms(
-    nerf: Nerf, training: Training, batch: RayBatch, pose: Tensor, step: int
+    nerf: Nerf, training: Training, batch: RayBatch, pose: Tensor, step: int, edges: EdgeRates
 ) -> tuple[dict[str, Tensor], int]:
     """Loss terms of a batch and `psnr` in dB inside the masks, by name, each a scalar; and the number of samples."""
     progress = step / training.steps
     refine = training.recipe.pose_learning_rate > 0 and progress > POSES_FROM
-    rays = _rays(training.photos, batch, pose if refine else None)
+    rays = _rays(training.photos, batch, pose if refine else None, training.recipe.prior_share)
     device = rays.origin.device
     count = _samples_per_ray(training.recipe, progress)
     rng = torch.Generator().manual_seed(training.seed * SEED_STRIDE + step)
@@ -286,6 +311,10 @@ def _loss_terms(
     origin, direction = rays.origin.detach().contiguous(), rays.direction.detach().contiguous()
     drawn = march(origin, direction, nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior)
     sigma, seen = _render(nerf.field, rays, drawn, batch, training.recipe.edge_boost)
+    if edges.boost and step % EDGES_EVERY == 0:
+        x = (origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]).view(-1, 3)
+        opacity = (1 - torch.exp(-sigma.detach() * drawn.delta)).view(-1)
+        edges.see(nerf.field, x, opacity, batch.edge[drawn.ray].repeat_interleave(count))
     color, psnr = _photometric(nerf.appearance, training, seen, batch, drawn.ray, background)
     terms = {"color": color, **_geometric(training, rays, batch, drawn, sigma, seen), "psnr": psnr}
     return terms, drawn.t.numel()
@@ -296,7 +325,7 @@ def _samples_per_ray(recipe: NerfRecipe, progress: float) -> int:
     return round(recipe.samples_first + (recipe.samples_last - recipe.samples_first) * fallen)
 
 
-def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None) -> _Rays:
+def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None, prior_share: float) -> _Rays:
     """The batch's rays, through cameras corrected by `pose` (V, 6) if it is given, and where their prior lies."""
     device = batch.view.device
     rotation, center = photos.rotation.to(device)[batch.view], photos.center.to(device)[batch.view]
@@ -305,8 +334,11 @@ def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None) -> _Rays:
     origin, direction, length = camera_rays(photos.intrinsics.to(device)[batch.view], rotation, center, batch.uv)
     confidence = batch.confidence * ((batch.depth > 0) & batch.inside)
     width = torch.full_like(length, PRIOR_HALF_WIDTH).detach()
-    prior = RayPrior(batch.depth * length.detach(), width, PRIOR_SHARE * confidence)
-    return _Rays(origin, direction, prior, confidence)
+    prior = RayPrior(batch.depth * length.detach(), width, prior_share * confidence)
+    if batch.order is None:
+        return _Rays(origin, direction, prior, confidence, prior.distance, confidence)
+    ranked = ((batch.order > 0) & batch.inside).float()
+    return _Rays(origin, direction, prior, confidence, batch.order * length.detach(), ranked)
 
 
 def _render(
@@ -352,10 +384,11 @@ def _geometric(
     if weights.depth_weight > 0:
         terms["depth"] = losses.depth_loss(distance, seen.opacity, known[ray], confidence[ray])
     if weights.rank_weight > 0:
-        far, opaque = (torch.zeros_like(known).index_put((ray,), part) for part in (distance, seen.opacity))
+        nothing = torch.zeros_like(known)
+        far, opaque = (nothing.index_put((ray,), part) for part in (distance, seen.opacity))
         apart_px = losses.RANK_APART * training.photos.images.shape[2]
         images = training.recipe.images_per_batch
-        terms["rank"] = losses.rank_loss(far, opaque, known, confidence, batch.uv, images, apart_px)
+        terms["rank"] = losses.rank_loss(far, opaque, rays.order, rays.order_weight, batch.uv, images, apart_px)
     if weights.mask_weight > 0:
         terms["mask"] = losses.mask_loss(seen.opacity, batch.matte[ray])
     if weights.sparsity_weight > 0:

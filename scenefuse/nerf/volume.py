@@ -147,5 +147,6 @@ def _corners(count: int) -> NDArray[np.int64]:
 def _grown(view: View, points: Array, reach: float) -> View:
     """The view with its mask grown by a length `reach` at the points' median depth."""
     depth = np.maximum(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3], 1e-9)
-    radius = int(np.ceil(reach * view.intrinsics[0, 0] / max(float(np.median(depth)), 1e-9)))
+    wanted = int(np.ceil(reach * view.intrinsics[0, 0] / max(float(np.median(depth)), 1e-9)))
+    radius = min(wanted, max(view.pixels.shape))  # a camera of a wrong pose may stand in the cube, or look away
     return replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy())

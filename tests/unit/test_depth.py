@@ -16,7 +16,7 @@ from scenefuse.depth.consistency import align_to_points, consistency_between_vie
 from scenefuse.depth.first_depth import network_inputs
 from scenefuse.depth.inputs import depth_photos
 from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
-from scenefuse.depth.pose_network import PoseNetwork, rigid
+from scenefuse.depth.pose_network import PoseNetwork, pose_quantities, rigid
 from scenefuse.depth.self_supervision import (
     minimum_reprojection,
     photometric_error,
@@ -24,7 +24,7 @@ from scenefuse.depth.self_supervision import (
     ssim,
     warp,
 )
-from scenefuse.depth.training import Networks, Recipe, Supervision, train_networks
+from scenefuse.depth.training import Networks, Recipe, Supervision, predict, train_networks
 from scenefuse.io.maps import read_depth
 from scenefuse.stage import StageError
 
@@ -215,6 +215,28 @@ def uninterrupted(tmp_path_factory):
     """The photos of a training, its networks and its losses."""
     photos = _photos()
     return photos, *_train(tmp_path_factory.mktemp("whole") / "state.pt", photos)
+
+
+def test_training_mends_a_wrong_first_depth_and_the_pose_network_learns_the_poses(tmp_path):
+    views, truth = plane_views(6)
+    photos = depth_photos(views, 3, torch.device("cpu"))
+    inputs = network_inputs(photos, 0)
+    torch.manual_seed(0)
+    networks = Networks(DepthNetwork(inputs.channels.shape[1]), PoseNetwork(3.0))
+    supervision = Supervision(inputs.channels, inputs.first * 0.7)
+
+    def depth_off():
+        depth = predict(networks.depth, photos, supervision)[:, 0].numpy()
+        return np.median(np.abs(depth / truth - 1.0)[views.masks])
+
+    def turned_off():
+        found = pose_quantities(networks.pose, photos, views.object_from_cam)
+        return found["pose_network_rotation_error_deg"]["value"]
+
+    before = depth_off(), turned_off()
+    length = Recipe(epochs=40, warmup_epochs=1, batch_photos=6, coarse_share=0.3)
+    train_networks(networks, photos, supervision, length, tmp_path / "state.pt", 0)
+    assert depth_off() < 0.5 * before[0] and turned_off() < 0.7 * before[1]
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, uninterrupted, capsys):

@@ -13,7 +13,8 @@ import scenefuse.nerf.training as training_module
 from scenefuse import checkpoints
 from scenefuse.cores import use_threads
 from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others
-from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.encoding import encode
+from scenefuse.nerf.field import EdgeRates, Field, FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
@@ -45,13 +46,13 @@ RECIPE = NerfRecipe(
 )
 
 
-def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0):
+def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0, **recipe):
     use_threads(1)
     cube, hull = sphere_volume(sphere)
     photos = photos_of(sphere, cube, prior=1.0)
     nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
     schedule = Schedule(epochs=2, rays_per_epoch=steps * 512 // 2)
-    recipe = replace(RECIPE, pose_learning_rate=pose)
+    recipe = replace(RECIPE, pose_learning_rate=pose, **recipe)
     training = Training(photos, schedule, recipe, WEIGHTS, warm=False, seed=seed)
     return nerf, photos, cube, train(nerf, training, checkpoint=checkpoint, report=report)
 
@@ -214,3 +215,72 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
     away = np.abs((compared - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
+
+
+def _fine_steps(sphere, **recipe):
+    """How far one step of Adam moves the rows of the coarse and of the fine levels, both in learning rates."""
+    nerf = _train(sphere, steps=1, **recipe)[0]
+    cube, hull = sphere_volume(sphere)
+    start = new_nerf(FIELD, torch.from_numpy(hull), 12, 0, "cpu").field
+    moved = (nerf.field.table - start.table).detach().abs() / RECIPE.grid_learning_rate
+    first_fine = int(start.grid.offset[FIELD.levels // 2])
+    return moved[:first_fine], moved[first_fine:]
+
+
+def test_adam_divides_a_factor_on_gradients_out_and_not_one_on_its_steps(sphere):
+    coarse, fine = _fine_steps(sphere, edge_boost=0.0)
+    _, boosted = _fine_steps(sphere, edge_boost=3.0)
+    assert torch.allclose(boosted, fine, atol=1e-3)
+    same, faster = _fine_steps(sphere, edge_boost=0.0, edge_rate=3.0)
+    assert torch.equal(same, coarse)
+    ratio = (faster / fine)[fine > 0.9]
+    assert float(ratio.min()) > 0.99 and float(ratio.max()) == pytest.approx(4.0, rel=1e-3)
+    assert (ratio > 2).float().mean() > 0.05 and (ratio < 1.1).float().mean() > 0.05
+
+
+def _errors(gradient=0.0, rate=0.0):
+    """What is left of a wave after 40 steps, root mean square, where x < 0.5 is called an edge, and elsewhere."""
+    rng = torch.Generator().manual_seed(0)
+    field = Field(FieldSettings(levels=4, log2_table=14, coarsest=4, finest=24), rng)
+    optimizer = torch.optim.Adam([field.table], lr=1e-2, betas=(0.9, 0.99), eps=1e-15)
+    rates = EdgeRates.of(field, rate)
+
+    def off(x, boost):
+        wave = torch.sin(60 * x[:, 0]) * torch.sin(60 * x[:, 1])
+        return encode(x, field.table, field.grid, field.level_weight, boost, fine_from=2).sum(1) - wave
+
+    for _ in range(40):
+        x = torch.rand(2000, 3, generator=rng)
+        edge = (x[:, 0] < 0.5).float()
+        (off(x, 1 + gradient * edge) ** 2).mean().backward()
+        if rate:
+            rates.see(field, x, torch.ones(len(x)), edge)
+        rates.step(field, optimizer)
+        optimizer.zero_grad()
+    x = torch.rand(5000, 3, generator=rng)
+    left = off(x, None).detach() ** 2
+    return [float(left[at].mean().sqrt()) for at in (x[:, 0] < 0.5, x[:, 0] >= 0.5)]
+
+
+def test_the_adaptive_grid_learns_edges_better_and_the_rest_as_well():
+    plain, gradients, steps = _errors(), _errors(gradient=3.0), _errors(rate=3.0)
+    assert gradients == pytest.approx(plain, rel=0.01)  # Adam divides the factor out again
+    assert steps[0] < 0.9 * plain[0] and steps[1] == pytest.approx(plain[1], rel=0.02)
+
+
+def test_the_order_of_depths_that_nothing_confirms_is_learned_only_where_it_is_asked_for(sphere):
+    cube, hull = sphere_volume(sphere)
+    known = photos_of(sphere, cube, prior=1.0)
+    inside_out = torch.where(known.depths > 0, 2 * known.depths[known.depths > 0].mean() - known.depths, 0.0)
+
+    def trained(weight, order):
+        photos = replace(known, confidence=torch.zeros_like(known.confidence), order=order)
+        nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), 0, "cpu")
+        weights = LossWeights(rank_weight=weight, color_weight=0.01)
+        training = Training(photos, Schedule(2, 60 * 512 // 2), RECIPE, weights, warm=False, seed=0)
+        return nerf, train(nerf, training, checkpoint=None, report=lambda line: None)
+
+    shipped, unranked = trained(0.5, None), trained(0.0, None)
+    assert torch.equal(shipped[0].field.table, unranked[0].field.table) and shipped[1]["rank"] == 0
+    ranked, barely = trained(0.5, inside_out)[1]["rank"], trained(1e-9, inside_out)[1]["rank"]
+    assert ranked < 0.8 * barely

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 LIBRARY = ROOT / "scenefuse"
 # In the order in which data flow; each imports only itself and what stands before it.
-PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "registration", "fusion"]
+PACKAGES = ["io", "workspace", "sfm", "mvs", "masks", "depth", "nerf", "poses", "paper", "registration", "fusion"]
 PACKAGES += ["metrics", "report", "pick", "two_clouds"]
 # Shared by all, and importing no package.
 SHARED = ["stage", "transforms", "cores", "checkpoints", "progress", "fingerprint", "machine", "job_records", "version"]

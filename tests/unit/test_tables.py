@@ -88,6 +88,11 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
     assert found["no_crop"]["coarse"] == found["full"]["coarse"]
 
 
+def test_with_recipe_paper_the_papers_registration_is_the_one_that_is_fused(project):
+    shipped, paper = (project(object={"recipe": name}).variants for name in ("scenefuse", "paper"))
+    assert paper["full"] == shipped["paper"] != shipped["full"]
+
+
 @pytest.mark.parametrize(
     "changes, sentence",
     [
@@ -100,6 +105,11 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
         ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
         ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
         ({"objects": "nowhere.tsv"}, "nowhere.tsv does not exist; write it as config/README.md describes"),
+        ({"object": {"stage1": {"pose_source": "chain"}}}, "'chain' is of recipe 'paper'; set object.recipe to paper"),
+        (
+            {"object": {"recipe": "paper", "stage1": {"pose_source": "network"}}},
+            "recipe 'paper' knows chain and sfm; poses by matches are not the paper's",
+        ),
     ],
 )
 def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):

@@ -5,11 +5,16 @@
 
 
 STAGE1 = dict(config["object"]["stage1"])
-# The workspace that the training stages read; both have the same photos, and poses in the same frame.
-POSED = {
-    "sfm": "results/objects/{object}/undistorted",
-    "network": "results/objects/{object}/poses",
-}[STAGE1.pop("pose_source")]
+POSE_SOURCE = STAGE1.pop("pose_source")
+# The workspace that the training stages read; all have the same photos, and poses in the same frame. In recipe paper, the last one.
+POSED = (
+    "results/objects/{object}/refined_poses"
+    if config["object"]["recipe"] == "paper"
+    else {
+        "sfm": "results/objects/{object}/undistorted",
+        "network": "results/objects/{object}/poses",
+    }[POSE_SOURCE]
+)
 HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 

@@ -1,0 +1,88 @@
+"""Poses chained from a pose network, frame after frame, and brought into the frame that masks and registration use."""
+
+import shutil
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from scenefuse.depth.inputs import DepthPhotos
+from scenefuse.depth.pose_network import PoseNetwork, small_photos
+from scenefuse.mvs.views import Views
+from scenefuse.poses.find_poses import trajectory_error
+from scenefuse.sfm.gravity import estimate_up
+from scenefuse.stage import StageError, atomic_directory, quantity
+from scenefuse.transforms import Array, Sim3, fit_sim3
+from scenefuse.workspace import read_workspace, write_model
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Poses of V frames.
+
+    Attributes:
+        own: (V, 4, 4) first_from_cam, in the networks' unit.
+        placed: (V, 4, 4) object_from_cam: the same after one similarity, which fits their centres to those of SfM.
+        object_from_first: that similarity; its scale is object units per unit of the networks.
+    """
+
+    own: Array
+    placed: Array
+    object_from_first: Sim3
+
+
+@torch.no_grad()
+def chained(network: PoseNetwork, frames: DepthPhotos) -> Array:
+    """(V, 4, 4) poses in the frame of the first camera: the motions between consecutive frames one after the other."""
+    small = small_photos(frames)
+    motions: Tensor = network(small[:-1], small[1:])
+    poses = [np.eye(4)]
+    for next_from_this in motions.double().cpu().numpy():
+        poses.append(poses[-1] @ np.linalg.inv(next_from_this))
+    return np.stack(poses)
+
+
+def place_chain(own: Array, known: Array) -> Chain:
+    """Lay a chain (V, 4, 4) on SfM's poses (V, 4, 4) by one similarity: masks and gravity count in their frame.
+
+    Raises:
+        StageError: the chain does not move, or along one line only.
+    """
+    try:
+        fit = fit_sim3(own[:, :3, 3], known[:, :3, 3])
+    except ValueError as error:
+        raise StageError(
+            f"the pose network's motions make no trajectory around the object ({error}): either it has learned no "
+            "motion from these frames, or the camera moved along one line; walk around the object, or set "
+            "object.stage1.pose_source to sfm, which runs the later stages from SfM's poses"
+        ) from None
+    placed = own.copy()
+    placed[:, :3, :3], placed[:, :3, 3] = fit.rotation @ own[:, :3, :3], fit.apply(own[:, :3, 3])
+    return Chain(own, placed, fit)
+
+
+def write_posed(workspace: Path, posed: Path, views: Views, poses: Array) -> None:
+    """Write a copy of an undistorted workspace with these poses (V, 4, 4) object_from_cam, and without points."""
+    cameras = {view.name: view for view in read_workspace(workspace).views}
+    moved = [replace(cameras[name], cam_from_world=np.linalg.inv(pose)) for name, pose in zip(views.names, poses)]
+    with atomic_directory(posed) as folder:
+        left_out = shutil.ignore_patterns("sparse", ".snakemake_timestamp")
+        shutil.copytree(workspace, folder, ignore=left_out, dirs_exist_ok=True)
+        (folder / "sparse").mkdir()
+        write_model(folder / "sparse", moved)
+
+
+def chain_quantities(chain: Chain, known: Array, pose_source: str) -> dict[str, Any]:
+    """How far the chain is from SfM's poses (V, 4, 4), and what later stages read of poses.json."""
+    rotations, centres = chain.placed[:, :3, :3], chain.placed[:, :3, 3]
+    return {
+        "pose_source": quantity(pose_source, ""),
+        "photos_with_pose": quantity(len(known), "1"),
+        "unit": quantity(chain.object_from_first.scale, "object units per unit of the networks"),
+        "frame": quantity("sfm", ""),
+        "up_in_camera_frame": quantity(estimate_up(rotations, centres)[0], "1"),
+        **trajectory_error("chain", chain.own, known),
+    }

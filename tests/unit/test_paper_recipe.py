@@ -1,0 +1,179 @@
+"""The paper's stages by its letter: their constants, what the networks learn, poses chained from motions, bad input."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from support.sideways_video import SHIFT_PX, sideways_video
+from support.textured_plane import plane_views
+
+from scenefuse.depth import training
+from scenefuse.depth.pose_network import small_photos
+from scenefuse.depth.training import Recipe, optimise, predict
+from scenefuse.io.settings import ROOT, read_settings
+from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.train_object_nerf import NerfSettings
+from scenefuse.paper import recipe
+from scenefuse.paper.chain import chained, place_chain
+from scenefuse.paper.estimate_as_paper import few_frames, place
+from scenefuse.paper.monocular import (
+    MonocularSettings,
+    frames_of,
+    monocular_losses,
+    neighbours,
+    new_monocular_networks,
+    recipe_of,
+    supervision_of,
+)
+from scenefuse.paper.train_nerf_as_paper import as_paper
+from scenefuse.stage import StageError
+from scenefuse.transforms import Sim3, rotation_between
+
+CPU = torch.device("cpu")
+
+
+def test_the_constants_are_the_papers():
+    nerf, depth = recipe.NERF, recipe_of(MonocularSettings(15))
+    assert (nerf.learning_rate, nerf.grid_learning_rate, training.LEARNING_RATE) == (1e-3, 1e-3, 1e-3)
+    assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
+    assert (nerf.images_per_batch, depth.batch_photos) == (24, 24)
+    assert (recipe.FIELD.levels, recipe.FIELD.log2_table, recipe.FIELD.width) == (16, 19, 64)
+    assert nerf.edge_rate > 0 and recipe.LOSSES.rank_weight > 0 and recipe.LOSSES.depth_weight > 0
+    assert nerf.prior_share == 0 and not nerf.appearance and recipe.LOSSES.distortion_weight == 0
+    preset = read_settings(ROOT / "config/paper.yaml")
+    assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == recipe.EPOCHS == 60
+    assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
+    assert preset["object"]["recipe"] == "paper" and preset["object"]["stage1"]["pose_source"] == "chain"
+    later = yaml.safe_load((ROOT / "config/paper_from_sfm.yaml").read_text())["object"]["stage1"]
+    assert later == {"epochs": preset["object"]["stage1"]["epochs"], "pose_source": "sfm"}
+
+
+def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_on_a_cpu():
+    settings = NerfSettings(field=FieldSettings(levels=4))
+    on_gpu, on_cpu = (as_paper(settings, 900_000, device) for device in ("cuda", "cpu"))
+    assert (on_gpu.field, on_gpu.schedule.rays_per_epoch) == (recipe.FIELD, 900_000)
+    assert (on_cpu.field, on_cpu.schedule.rays_per_epoch) == (settings.field, settings.schedule.rays_per_epoch)
+    assert as_paper(settings, 500, "cpu").schedule.rays_per_epoch == 500
+    assert on_cpu.recipe is recipe.NERF and on_cpu.refinement.match_reach_px == 0
+
+
+def _trained(frames, path, epochs=50, **target):
+    """Networks trained on frames, and their losses."""
+    torch.manual_seed(0)
+    networks, length = new_monocular_networks(CPU), Recipe(epochs, 2, 24, 0.0)
+    supervision = supervision_of(frames, **target)
+    losses = optimise(networks, frames, monocular_losses(networks, frames, supervision, length), length, path, 0)
+    return networks, supervision, losses
+
+
+@torch.no_grad()
+def _shifts_px(networks, frames, supervision):
+    """Columns by which depth and motion together move the middle of each frame into the next."""
+    small = small_photos(frames)
+    motion, depth = networks.pose(small[:-1], small[1:]), predict(networks.depth, frames, supervision)
+    middle = torch.zeros(len(small) - 1, 3)
+    middle[:, 2] = depth[:-1, 0, depth.shape[2] // 2, depth.shape[3] // 2]
+    moved = (motion[:, :3, :3] @ middle[:, :, None])[..., 0] + motion[:, :3, 3]
+    return frames.intrinsics[0, 0, 0] * moved[:, 0] / moved[:, 2]
+
+
+def test_depth_and_motion_are_learned_from_a_video_alone(tmp_path):
+    frames = frames_of(sideways_video(), CPU)
+    networks, supervision, losses = _trained(frames, tmp_path / "state.pt")
+    assert losses[-1]["photometric"] < 0.2 * losses[0]["photometric"]
+    assert float(_shifts_px(networks, frames, supervision).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
+
+
+def test_fused_depth_refines_the_depth_and_the_pose_network(tmp_path):
+    frames = frames_of(sideways_video(), CPU)
+    target, weight = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
+    networks, supervision, losses = _trained(frames, tmp_path / "state.pt", target=target, weight=weight)
+    depth = predict(networks.depth, frames, supervision)
+    assert torch.median((depth - 1.4).abs()) < 0.05 and losses[-1]["target"] < 0.5 * losses[0]["target"]
+    assert losses[-1]["pose"] < 0.3 * losses[0]["pose"]
+    alone, _, _ = _trained(frames, tmp_path / "alone.pt")
+    small = small_photos(frames)
+    ours, theirs = (n.pose(small[:-1], small[1:]).detach() for n in (networks, alone))
+    assert not torch.allclose(ours, theirs, atol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["depth", "pose"])
+def test_every_step_moves_both_networks(tmp_path, name):
+    frames = frames_of(sideways_video(), CPU)
+    supervision = supervision_of(frames, torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks))
+    networks, length = new_monocular_networks(CPU), Recipe(2, 1, 24, 0.0)
+    before = [part.clone() for part in getattr(networks, name).parameters()]
+    objective = monocular_losses(networks, frames, supervision, length)
+    optimise(networks, frames, objective, length, tmp_path / "state.pt", 0)
+    assert any(not torch.equal(a, b) for a, b in zip(before, getattr(networks, name).parameters()))
+
+
+class Known(torch.nn.Module):
+    """A pose network that says what it is told."""
+
+    def __init__(self, motions):
+        super().__init__()
+        self.motions = motions
+
+    def forward(self, target, source):
+        return self.motions
+
+
+def _orbit(count=12):
+    """(V, 4, 4) world_from_cam of cameras that look at the origin from a circle."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    for index, angle in enumerate(np.linspace(0, 2, count)):
+        poses[index, :3, 3] = [np.cos(angle), np.sin(angle), 0.1 * angle]
+        poses[index, :3, :3] = rotation_between(np.array([0.0, 0.0, 1.0]), -poses[index, :3, 3])
+    return poses
+
+
+def test_a_chain_of_true_motions_is_the_trajectory_and_a_similarity_places_it():
+    poses, fit = _orbit(), Sim3(2.5, rotation_between(np.array([1.0, 0, 0]), np.array([0, 0.6, 0.8])), np.ones(3))
+    frames = frames_of(sideways_video(len(poses)), CPU)
+    motions = torch.as_tensor(np.linalg.inv(poses[1:]) @ poses[:-1])
+    own = chained(Known(motions), frames)
+    assert np.allclose(own, np.linalg.inv(poses[0]) @ poses, atol=1e-6)
+    known = poses.copy()
+    known[:, :3, :3], known[:, :3, 3] = fit.rotation @ poses[:, :3, :3], fit.apply(poses[:, :3, 3])
+    chain = place_chain(own, known)
+    assert np.allclose(chain.placed, known, atol=1e-6) and chain.object_from_first.scale == pytest.approx(2.5)
+
+
+@pytest.mark.parametrize("source", ["chain", "sfm"])
+def test_depth_gets_the_unit_of_the_poses_that_go_on(source):
+    views, truth = plane_views()
+    frames, networks = frames_of(views, CPU), new_monocular_networks(CPU)
+    unit = views.object_from_cam.copy()
+    unit[:, :3, 3] /= 3.0
+    motions = torch.as_tensor(np.linalg.inv(unit[1:]) @ unit[:-1])
+    told = replace(networks, pose=Known(motions))
+    raw = torch.tensor(np.where(truth > 0, truth, 3.0) / 3.0, dtype=torch.float32)[:, None]
+    placed = place(raw, told, frames, views, source, 0)
+    assert placed.unit == pytest.approx(3.0, rel=0.02)
+    on_object = torch.from_numpy(views.masks)[:, None]
+    assert np.allclose(placed.depth[on_object].numpy(), truth[views.masks], rtol=0.02)
+    assert np.allclose(placed.poses, views.object_from_cam, atol=1e-5)
+
+
+def test_frames_are_compared_with_trained_ones_before_and_after_them():
+    near = neighbours(np.array([True, True, False, True, True]))
+    assert near.tolist() == [[1, 3], [0, 3], [1, 3], [1, 4], [3, 1]]
+
+
+def test_bad_videos_are_one_sentence():
+    with pytest.raises(StageError, match="looks the same in all frames.*walk around"):
+        frames_of(sideways_video(step=0.0), CPU)
+    views = sideways_video()
+    with pytest.raises(StageError, match="only 2 frames .* needs at least 3"):
+        frames_of(replace(views, held_out=np.arange(10) > 1), CPU)
+    still = np.tile(np.eye(4), (5, 1, 1))
+    with pytest.raises(StageError, match="no trajectory .* learned no motion .*pose_source to sfm"):
+        place_chain(still, _orbit(5))
+
+
+def test_fewer_frames_than_a_batch_are_said(capsys):
+    assert few_frames(24) == [] and "23 frames are fewer than the paper's batch" in few_frames(23)[0]
+    assert "23 frames" in capsys.readouterr().out
