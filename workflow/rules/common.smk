@@ -12,7 +12,7 @@ from snakemake.exceptions import WorkflowError
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
 from scenefuse.machine import has_gpu, memory_mb
-from scenefuse.sfm.photo_files import photo_files
+from scenefuse.sfm.photo_files import GEO_FILE, photo_files
 from scenefuse.stage import StageError
 
 ROOT = Path(workflow.basedir)
