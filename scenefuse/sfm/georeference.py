@@ -20,7 +20,7 @@ from scenefuse.sfm.survey.placement import (
     UP,
     GeoreferenceSettings,
     GpsCameras,
-    compare_gps,
+    beside_gps,
     place_by_control,
     place_by_gps,
     upright,
@@ -60,7 +60,7 @@ def georegister(
         seed: of RANSAC.
 
     Raises:
-        StageError: what `read_sighted`, `place_by_control` and `compare_gps` say.
+        StageError: what `read_sighted`, `place_by_control` and `beside_gps` say.
     """
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
@@ -95,9 +95,10 @@ def georeference(
     if control is not None:
         positions = np.array([s.point.position for s in control.sightings])
         frame = replace(local_frame(positions), grid=control.grid)
-        placement, notes = place_by_control(control.sightings, frame.apply(positions), up, str(control.path), seed)
+        there, where = frame.apply(positions), str(control.path)
+        placement, notes = place_by_control(control.sightings, there, up, where, seed)
         if by_gps:
-            placement = compare_gps(placement, gps, frame.apply(gps.positions), str(control.path))
+            placement = beside_gps(placement, control.sightings, there, gps, frame.apply(gps.positions), where)
         return Georeference(placement, frame, gps, replace(control, notes=[*control.notes, *notes]))
     if by_gps:
         frame = local_frame(gps.positions)
@@ -113,7 +114,7 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
     Positions along one line, or without heights, leave a model free to tilt: it is not adjusted to them.
 
     Returns:
-        Quantities: what it was adjusted to, noise and reprojection errors; empty where it was not adjusted.
+        Quantities: what it was adjusted to, and reprojection errors; empty where it was not adjusted.
     """
     placement, gps, frame = found.placement, found.gps, found.frame
     if frame is None or placement.status != "georeferenced" or placement.levelled:
@@ -129,7 +130,7 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
         [s.point.clicks for s in used],
     )
     before_px = model.compute_mean_reprojection_error()
-    noise_px = adjust_to_survey(model, freedom, photos, points)
+    adjust_to_survey(model, freedom, photos, points)
     drop_outliers(model)
     after_px = model.compute_mean_reprojection_error()
     print(
@@ -140,7 +141,6 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
     return {
         "adjusted_to_control_points": quantity(len(used), "1"),
         "adjusted_to_positions": quantity(len(photos.names), "1"),
-        "observation_noise_px": quantity(noise_px, "px"),
         "mean_reprojection_error_before_px": quantity(before_px, "px"),
         "mean_reprojection_error_px": quantity(after_px, "px"),
     }

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
-from scenefuse.sfm.bundle.adjustment import ROBUST_PX, Freedom, adjustment_options
-from scenefuse.sfm.interrupt import interruptible
+from scenefuse.sfm.bundle.adjustment import Freedom, adjustment_options
 from scenefuse.transforms import Array
 
-# The median length of an error in two dimensions is so many of its standard deviations in one (Rayleigh).
-MEDIAN_OVER_SD = 1.1774
-# Never so exact that a few positions count for more than all of the photos, and never without noise.
-LEAST_NOISE_PX = 0.1
+# In its standard deviations: error of a photo's position at which it loses half its weight (Cauchy).
+ROBUST_POSITION = 3.0
 # Relative gain that ends an adjustment.
 SURVEY_TOLERANCE = 1e-9
 # How far from its point, in metres, a camera stands that measures a coordinate; its aperture takes no depth in.
@@ -67,30 +64,27 @@ def adjust_to_survey(
     photos: SurveyedPhotos,
     points: SurveyedPoints,
     tolerance: float = SURVEY_TOLERANCE,
-) -> float:
+) -> None:
     """Adjust a model that lies in the local frame (metres) in place, by reprojection errors and by what was surveyed.
 
     COLMAP weighs no observation by a standard deviation of its own, but a camera with a long focal length does: each
     surveyed point is also seen by two cameras that stand still, one above it and one south of it, whose pixel is the
     standard deviation of the coordinates that they see. Positions of photos are COLMAP's pose priors. All errors have
-    Cauchy weights, in units of the noise of the model's own observations, so that each counts by its variance.
+    Cauchy weights. An observation counts with a standard deviation of 1 px: those of one model are less far off, but
+    they err alike, since a lens that does not quite fit shifts all that lie near each other.
 
     Args:
         model: registered photos and points, georeferenced.
         freedom: what of the cameras may change.
         photos, points: what was surveyed; either may be empty, not both.
         tolerance: relative gain that ends the adjustment.
-
-    Returns:
-        Noise of the model's observations, the standard deviation in x and in y, in pixels.
     """
-    noise_px = observation_noise_px(model)
     held = copy.deepcopy(model)
     config = pycolmap.BundleAdjustmentConfig()
     for image in held.reg_image_ids():
         config.add_image(image)
-    still = [camera for k in range(len(points.clicks)) for camera in _add_point(held, points, k, noise_px)]
-    priors = [_position_prior(held, photos, row, noise_px) for row in range(len(photos.names))]
+    still = [camera for k in range(len(points.clicks)) for camera in _add_point(held, points, k)]
+    priors = [_position_prior(held, photos, row) for row in range(len(photos.names))]
     still += _held(held, len(priors) - len(still))
     for image in still:
         config.add_image(image)
@@ -101,11 +95,11 @@ def adjust_to_survey(
     options.alignment_ransac.max_error = EXACT_M
     options.alignment_ransac.random_seed = 0
     options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.prior_position_loss_scale = ROBUST_PX
+    options.ceres.prior_position_loss_scale = ROBUST_POSITION
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(
         adjustment_options(freedom, tolerance), options, config, priors, held
     )
-    interruptible(adjuster.solve)
+    adjuster.solve()
     for image in model.reg_image_ids():
         own, frame = model.images[image], model.images[image].frame
         assert frame is not None
@@ -115,22 +109,11 @@ def adjust_to_survey(
     for point in model.point3D_ids():
         model.points3D[point].xyz = held.points3D[point].xyz
     model.update_point_3d_errors()
-    return noise_px
 
 
-def observation_noise_px(model: pycolmap.Reconstruction) -> float:
-    """Standard deviation, in x and in y, of a model's observations; outliers do not count."""
-    off = []
-    for image in (model.images[i] for i in model.reg_image_ids()):
-        seen = [p for p in image.points2D if p.has_point3D()]
-        at = [image.project_point(model.points3D[p.point3D_id].xyz) for p in seen]
-        off += [float(np.linalg.norm(a - p.xy)) for a, p in zip(at, seen) if a is not None]
-    return max(LEAST_NOISE_PX, float(np.median(off)) / MEDIAN_OVER_SD if off else ROBUST_PX)
-
-
-def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int, noise_px: float) -> list[int]:
+def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int) -> list[int]:
     """Add a surveyed point with its clicks; ids of the cameras that measure its coordinates."""
-    place, (horizontal, vertical) = points.x_in_local[row], FAR_M * noise_px / points.sd_m[row]
+    place, (horizontal, vertical) = points.x_in_local[row], FAR_M / points.sd_m[row]
     track = pycolmap.Track()
     by_name = {model.images[i].name: i for i in model.reg_image_ids()}
     for photo, pixel in points.clicks[row]:
@@ -174,11 +157,9 @@ def _held(model: pycolmap.Reconstruction, count: int) -> list[int]:
     return [_add_camera(model, DOWN, corners[k % 8] * (1 + k // 8), (1.0, 1.0)) for k in range(max(8, count))]
 
 
-def _position_prior(
-    model: pycolmap.Reconstruction, photos: SurveyedPhotos, row: int, noise_px: float
-) -> pycolmap.PosePrior:
+def _position_prior(model: pycolmap.Reconstruction, photos: SurveyedPhotos, row: int) -> pycolmap.PosePrior:
     image = model.find_image_with_name(photos.names[row])
-    place, (horizontal, vertical) = photos.x_in_local[row], photos.sd_m[row] / noise_px
+    place, (horizontal, vertical) = photos.x_in_local[row], photos.sd_m[row]
     known = np.where(np.isfinite(place), place, image.projection_center())
     up = vertical if np.isfinite(place[2]) else UNKNOWN_M
     return _prior(image, known, np.array([horizontal, horizontal, up]))

@@ -23,6 +23,8 @@ OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
 BENT = 0.02
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
+# Rounds in which the common shift of GPS positions and the similarity are fitted in turn.
+SHIFT_ROUNDS = 300
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 
@@ -133,23 +135,28 @@ def place_by_control(
     return Placement("georeferenced", reason, fitted, none, "measured", False, used), notes
 
 
-def compare_gps(placement: Placement, gps: GpsCameras, target: Array, where: str) -> Placement:
-    """A placement by control points with GPS positions beside it: their common shift, and those that agree with it.
+def beside_gps(
+    placement: Placement, sightings: list[Sighting], there: Array, gps: GpsCameras, target: Array, where: str
+) -> Placement:
+    """A placement by control points, refined by GPS positions up to a shift that all of them share.
 
-    Another datum, geoid heights or a base station of its own move all positions alike; what is left is noise.
+    Another datum, heights above a geoid or a base station of its own move all positions alike: the control points say
+    where the model lies, the positions help to turn and scale it. Shift and similarity are fitted in turn.
 
     Args:
         placement: by control points.
+        sightings: P surveyed points.
+        there: (P, 3) their coordinates in the local frame; NaN where a height is unknown.
         gps: N photos with positions.
-        target: (N, 3) the positions in the local frame; NaN where a height is unknown.
+        target: (N, 3) the positions in the local frame, likewise.
         where: the control points' file, for messages.
 
     Raises:
         StageError: GPS saw the cameras more than a kilometre away.
     """
-    difference = target - placement.local_from_model.apply(gps.centres)
-    known = np.isfinite(difference)
-    shift = np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
+    fitted, points = placement.local_from_model, placement.used
+    difference = target - fitted.apply(gps.centres)
+    shift = _middle(difference)
     if np.linalg.norm(shift[:2]) > ELSEWHERE_M:
         raise StageError(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
@@ -157,7 +164,20 @@ def compare_gps(placement: Placement, gps: GpsCameras, target: Array, where: str
         )
     limit = max(OUTLIER * float(np.median(gps.sd_m)), BENT * _extent(target)[0])
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
-    return replace(placement, inliers=inliers, gps_shift=shift)
+    start = np.concatenate([[s.x_in_model for s, u in zip(sightings, points) if u], gps.centres[inliers]])
+    sd_m = np.concatenate([[s.point.sd_m[0] for s, u in zip(sightings, points) if u], gps.sd_m[inliers, 0]])
+    for _ in range(SHIFT_ROUNDS if inliers.any() else 0):
+        here = fitted.apply(start)
+        wanted = np.concatenate([there[points], target[inliers] - shift])
+        fitted = fit_sim3(start, np.where(np.isfinite(wanted), wanted, here), sd_m**-2.0)
+        shift = _middle(target[inliers] - fitted.apply(gps.centres[inliers]))
+    return replace(placement, local_from_model=fitted, inliers=inliers, gps_shift=shift)
+
+
+def _middle(difference: Array) -> Array:
+    """(3,) medians of (N, 3) differences; 0 where none is known."""
+    known = np.isfinite(difference)
+    return np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
 
 
 def place_by_gps(centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int) -> Placement:
