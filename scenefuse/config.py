@@ -39,9 +39,9 @@ from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
-from scenefuse.sfm.georeference import GeoreferenceSettings
 from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.pairs import MatchSettings
+from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.sfm.undistort import UndistortSettings
 from scenefuse.stage import setting
 

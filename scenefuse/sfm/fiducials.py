@@ -178,7 +178,7 @@ def triangulate_consistent(
     positions, residuals, names, left_out = [], [], [], []
     for point, observed in _sightings(clicks, images, sizes).items():
         seen, pixels = [images[name] for name, _ in observed], np.array([p for _, p in observed])
-        position, residual = _intersect(seen, pixels)
+        position, residual = intersect(seen, pixels)
         if position is None:
             where = ", ".join(name for name, _ in observed)
             left_out.append(f"the rays to point {point} from {where} are parallel or meet behind a camera")
@@ -205,7 +205,7 @@ def _sightings(
     for point, photo, pixel in zip(clicks.points, clicks.photos, clicks.pixels):
         seen.setdefault(point, [])
         if photo in images:
-            seen[point].append((photo, _model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))
+            seen[point].append((photo, model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))
         elif sizes is not None and photo in sizes:
             lost.setdefault(point, []).append(photo)
         else:
@@ -239,7 +239,7 @@ def locate(
     return triangulate(marked, read_model(model), max_residual_px, sizes)
 
 
-def _model_pixel(
+def model_pixel(
     path: Path,
     point: str,
     photo: str,
@@ -259,7 +259,7 @@ def _model_pixel(
     return pixel * np.array(own) / np.array(clicked)
 
 
-def _intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
+def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
     """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet."""
     poses = np.array([image.cam_from_world().matrix() for image in images])
     cameras = [image.camera for image in images if image.camera is not None]

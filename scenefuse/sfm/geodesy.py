@@ -25,12 +25,14 @@ class LocalFrame:
     Attributes:
         latitude_deg: of the origin.
         longitude_deg: of the origin.
-        altitude_m: of the origin, as GPS gave it; 0 where no photo has a height.
+        altitude_m: of the origin, as GPS or the control points gave it; 0 where there is no height.
+        grid: the projected CRS of the control points; "" for the UTM zone of the origin.
     """
 
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
+    grid: str = ""
 
     def apply(self, positions: Array) -> Array:
         """(N, 3) latitude (deg), longitude (deg), altitude (m) to (N, 3) east, north, up in metres.
@@ -51,19 +53,29 @@ class LocalFrame:
 
     @property
     def crs(self) -> str:
-        """The UTM zone of the origin, as an EPSG code."""
+        """Where results are written: the control points' CRS, else the UTM zone of the origin, as an EPSG code."""
+        if self.grid:
+            return self.grid
         zone = min(int((self.longitude_deg + 180.0) // 6.0) + 1, 60)
         return f"EPSG:{(32600 if self.latitude_deg >= 0 else 32700) + zone}"
 
-    def in_crs(self, x_in_local: Array) -> Array:
-        """(N, 3) east, north, up in metres to (N, 3) easting, northing, altitude in `crs`, exactly.
+    @property
+    def crs_unit(self) -> str:
+        """The unit of `crs`, "m" for metres."""
+        unit = pyproj.CRS.from_user_input(self.crs).axis_info[0].unit_name
+        return "m" if unit in ("metre", "meter") else unit
 
-        No similarity does: up is vertical at the origin only, so that 5 km away altitude and up differ by 2 m.
+    def in_crs(self, x_in_local: Array) -> Array:
+        """(N, 3) east, north, up in metres to (N, 3) easting, northing, altitude in `crs` and its unit, exactly.
+
+        Heights are only counted in that unit; their zero is that of the positions that made the frame. No similarity
+        does: up is vertical at the origin only, so that 5 km away altitude and up differ by 2 m.
         """
-        geographic = self.inverse(x_in_local)
-        to_grid = pyproj.Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
+        geographic, grid = self.inverse(x_in_local), pyproj.CRS.from_user_input(self.crs)
+        grid = grid.sub_crs_list[0] if grid.is_compound else grid
+        to_grid = pyproj.Transformer.from_crs("EPSG:4326", grid, always_xy=True)
         easting, northing = to_grid.transform(geographic[:, 1], geographic[:, 0])
-        return np.stack([easting, northing, geographic[:, 2]], axis=1)
+        return np.stack([easting, northing, geographic[:, 2] / grid.axis_info[0].unit_conversion_factor], axis=1)
 
     def crs_from_local(self) -> Sim3:
         """The similarity that comes nearest to `in_crs` about the origin: 8 cm off at 1 km, 2 m at 5 km, in height.
@@ -141,4 +153,5 @@ def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | Non
     latitude, longitude, altitude = (
         value(georeference, f"origin_{name}") for name in ("latitude_deg", "longitude_deg", "altitude_m")
     )
-    return LocalFrame(float(latitude), float(longitude), float(altitude or 0.0))
+    grid = value(georeference, "crs") if "crs" in georeference else ""
+    return LocalFrame(float(latitude), float(longitude), float(altitude or 0.0), grid)

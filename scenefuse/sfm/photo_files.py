@@ -5,6 +5,8 @@ from pathlib import Path
 
 from scenefuse.stage import StageError
 
+# Positions of the photos beside it, as OpenDroneMap names the file.
+GEO_FILE = "geo.txt"
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
 # Photos all the same, but in formats that not every stage can decode.
 UNREADABLE = frozenset(

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from PIL.ExifTags import GPS, IFD, Base
 
-from scenefuse.sfm.photo_files import photo_files
+from scenefuse.sfm.photo_files import GEO_FILE, photo_files
+from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
@@ -36,12 +37,14 @@ class Photo:
         width: columns as stored; as people see them where `orientation` is 1.
         height: rows, likewise.
         sha256: of the file's bytes.
-        latitude_deg: WGS84 latitude from EXIF, or None.
-        longitude_deg: WGS84 longitude from EXIF, or None.
-        altitude_m: altitude from EXIF, or None.
+        latitude_deg: WGS84 latitude from EXIF or geo.txt, or None.
+        longitude_deg: WGS84 longitude, likewise.
+        altitude_m: altitude, likewise.
         focal_px: focal length that EXIF's 35 mm equivalent gives, or None.
         camera: maker and model from EXIF, or "".
         orientation: EXIF orientation; 1 is upright.
+        horizontal_sd_m: standard deviation of the position, east and north, from XMP or geo.txt, or None.
+        vertical_sd_m: of the altitude, likewise.
     """
 
     name: str
@@ -54,10 +57,12 @@ class Photo:
     focal_px: float | None = None
     camera: str = ""
     orientation: int = 1
+    horizontal_sd_m: float | None = None
+    vertical_sd_m: float | None = None
 
     @property
     def has_gps(self) -> bool:
-        """Whether EXIF held a position."""
+        """Whether a position is known."""
         return self.latitude_deg is not None and self.longitude_deg is not None
 
 
@@ -65,7 +70,7 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     """List the photos of a folder and its subfolders, check that every one can be decoded, and stand them upright.
 
     Photos that EXIF says are rotated are turned and written again; all others are linked. From here on pixels count as
-    people see them.
+    people see them. A geo.txt in the folder takes the place of the positions in EXIF.
 
     Args:
         folder: folder of photos; JPEG, PNG, TIFF or BMP.
@@ -73,17 +78,23 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
         photos: output, JSON with name, size in pixels, SHA-256, position and focal length of each photo in `upright`.
 
     Raises:
-        StageError: the folder is missing or holds no photo, or a photo cannot be decoded.
+        StageError: the folder is missing or holds no photo, a photo cannot be decoded, or geo.txt is not well formed.
     """
     names = photo_names(folder)
+    positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
     with atomic_directory(upright) as temporary, ThreadPoolExecutor(threads()) as pool:
         listed = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
     turned = [p.name for p in listed if not (upright / p.name).is_symlink()]
     notes = photo_notes(listed)
+    if positions is not None:
+        listed = [replace(p, **place) for p, place in zip(listed, positions_of(names, positions, folder / GEO_FILE))]
+        notes.append(
+            f"{GEO_FILE} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
+        )
     if turned:
         notes.append(f"{len(turned)} photos ({turned[0]}, ...) carry an EXIF rotation; upright copies of them are used")
-    with_gps = sum(p.has_gps for p in listed)
-    print(f"{len(listed)} photos in {folder}, {with_gps} with a GPS position", flush=True)
+    with_gps, stated = sum(p.has_gps for p in listed), sum(p.has_gps and bool(p.horizontal_sd_m) for p in listed)
+    print(f"{len(listed)} photos in {folder}, {with_gps} with a GPS position, {stated} with its accuracy", flush=True)
     write_photos(photos, listed, upright, kind="photos", notes=notes, turned=quantity(turned, ""))
 
 
@@ -108,7 +119,8 @@ def _stood_upright(folder: Path, name: str, output: Path) -> Photo:
         target.symlink_to(os.path.relpath(os.path.realpath(folder / name), os.path.realpath(target.parent)))
         return photo
     save_upright(folder / name, target)
-    return inspect_photo(output, name)
+    turned = inspect_photo(output, name)
+    return replace(turned, horizontal_sd_m=photo.horizontal_sd_m, vertical_sd_m=photo.vertical_sd_m)
 
 
 def save_upright(source: Path, target: Path, max_width_px: int | None = None) -> tuple[int, int]:
@@ -170,6 +182,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             orientation = int(exif.get(Base.Orientation, 1) or 1)
             camera = f"{_text(exif.get(Base.Make))} {_text(exif.get(Base.Model))}".strip()
             latitude, longitude, altitude = _position(exif.get_ifd(IFD.GPSInfo))
+            xmp = image.info.get("xmp", b"")
+            horizontal, vertical = rtk_accuracy(xmp if isinstance(xmp, bytes) else str(xmp).encode())
             equivalent_mm = _number(exif.get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm))
             image.load()
             width, height = image.size
@@ -181,7 +195,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
     # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
     focal_px = equivalent_mm / 36.0 * max(width, height) if equivalent_mm else None
     digest = sha256(path)
-    return Photo(name, width, height, digest, latitude, longitude, altitude, focal_px, camera, orientation)
+    place = (latitude, longitude, altitude)
+    return Photo(name, width, height, digest, *place, focal_px, camera, orientation, horizontal, vertical)
 
 
 def photo_notes(photos: list[Photo]) -> list[str]:
@@ -229,6 +244,12 @@ def gps_positions(photos: list[Photo]) -> tuple[list[str], NDArray[np.float64]]:
     known = [p for p in photos if p.has_gps]
     rows = [(p.latitude_deg, p.longitude_deg, np.nan if p.altitude_m is None else p.altitude_m) for p in known]
     return [p.name for p in known], np.array(rows, dtype=np.float64).reshape(-1, 3)
+
+
+def gps_accuracies(photos: list[Photo], otherwise_m: float) -> NDArray[np.float64]:
+    """(N, 2) standard deviations in metres, horizontal and vertical, of the photos that have a position."""
+    known = [(p.horizontal_sd_m, p.vertical_sd_m) for p in photos if p.has_gps]
+    return np.array([[h or otherwise_m, v or h or otherwise_m] for h, v in known]).reshape(-1, 2)
 
 
 def _position(gps: dict[int, Any]) -> tuple[float | None, float | None, float | None]:

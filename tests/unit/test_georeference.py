@@ -7,15 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from scenefuse.sfm.geodesy import LocalFrame, local_frame, scene_frame
-from scenefuse.sfm.georeference import (
-    GeoreferenceSettings,
-    camera_poses,
-    fit_level,
-    georegister,
-    place_by_gps,
-)
+from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.photos import Photo, write_photos
-from scenefuse.stage import read_json, value
+from scenefuse.sfm.survey.placement import GeoreferenceSettings, fit_level, place_by_gps
+from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_angle_deg
 from scenefuse.workspace import View, write_model
 
@@ -205,10 +200,13 @@ def listed(names, centres):
 
 def georegister_in(folder, photos):
     write_photos(folder / "photos.json", photos, folder, "photos", [])
+    write_json(folder / "sparse.json", {"lens": quantity("held", "")})
     georegister(
         sparse=folder / "sparse",
+        sparse_json=folder / "sparse.json",
         photos=folder / "photos.json",
         georeferenced=folder / "georeferenced",
+        residuals=folder / "residuals.tsv",
         report=folder / "georeference.json",
         settings=SETTINGS,
         seed=0,

@@ -11,11 +11,11 @@ def photos_of(row, who):
 
 
 def scene_photos(wildcards):
-    """The photos of a scene."""
-    return photos_in(
-        photos_of(scene_row(wildcards.scene), f"scene '{wildcards.scene}'"),
-        f"{config['scenes']}, scene '{wildcards.scene}'",
-    )
+    """The photos of a scene, and the file of their positions where there is one."""
+    folder = photos_of(scene_row(wildcards.scene), f"scene '{wildcards.scene}'")
+    positions = Path(folder) / GEO_FILE
+    photos = photos_in(folder, f"{config['scenes']}, scene '{wildcards.scene}'")
+    return photos + ([str(positions)] if positions.is_file() else [])
 
 
 def scene_folder(wildcards):
@@ -51,6 +51,17 @@ def calibration_flag(row, kind):
     return lambda wildcards: flags(
         dict(zip(["calibration"], calibration_of(row, kind)(wildcards)))
     )
+
+
+def control_of(wildcards):
+    """Input function: the control points of a scene, where the table has them."""
+    given = scene_row(wildcards.scene).get("control")
+    return [given] if given else []
+
+
+def control_flag(wildcards):
+    """The same as a command-line option."""
+    return flags(dict(zip(["control"], control_of(wildcards))))
 
 
 def calibrated(row, kind):

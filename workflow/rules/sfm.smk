@@ -1,11 +1,12 @@
 # Structure from motion: from photos to cameras, the same steps for a scene and for an object.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration; config: scene, object, seed
+# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration, control; config: scene, object, seed
 # OUTPUTS   results/scenes/{scene}/photos/, photos.json                     the photos, checked and upright, with GPS
 #           results/objects/{object}/frames/, photos.json                   the same, at most a given width
 #           .../features.db, database.db, matches.json                      COLMAP databases
 #           .../sparse/, sparse.json                                        cameras and sparse points
-#           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up
+#           results/scenes/{scene}/georeferenced/, georeference.json        the same in metres, z up, adjusted to the survey
+#           results/scenes/{scene}/residuals.tsv                            what is left at control points, check points, positions
 #           .../spread.npz, spread.json                                     how far the model may be bent
 #           .../undistorted/, undistorted.json                              photos with pinhole cameras: a COLMAP workspace
 
@@ -244,14 +245,16 @@ use rule map_scene_photos as map_object_photos with:
 
 
 rule georegister:
-    """Turn and scale the model into metres, east, north and up, by the photos' GPS."""
+    """Bring the model into metres, east, north and up, by control points or the photos' GPS, and adjust it to them."""
     input:
+        control_of,
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/sparse",
         report="results/scenes/{scene}/sparse.json",
     output:
         model=directory("results/scenes/{scene}/georeferenced"),
         report="results/scenes/{scene}/georeference.json",
+        residuals="results/scenes/{scene}/residuals.tsv",
     log:
         "results/logs/georegister/{scene}.log",
     benchmark:
@@ -259,19 +262,22 @@ rule georegister:
     priority: 1
     conda:
         "../../envs/reconstruction.yaml"
+    threads: SCENE_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 2000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
+        mem_mb=lambda wildcards, attempt: 8000 * attempt,
+        runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=flags(config["scene"]["georegister"]),
+        control=control_flag,
+        files=state_of(control_of),
         seed=config["seed"],
         script=script("sfm/georegister.py"),
         code=code("sfm/georegister.py"),
     message:
         "Scene {wildcards.scene}: georeferencing"
     shell:
-        "exec python {params.script} --sparse {input.model} --photos {input.photos} --georeferenced {output.model}"
-        " --report {output.report} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.control}"
+        " --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
 rule estimate_scene_spread:

@@ -35,6 +35,11 @@ class Freedom:
 
 def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = TOLERANCE) -> None:
     """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors."""
+    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom, tolerance))
+
+
+def adjustment_options(freedom: Freedom, tolerance: float) -> pycolmap.BundleAdjustmentOptions:
+    """COLMAP's options of an adjustment."""
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.refine_focal_length = options.refine_extra_params = freedom.lens
@@ -48,7 +53,7 @@ def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = 
     solver.gradient_tolerance = TOLERANCE
     solver.parameter_tolerance = TOLERANCE
     solver.num_threads = threads()
-    cancellable(pycolmap.bundle_adjustment, model, options)
+    return options
 
 
 def drop_outliers(model: pycolmap.Reconstruction) -> None:

@@ -1,0 +1,121 @@
+"""Control and check points in OpenDroneMap's gcp_list.txt."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from scenefuse.sfm.survey.crs import read_crs, to_wgs84
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+
+# A point whose name begins so is a check point, as OpenDroneMap's users mark it.
+CHECK = "CHK-"
+# Standard deviations of a point's coordinates, horizontal and vertical, where the file gives none: a GNSS receiver's.
+SD_M = (0.02, 0.03)
+# Coordinates, standard deviations, photo and pixel.
+Row = tuple[Array, tuple[float, float], str, Array]
+LAYOUT = "x y z pixel_x pixel_y photo [name [horizontal sd [vertical sd]]]"
+
+
+@dataclass(frozen=True)
+class SurveyedPoint:
+    """A point of known coordinates and where it was clicked.
+
+    Attributes:
+        name: of the point.
+        position: (3,) WGS84 latitude (deg), longitude (deg), height (m; NaN where unknown).
+        sd_m: standard deviations of the coordinates, horizontal (of each axis) and vertical.
+        check: whether it is only measured, never used.
+        clicks: photo and (2,) pixel of each click, in pixels of the photo as people see it.
+    """
+
+    name: str
+    position: Array
+    sd_m: tuple[float, float]
+    check: bool
+    clicks: list[tuple[str, Array]]
+
+
+@dataclass(frozen=True)
+class ControlFile:
+    """A file of surveyed points.
+
+    Attributes:
+        path: of the file, for messages.
+        crs: of its coordinates.
+        points: in order of appearance.
+    """
+
+    path: Path
+    crs: pyproj.CRS
+    points: list[SurveyedPoint]
+
+
+def read_control(path: Path) -> ControlFile:
+    """Read a gcp_list.txt: the CRS in the first line, then one click a line, `x y z pixel_x pixel_y photo name`.
+
+    Points without a name are told by their coordinates; z may be NaN. Numbers in the eighth and ninth column are
+    standard deviations in metres, horizontal and vertical. Points named CHK-... are check points. Separated by tabs, a
+    photo's name may hold spaces. Lines that begin with # are ignored.
+
+    Raises:
+        StageError: no such file, no CRS, a line that is not well formed, a name with two positions, a photo clicked
+            twice for one point, coordinates outside the CRS.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (FileNotFoundError, IsADirectoryError):
+        raise StageError(f"the file of control points {path} does not exist; write it, or correct its path") from None
+    except UnicodeDecodeError:
+        raise StageError(f"{path} is no text; save the control points as text (UTF-8)") from None
+    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    crs = read_crs(lines[0][1] if lines else "", str(path))
+    rows: dict[str, list[Row]] = {}
+    for number, line in lines[1:]:
+        cells = [cell.strip() for cell in line.split("\t")] if "\t" in line.strip() else line.split()
+        name, row = _row(cells, f"{path}, line {number}")
+        rows.setdefault(name, []).append(row)
+    if not rows:
+        raise StageError(f"{path} holds no points below its first line; write lines {LAYOUT}")
+    positions = to_wgs84(crs, np.array([clicks[0][0] for clicks in rows.values()]), str(path))
+    points = [_point(name, clicks, place, path) for (name, clicks), place in zip(rows.items(), positions)]
+    return ControlFile(path, crs, points)
+
+
+def _row(cells: list[str], where: str) -> tuple[str, Row]:
+    """Name of the point; its coordinates, standard deviations, photo and pixel."""
+    try:
+        numbers = np.array([float(cell) for cell in cells[:5]])
+        photo = cells[5]
+        if not (np.isfinite(numbers[[0, 1, 3, 4]]).all() and photo):
+            raise ValueError
+    except (ValueError, IndexError):
+        raise StageError(f"{where}: expected {LAYOUT}, got '{' '.join(cells)}'") from None
+    name = cells[6] if len(cells) > 6 and cells[6] else f"{cells[0]} {cells[1]} {cells[2]}"
+    stated = [number for cell in cells[7:9] if (number := _number(cell)) is not None]
+    if any(sd <= 0 for sd in stated):
+        raise StageError(f"{where}: a standard deviation (columns 8 and 9, metres) has to be positive")
+    sd_m = (stated[0], stated[-1]) if stated else SD_M
+    return name, (numbers[:3], sd_m, photo, numbers[3:])
+
+
+def _number(cell: str) -> float | None:
+    try:
+        number = float(cell)
+    except ValueError:
+        return None
+    return number if np.isfinite(number) else None
+
+
+def _point(name: str, rows: list[Row], position: Array, path: Path) -> SurveyedPoint:
+    """One point of its lines."""
+    if any(not np.array_equal(row[0], rows[0][0], equal_nan=True) for row in rows):
+        raise StageError(f"{path}: the lines of point {name} give different coordinates; correct them, or its name")
+    photos = [photo for _, _, photo, _ in rows]
+    twice = next((photo for photo in photos if photos.count(photo) > 1), None)
+    if twice is not None:
+        raise StageError(f"{path}: point {name} is clicked more than once in {twice}; keep one line of it")
+    clicks = [(photo, pixel) for _, _, photo, pixel in rows]
+    return SurveyedPoint(name, position, rows[0][1], name.upper().startswith(CHECK), clicks)

@@ -1,0 +1,96 @@
+"""Coordinate reference systems as survey files name them, and their way to WGS84."""
+
+import re
+
+import numpy as np
+import pyproj
+
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+
+# OpenDroneMap's way to name a UTM zone.
+UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
+# A CRS is used so far beyond its area at most, in degrees: one UTM zone.
+BEYOND_DEG = 6.0
+
+
+def read_crs(text: str, where: str) -> pyproj.CRS:
+    """The CRS of a header: `EPSG:25832`, with heights `EPSG:25832+7837`, `WGS84 UTM 32N`, or a PROJ string.
+
+    Raises:
+        StageError: `text` names none, or one whose heights have another unit than its plane.
+    """
+    zone = UTM.fullmatch(text.strip())
+    code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
+    try:
+        crs = pyproj.CRS.from_user_input(code)
+    except pyproj.exceptions.CRSError:
+        raise StageError(
+            f"{where} begins with '{text.strip()[:60]}', which names no coordinate reference system; write one in the"
+            " first line: EPSG:25832, with heights EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
+        ) from None
+    known = crs.to_epsg()
+    crs = crs if known is None else pyproj.CRS.from_epsg(known)
+    units = {axis.unit_name for axis in crs.axis_info}
+    if plane(crs).is_projected and len(units) > 1:
+        raise StageError(
+            f"{where}: the CRS {crs.name} counts {' and '.join(sorted(units))}; give heights in the unit of the plane"
+        )
+    if not (plane(crs).is_projected or plane(crs).is_geographic):
+        raise StageError(
+            f"{where}: the CRS {crs.name} is neither projected nor geographic; give coordinates in such a one"
+        )
+    return crs
+
+
+def plane(crs: pyproj.CRS) -> pyproj.CRS:
+    """The horizontal part of a CRS."""
+    return crs.sub_crs_list[0] if crs.is_compound else crs
+
+
+def unit_m(crs: pyproj.CRS) -> float:
+    """Metres in the unit of a projected CRS and of its heights; 1 for a geographic one."""
+    return 1.0 if plane(crs).is_geographic else float(plane(crs).axis_info[0].unit_conversion_factor)
+
+
+def grid_name(crs: pyproj.CRS) -> str:
+    """What `LocalFrame.grid` calls a projected CRS; "" for a geographic one, whose points go into a UTM zone."""
+    return "" if plane(crs).is_geographic else crs.to_string()
+
+
+def to_wgs84(crs: pyproj.CRS, points: Array, where: str) -> Array:
+    """(N, 3) x (easting or longitude), y, height to (N, 3) WGS84 latitude (deg), longitude (deg), height (m).
+
+    Heights keep their zero: they are only brought into metres. NaN stays NaN.
+
+    Raises:
+        StageError: points that lie nowhere near the area of the CRS, with a guess where the axes are swapped.
+    """
+    found = _in_degrees(crs, points[:, :2])
+    strange = ~_in_area(crs, found)
+    if strange.any():
+        row = int(np.flatnonzero(strange)[0])
+        swapped = _in_area(crs, _in_degrees(crs, points[:, 1::-1])).all()
+        advice = "x and y are swapped: x is easting or longitude" if swapped else "correct the CRS or the coordinates"
+        raise StageError(
+            f"{where}: {points[row, 0]:.12g} {points[row, 1]:.12g} does not lie in {crs.name}"
+            f" ({strange.sum()} of {len(points)} points); {advice}"
+        )
+    return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
+
+
+def _in_degrees(crs: pyproj.CRS, points: Array) -> Array:
+    """(N, 2) longitude, latitude; infinite where there is none."""
+    transformer = pyproj.Transformer.from_crs(plane(crs), "EPSG:4326", always_xy=True)
+    return np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
+
+
+def _in_area(crs: pyproj.CRS, degrees: Array) -> np.ndarray:
+    """(N,) whether longitude, latitude exist and lie in the area of the CRS or near it."""
+    longitude, latitude = degrees.T
+    good = np.isfinite(degrees).all(1) & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
+    area = plane(crs).area_of_use
+    if area is None or area.west > area.east:
+        return good
+    good &= (latitude >= area.south - BEYOND_DEG) & (latitude <= area.north + BEYOND_DEG)
+    return np.asarray(good & (longitude >= area.west - BEYOND_DEG) & (longitude <= area.east + BEYOND_DEG))

@@ -1,0 +1,175 @@
+"""What is left between a georeferenced model and what was surveyed: at every point, and at every photo's position."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.sfm.survey.control import Control, Sighting, errors
+from scenefuse.sfm.survey.placement import GpsCameras, Placement
+from scenefuse.stage import atomic_file, quantity
+from scenefuse.transforms import Array
+
+COLUMNS = ["kind", "name", "used", "east_m", "north_m", "up_m", "horizontal_sd_m", "vertical_sd_m"]
+COLUMNS += ["photos", "reprojection_px"]
+
+
+@dataclass(frozen=True)
+class Georeference:
+    """Where a model lies, and by what.
+
+    Attributes:
+        placement: the similarity and what agrees with it.
+        frame: the local frame; None where there is no metric one.
+        gps: the photos with positions.
+        control: surveyed points; None where there are none.
+    """
+
+    placement: Placement
+    frame: LocalFrame | None
+    gps: GpsCameras
+    control: Control | None = None
+
+    @property
+    def sightings(self) -> list[Sighting]:
+        """The surveyed points."""
+        return [] if self.control is None else self.control.sightings
+
+    @property
+    def metric(self) -> bool:
+        """Whether the model is in metres."""
+        return self.placement.status == "georeferenced" and self.frame is not None
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Model minus survey, in metres, east, north and up; not a number where either is unknown.
+
+    Attributes:
+        cameras: (N, 3) at the photos with positions, which are first moved by their common shift.
+        points: (P, 3) at the surveyed points.
+        points_px: (P,) RMS distances of clicks from the points that they show together.
+    """
+
+    cameras: Array
+    points: Array
+    points_px: Array
+
+
+def residuals_of(model: pycolmap.Reconstruction, found: Georeference) -> Residuals:
+    """Compare a georeferenced model with what was surveyed. Points lie where their clicks' rays meet."""
+    if not found.metric or found.frame is None:
+        return Residuals(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    names, positions = found.gps.names, found.frame.apply(found.gps.positions) - found.placement.gps_shift
+    centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
+    target = found.frame.apply(np.array([s.point.position for s in found.sightings]).reshape(-1, 3))
+    return Residuals(centres - positions, *errors(found.sightings, model, target))
+
+
+def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
+    """Write a line for every surveyed point and every photo with a position; cells without a value are empty."""
+    rows: list[list[Any]] = []
+    if found.metric:
+        for row, sighting in enumerate(found.sightings):
+            point, kind = sighting.point, "check point" if sighting.point.check else "control point"
+            used = "yes" if found.placement.used[row] else "no"
+            counts = [len(point.clicks), left.points_px[row]]
+            rows.append([kind, point.name, used, *left.points[row], *point.sd_m, *counts])
+        for row, name in enumerate(found.gps.names):
+            chosen = found.placement.inliers
+            used = "yes" if len(chosen) and chosen[row] else "no"
+            rows.append(["position", name, used, *left.cameras[row], *found.gps.sd_m[row], "", ""])
+    with atomic_file(path) as temporary:
+        lines = ["\t".join(COLUMNS), *("\t".join(map(_cell, row)) for row in rows)]
+        temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _cell(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:.4f}" if np.isfinite(value) else ""
+    return str(value)
+
+
+def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg: float) -> dict[str, Any]:
+    """Content of georeference.json; what matters of it is printed."""
+    placement, gps, unit = found.placement, found.gps, "m" if found.metric else "scene units"
+    print(f"{placement.status}: {placement.reason}; unit: {unit}", flush=True)
+    transform = placement.local_from_model
+    content = {
+        "status": quantity(placement.status, ""),
+        "reason": quantity(placement.reason, ""),
+        "length_unit": quantity(unit, ""),
+        "metric": quantity(found.metric, ""),
+        "scene_from_sparse": quantity(transform.matrix, unit),
+        "scale": quantity(transform.scale, f"{unit} per unit of the sparse model"),
+        "photos_with_gps": quantity(len(gps.names), "1"),
+        "photos_with_gps_height": quantity(int(np.isfinite(gps.positions[:, 2]).sum()), "1"),
+        "up_cue": quantity(cue if placement.levelled else "control points" if found.control else "GPS", ""),
+        "camera_roll_median_deg": quantity(roll_deg, "deg"),
+    }
+    if not found.metric or found.frame is None:
+        return content
+    frame, crs_from_local = found.frame, found.frame.crs_from_local()
+    measured = placement.heights == "measured"
+    content |= {
+        "heights": quantity(placement.heights, ""),
+        "origin_latitude_deg": quantity(frame.latitude_deg, "deg"),
+        "origin_longitude_deg": quantity(frame.longitude_deg, "deg"),
+        "origin_altitude_m": quantity(frame.altitude_m if measured else None, "m"),
+        "crs": quantity(frame.crs, ""),
+        "origin_in_crs": quantity(crs_from_local.translation, frame.crs_unit),
+        "crs_from_scene": quantity(crs_from_local.matrix, frame.crs_unit),
+    }
+    if found.control is not None:
+        content |= _of_points(found, found.control, left)
+    return content | (_of_cameras(found, left) if len(placement.inliers) else {})
+
+
+def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[str, Any]:
+    """Errors at control and at check points, as quantities."""
+    for note in control.notes:
+        print(f"note: {note}", flush=True)
+    check = np.array([s.point.check and not s.problem for s in control.sightings])
+    content: dict[str, Any] = {"control_notes": quantity(control.notes, "")}
+    for kind, rows in (("control", found.placement.used), ("check", check)):
+        horizontal, vertical = rms(left.points[rows, :2]), rms(left.points[rows, 2:])
+        content |= {
+            f"{kind}_points": quantity(int(rows.sum()), "1"),
+            f"{kind}_rms_horizontal_m": quantity(horizontal, "m"),
+            f"{kind}_rms_vertical_m": quantity(vertical, "m"),
+        }
+        if rows.any():
+            height = "heights unknown" if vertical is None else f"vertically {vertical:.3f} m"
+            print(f"{rows.sum()} {kind} points: RMS horizontally {horizontal:.3f} m, {height}", flush=True)
+    return content
+
+
+def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
+    """Distances of cameras from their positions, as quantities."""
+    gps, inliers = found.gps, found.placement.inliers
+    distance = np.sqrt(np.nansum(left.cameras**2, axis=1))
+    whole = rms(left.cameras[inliers])
+    print(f"GPS residuals: median {np.median(distance):.2f} m, RMS of inliers {whole or 0:.2f} m", flush=True)
+    content = {
+        "gps_inliers": quantity(int(inliers.sum()), "1"),
+        "gps_residual_median_m": quantity(float(np.median(distance)), "m"),
+        "gps_residual_rms_m": quantity(whole, "m"),
+        "gps_residual_horizontal_rms_m": quantity(rms(left.cameras[inliers, :2]), "m"),
+        "gps_residual_vertical_rms_m": quantity(rms(left.cameras[inliers, 2:]), "m"),
+        "gps_residuals_m": quantity(dict(zip(gps.names, distance.round(4).tolist())), "m"),
+        "gps_outliers": quantity([name for name, ok in zip(gps.names, inliers) if not ok], ""),
+        "gps_accuracy_m": quantity(np.median(gps.sd_m, axis=0), "m"),
+    }
+    if found.control is not None:
+        content["gps_shift"] = quantity(found.placement.gps_shift, "m")
+    return content
+
+
+def rms(values: NDArray[np.float64]) -> float | None:
+    """Root mean square length of (N, D) differences over those that are known; None where none is."""
+    known = values[np.isfinite(values).any(1)]
+    return float(np.sqrt(np.nansum(known**2) / len(known))) if len(known) else None
