@@ -1,12 +1,16 @@
 """A user's tables and settings: read as people write them, or refused in one sentence."""
 
 import codecs
+from pathlib import Path
 
 import pytest
+import yaml
 
 from scenefuse.io.project import read_project
 from scenefuse.io.tables import read_table, read_text
 from scenefuse.stage import StageError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -78,6 +82,12 @@ def project(tmp_path, monkeypatch):
         return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"} | settings)
 
     return read
+
+
+def test_as_shipped_only_the_registration_that_is_fused_runs_and_the_demo_adds_what_it_is_compared_with(project):
+    assert set(project().variants) == {"full"}
+    demo = yaml.safe_load((ROOT / "config/demo.yaml").read_text())
+    assert set(project(**demo).variants) == {"full", "paper", "clouds_only", "no_scale", "no_crop"}
 
 
 def test_variants_are_the_settings_of_registration_with_what_differs(project):
