@@ -98,7 +98,7 @@ def two_clouds(
             rows.append(trial(results, scene, name, seed, Path(folder)))
     table = pd.DataFrame(rows)
     table.to_csv(report, sep="\t", index=False, float_format="%.4g")
-    print(table.T.to_string(float_format="%.4g"))
+    print(table.T.to_string(float_format="{:.4g}".format))
 
 
 if __name__ == "__main__":
