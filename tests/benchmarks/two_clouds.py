@@ -1,4 +1,4 @@
-"""`scenefuse register --fuse` on a finished demo: each object's cloud in its scene as a LAZ, without photos, against truth.
+"""`scenefuse register --fuse` on a finished demo, against truth: an object's cloud in its scene as a LAZ, no photos.
 
 make demo, then PYTHONPATH=. python tests/benchmarks/two_clouds.py --results results
 

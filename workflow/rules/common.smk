@@ -85,6 +85,27 @@ def object_row(name):
     return row_of(name, OBJECTS, "objects")
 
 
+def settings_of(wildcards):
+    """The settings for what a job works on: its object or, without one, its scene, with those of the row's own file."""
+    kind = "object" if "object" in wildcards.keys() else "scene"
+    return PROJECT.of(kind, wildcards[kind])
+
+
+def settings(*sections, without=()):
+    """Params function: sections of these settings, `object.nerf` for instance, as command line flags; not those of some names."""
+
+    def words(wildcards):
+        found = {}
+        for section in sections:
+            part = settings_of(wildcards)
+            for name in section.split("."):
+                part = part[name]
+            found |= part if isinstance(part, dict) else {name: part}
+        return flags({name: found[name] for name in found if name not in without})
+
+    return words
+
+
 def in_scene(*paths):
     """Input function: files of the scene that the object lies in."""
 

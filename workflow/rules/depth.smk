@@ -4,13 +4,11 @@
 # OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
 
 
-STAGE1 = dict(config["object"]["stage1"])
 # The workspace that the training stages read; both have the same photos, and poses in the same frame.
 POSED = {
     "sfm": "results/objects/{object}/undistorted",
     "network": "results/objects/{object}/poses",
-}[STAGE1.pop("pose_source")]
-HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
+}[config["object"]["stage1"]["pose_source"]]
 
 
 rule train_depth:
@@ -35,7 +33,9 @@ rule train_depth:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(STAGE1 | HELD_OUT),
+        options=settings(
+            "object.stage1", "object.hold_out_every", without=["pose_source"]
+        ),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
         script=script("depth/train_depth.py"),
@@ -73,7 +73,7 @@ rule refine_depth:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["stage3"] | HELD_OUT),
+        options=settings("object.stage3", "object.hold_out_every"),
         checkpoints="results/checkpoints/{object}/stage3",
         seed=config["seed"],
         script=script("depth/refine_depth.py"),
