@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scenefuse.io.settings import problem, with_defaults
+from scenefuse.io.settings import problem, read_differences, schema_of, with_defaults
+from scenefuse.new_project import init
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -53,6 +54,19 @@ def test_the_shown_settings_are_the_shipped_ones():
     shown = yaml.safe_load((ROOT / "config/config.yaml").read_text())
     assert problem(shown, schema) is None
     assert with_defaults(shown, schema) == with_defaults({}, schema)
+
+
+@pytest.mark.parametrize("preset", ["draft", "normal", "high"])
+def test_a_preset_holds_settings_and_goes_into_a_new_project(preset, tmp_path):
+    found = read_differences(ROOT / f"config/presets/{preset}.yaml")
+    init(tmp_path / "yard", preset=preset)
+    assert read_differences(tmp_path / "yard/config/config.yaml") == found
+    width = with_defaults(found, schema_of("config"))["object"]["nerf"]["width_px"]
+    assert (preset, width > 480, width < 480) in {
+        ("draft", False, True),
+        ("normal", False, False),
+        ("high", True, False),
+    }
 
 
 SCRIPTS = sorted((ROOT / "scripts").rglob("*.py"))
