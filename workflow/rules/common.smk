@@ -11,7 +11,7 @@ from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
-from scenefuse.io.settings import ROOT as SHIPPED
+from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.machine import has_gpu, memory_mb
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
@@ -25,10 +25,17 @@ if workflow.modifier.path_modifier.replace_prefix("results") != "results":
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
+# Where jobs import the library from: the clone, or where it was installed.
+LIBRARY = ROOT if (ROOT / "scenefuse").is_dir() else PACKAGE.parent
+if LIBRARY != ROOT and workflow.deployment_settings.deployment_method:
+    raise WorkflowError(
+        "the environments of --sdm lack scenefuse where it was installed by pip; leave --sdm out, or run the workflow of"
+        " a clone"
+    )
 # Jobs find the project's scripts, its package and this environment's Python without an activated shell.
 os.environ.update(
     SCENEFUSE=str(ROOT),
-    PYTHONPATH=str(ROOT),
+    PYTHONPATH=str(LIBRARY),
     PATH=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}",
 )
 
