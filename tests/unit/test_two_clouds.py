@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from laspy.vlrs.vlrlist import VLRList
 from scipy.spatial import cKDTree
 from support.cloud_files import UTM
 from support.planted import plant
@@ -51,6 +52,24 @@ def write_survey(path, cloud, crs="EPSG:25832", bright=257):
     las.intensity = np.arange(len(cloud)) % 60_000
     las.height = cloud.points[:, 2]
     las.write(str(path))
+
+
+def test_an_index_that_more_points_make_untrue_is_left_out_and_other_records_stay(tmp_path):
+    scene = in_scene(sheet(0, 4))
+    write_survey(tmp_path / "flown.laz", scene)
+    las = laspy.read(tmp_path / "flown.laz")
+    for user, data in (("copc", bytes(160)), ("surveyor", b"Smith")):
+        las.header.vlrs.append(laspy.VLR(user, 1, "", data))
+    las = laspy.convert(las, point_format_id=7)
+    las.evlrs = VLRList([laspy.VLR("copc", 1000, "", bytes(32)), laspy.VLR("surveyor", 2, "", b"Jones")])
+    las.write(str(tmp_path / "yard.laz"))
+    read = read_cloud(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), read, read, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    header = laspy.read(tmp_path / "completed.laz").header
+    kept = [(record.user_id, bytes(record.record_data_bytes())) for record in [*header.vlrs, *header.evlrs]]
+    assert {("surveyor", b"Smith"), ("surveyor", b"Jones")} <= set(kept)
+    assert "copc" not in {user for user, _ in kept} and header.parse_crs().to_epsg() == 25832
 
 
 def sheet(low, high, color=(200, 100, 50)):
