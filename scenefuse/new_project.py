@@ -56,6 +56,9 @@ def init(
     lying_in = "" if scene is None else _name(scene)
     scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder)]
     rows = [{"object": name, "scene": lying_in} | _source(path, folder) for name, path in zip(names, objects)]
+    for row in rows:
+        # Where `pick` saves what is clicked.
+        row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
     texts = {
         "config/scenes.tsv": _table("scenes", SCENES, scenes),
         "config/objects.tsv": _table("objects", OBJECTS, rows),

@@ -131,9 +131,8 @@ def test_an_installed_package_makes_a_project_and_plans_its_run(installed, tmp_p
     words = ("init", "yard", "--scene", "flight", "--objects", "my house")
     status, output = scenefuse(*words, cwd=tmp_path, library=installed)
     assert status == 0, output
-    (tmp_path / "yard/clicks.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t10\t10\n")
-    table = tmp_path / "yard/config/objects.tsv"
-    table.write_text(table.read_text().replace("my house\t\t", "my house\t\tclicks.tsv"))
+    clicks = tmp_path / "yard/config/my_house_prompts.tsv"
+    clicks.write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t10\t10\n")
     status, output = scenefuse("run", "-n", cwd=tmp_path / "yard", library=installed)
     assert status == 0, output
     assert {"map_scene_photos", "fuse_object", "complete_scene", "write_report"} <= planned(output)
