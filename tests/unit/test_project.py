@@ -31,6 +31,18 @@ def test_conda_files_pin_the_versions_of_the_default_environment():
         assert set(packages) <= pins, path.name
 
 
+def test_a_container_has_the_system_libraries_of_the_default_environment():
+    listed = re.search(r"PACKAGES=\((.*)\)", (ROOT / "envs/setup.sh").read_text())[1].split()
+    installed = re.search(r"--no-install-recommends (.*) \\\n", (ROOT / "Dockerfile").read_text())[1].split()
+    assert set(installed) == set(listed) - {"python3-venv"}
+
+
+def test_the_catalogue_is_told_how_the_workflow_is_used():
+    told = yaml.safe_load((ROOT / ".snakemake-workflow-catalog.yml").read_text())["usage"]
+    assert told["software-stack-deployment"]["conda"] and told["report"]
+    assert (ROOT / "workflow/Snakefile").is_file() and (ROOT / "config/README.md").is_file()
+
+
 def test_there_are_at_most_ninety_settings():
     schema = yaml.safe_load((ROOT / "workflow/schemas/config.schema.yaml").read_text())
     counted = [name for name, _ in leaves(schema) if name.split(".")[0] not in ("demo", "evaluation")]

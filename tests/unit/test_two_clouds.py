@@ -157,16 +157,18 @@ def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     assert after.red.max() <= 255 and after.red[-1] > 100
 
 
-def test_a_completed_scene_takes_a_second_object(tmp_path):
+def test_a_completed_scene_takes_further_objects(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
-    for number, (low, high) in enumerate([(2, 8), (6, 12)], 1):
+    scene = tmp_path / "yard.laz"
+    for number, (low, high) in enumerate([(2, 8), (6, 12), (10, 16)], 1):
         out = tmp_path / str(number)
-        scene = tmp_path / "yard.laz" if number == 1 else tmp_path / "1/completed.laz"
         read = read_cloud(scene)
         done = complete(own(sheet(low, high)), read, read, POSE, FILL)
         write_completed(out, done, tmp_path / "shed.ply", scene)
-    last = laspy.read(tmp_path / "2/completed.laz")
-    assert {(0, 0), (1, 0), (0, 1)} == set(zip(last.source.tolist(), last.source_after.tolist()))
+        scene = out / "completed.laz"
+    last = laspy.read(scene)
+    sources = zip(last.source.tolist(), last.source_after.tolist(), last.source_after_after.tolist())
+    assert set(sources) == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)}
     assert any(
         "'source' is 'source_after'" in note for note in value(read_json(tmp_path / "2/completed.json"), "notes")
     )
@@ -181,7 +183,7 @@ def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be
     written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.ply")
     assert [path.name for path in written] == ["completed.ply", "completed.json"]
     notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
-    for words in ("has no height", "grey in the scene", "neither side has photos"):
+    for words in ("leaves out the columns height", "grey in the scene", "neither side has photos"):
         assert any(words in note for note in notes) and words in printed
     added = read_cloud(written[0])
     assert (added.colors[added.fields["source"] == 1] == 128).all()
