@@ -16,6 +16,15 @@ OTHER = """
 configfile: "mine.yaml"
 
 
+rule count_points:
+    input:
+        "results/scenes/yard/completed.ply",
+    output:
+        "points.txt",
+    shell:
+        "grep -a -m1 'element vertex' {{input}} > {{output}}"
+
+
 module completion:
     snakefile:
         "{snakefile}"
@@ -24,16 +33,6 @@ module completion:
 
 
 use rule * from completion as completion_*
-
-
-rule count_points:
-    input:
-        "results/scenes/yard/completed.ply",
-    output:
-        "points.txt",
-    default_target: True
-    shell:
-        "grep -a -m1 'element vertex' {{input}} > {{output}}"
 """
 
 
@@ -66,10 +65,11 @@ def test_either_snakefile_makes_everything_from_any_folder(yard, snakefile):
     assert {"all", "map_scene_photos", "complete_scene", "write_summary", "write_report"} <= planned(output)
 
 
-def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own(yard):
+@pytest.mark.parametrize("snakefile", ["Snakefile", "workflow/Snakefile"])
+def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own(yard, snakefile):
     settings = (yard / "mine.yaml").read_text()
     (yard / "mine.yaml").write_text("completion:\n" + "".join(f"  {line}\n" for line in settings.splitlines()))
-    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
+    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / snakefile))
     status, output = plan(yard)
     assert status == 0, output
     rules = planned(output)
