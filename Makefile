@@ -6,7 +6,7 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 .PHONY: demo test lint report bench bench-registration bench-nerf docs clean
 
 demo: .venv/ready
-	snakemake --cores $(CORES)
+	snakemake --configfile config/demo.yaml --cores $(CORES)
 	@cat results/summary/summary.txt
 
 test: .venv/ready
@@ -23,7 +23,7 @@ lint: .venv/ready
 
 # Snakemake's own report: provenance, run times, and the results with captions.
 report: .venv/ready
-	snakemake --cores 1 --report results/summary/snakemake-report.html
+	snakemake --configfile config/demo.yaml --cores 1 --report results/summary/snakemake-report.html
 
 bench: bench-registration bench-nerf
 

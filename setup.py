@@ -6,7 +6,7 @@ from shutil import copy2
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-CONFIG = ("config/config.yaml", "config/README.md", "config/examples")
+CONFIG = ("config/config.yaml", "config/README.md", "config/presets", "config/examples")
 """Not the demo's tables: an installed workflow works on those of a user."""
 SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG)
 

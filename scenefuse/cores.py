@@ -14,10 +14,13 @@ with contextlib.suppress(ImportError):
 
 
 def use_threads(count: int) -> None:
-    """Let PyTorch, Numba and OpenCV use `count` threads each."""
-    import torch
+    """Let PyTorch (where it is installed), Numba and OpenCV use `count` threads each."""
+    torch: Any = None
+    with contextlib.suppress(ModuleNotFoundError):
+        import torch  # before Numba starts its threads: it then uses the OpenMP that PyTorch brought along
 
     cv2.setNumThreads(count)
     if nb is not None:
         nb.set_num_threads(max(1, min(count, nb.config.NUMBA_NUM_THREADS)))
-    torch.set_num_threads(count)  # last, since Numba changes it when it starts
+    if torch is not None:
+        torch.set_num_threads(count)  # last, since Numba changes it when it starts

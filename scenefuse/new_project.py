@@ -2,6 +2,7 @@
 
 import re
 from pathlib import Path
+from typing import Literal
 
 import tyro
 
@@ -14,7 +15,6 @@ OBJECTS = ("object", "scene", "photos", "cloud", "prompts", "fiducials")
 SETTINGS = """\
 # Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
 # {root}/config/README.md
-gpu: auto # GPUs that a stereo or training job asks for; auto: 1 where this machine has an NVIDIA card
 """
 README = """\
 # {name}
@@ -28,13 +28,20 @@ README = """\
 """
 
 
-def init(folder: tyro.conf.Positional[Path], *, scene: Path | None = None, objects: tuple[Path, ...] = ()) -> None:
+def init(
+    folder: tyro.conf.Positional[Path],
+    *,
+    scene: Path | None = None,
+    objects: tuple[Path, ...] = (),
+    preset: Literal["draft", "normal", "high"] = "normal",
+) -> None:
     """Make a folder for a project of your own: config/scenes.tsv, config/objects.tsv, config/config.yaml, README.md.
 
     Args:
         folder: of the project; it may exist, but not hold a project.
         scene: photos of the scene (a folder), or its cloud, for the first row of scenes.tsv.
         objects: the same of objects in it (a folder or a video, or a cloud), for the rows of objects.tsv.
+        preset: what config.yaml holds: settings for a first look, the shipped ones, or larger ones for a GPU.
 
     Raises:
         StageError: the folder is a file or holds a project, a path does not exist, two names are the same, or there are
@@ -49,10 +56,13 @@ def init(folder: tyro.conf.Positional[Path], *, scene: Path | None = None, objec
     lying_in = "" if scene is None else _name(scene)
     scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder)]
     rows = [{"object": name, "scene": lying_in} | _source(path, folder) for name, path in zip(names, objects)]
+    for row in rows:
+        # Where `pick` saves what is clicked.
+        row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
     texts = {
         "config/scenes.tsv": _table("scenes", SCENES, scenes),
         "config/objects.tsv": _table("objects", OBJECTS, rows),
-        "config/config.yaml": SETTINGS.format(root=ROOT),
+        "config/config.yaml": SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),
         "README.md": README.format(name=folder.resolve().name),
     }
     for path in (folder / name for name in texts):

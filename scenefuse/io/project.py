@@ -10,12 +10,15 @@ from typing import Any
 
 import yaml
 
-from scenefuse.io.settings import ROOT, merge, problem, schema_of, with_defaults
+from scenefuse.io.settings import ROOT, merge, problem, read_differences, schema_of, with_defaults
 from scenefuse.io.tables import Row, read_table
 from scenefuse.stage import StageError
 
 # Columns that say something about a row's photos.
 OF_PHOTOS = ("calibration", "control", "prompts", "masks", "truth")
+# Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
+OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
+OF_THE_RUN = ("scene.chunks", "object.recipe", "object.stage1.pose_source", "registration.variants")
 
 
 @dataclass(frozen=True)
@@ -26,13 +29,23 @@ class Project:
         settings: as shipped, with the user's laid over them.
         scenes: rows of the table of scenes by name.
         objects: rows of the table of objects by name.
-        variants: settings of `registration` for each variant that runs.
+        variants: for each registration variant that runs, the settings of `registration` that differ.
+        own: settings of the rows that have a settings file of their own, by kind and name.
     """
 
     settings: dict[str, Any]
     scenes: dict[str, Row]
     objects: dict[str, Row]
     variants: dict[str, dict[str, Any]]
+    own: dict[tuple[str, str], dict[str, Any]]
+
+    def of(self, kind: str, name: str) -> dict[str, Any]:
+        """The settings of a `scene` or an `object`."""
+        return self.own.get((kind, name), self.settings)
+
+    def registration(self, name: str, variant: str) -> dict[str, Any]:
+        """The settings of `registration` for a variant of an object."""
+        return merge(self.of("object", name)["registration"], self.variants[variant])
 
 
 def read_project(config: Mapping[str, Any]) -> Project:
@@ -68,7 +81,13 @@ def read_project(config: Mapping[str, Any]) -> Project:
     wrong = _recipe_problem(settings["object"])
     if wrong:
         raise StageError(f"config, {wrong}")
-    return Project(settings, scenes, objects, _variants(settings))
+    own = {
+        (kind, name): merge(settings, _differences(kind, name, row["config"], settings[f"{kind}s"]))
+        for kind, rows in (("scene", scenes), ("object", objects))
+        for name, row in rows.items()
+        if row.get("config")
+    }
+    return Project(settings, scenes, objects, _variants(settings), own)
 
 
 def _checked_table(name: str, kind: str) -> dict[str, Row]:
@@ -105,6 +124,28 @@ def _recipe_problem(settings: Mapping[str, Any]) -> str:
     return ""
 
 
+def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
+    """What the settings file of a row changes."""
+    where = f"{table}, {kind} '{name}', config {path}"
+    try:
+        found = read_differences(Path(path) if Path(path).is_file() else ROOT / path)
+    except StageError as error:
+        raise StageError(f"{table}, {kind} '{name}': {error}") from None
+    other = next((key for key in found if key not in OWN[kind]), None)
+    if other is not None:
+        raise StageError(
+            f"{where}: '{other}' does not concern one {kind}; it may hold {', '.join(OWN[kind])}. Put the rest into the"
+            " settings file of the run"
+        )
+    for key in OF_THE_RUN:
+        part: Any = found
+        for step in key.split("."):
+            part = part.get(step) if isinstance(part, dict) else None
+        if part is not None:
+            raise StageError(f"{where}: {key} is the same for the whole run; put it into the settings file of the run")
+    return found
+
+
 def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
     """Settings of the variants that run; with recipe `paper` the paper's registration is the one that is fused."""
     defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
@@ -120,4 +161,4 @@ def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         )
     if "full" not in chosen:
         raise StageError("config, registration.variants: 'full' is missing; it is the one that is fused")
-    return {name: merge(dict(registration), defined[name]) for name in chosen}
+    return {name: defined[name] for name in chosen}

@@ -65,9 +65,11 @@ def read_settings(mine: Path | None) -> dict[str, Any]:
     Raises:
         StageError: the file is missing, is no YAML, or holds a key or value that the schema does not allow.
     """
-    schema = schema_of("config")
-    if mine is None:
-        return with_defaults({}, schema)
+    return with_defaults({} if mine is None else read_differences(mine), schema_of("config"))
+
+
+def read_differences(mine: Path) -> dict[str, Any]:
+    """The settings that a file names, checked; errors as of `read_settings`."""
     try:
         own = yaml.safe_load(mine.read_text()) or {}
     except OSError:
@@ -76,10 +78,10 @@ def read_settings(mine: Path | None) -> dict[str, Any]:
         raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
     if not isinstance(own, dict):
         raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
-    wrong = problem(own, schema)
+    wrong = problem(own, schema_of("config"))
     if wrong:
         raise StageError(f"{mine}, {wrong}")
-    return with_defaults(own, schema)
+    return own
 
 
 def build(settings: type[T], values: Mapping[str, Any]) -> T:

@@ -69,11 +69,11 @@ class Session:
         Raises:
             StageError: settings, tables or photos are wrong.
         """
-        settings = read_settings(configfile)
+        project = read_project(read_settings(configfile))
         self.name, self.configfile = name, configfile
-        self.boards = [Board(source) for source in sources_of(read_project(settings), name)]
+        self.boards = [Board(source) for source in sources_of(project, name)]
         self.tiles, self.thumbnails = Tiles(), Thumbnails(Path("results/pick/thumbnails"))
-        self.segmenter = Segmenter(settings["object"]["masks"], MASK_SIDE_PX)
+        self.segmenter = Segmenter(project.of("object", name)["object"]["masks"], MASK_SIDE_PX)
         self._accepted = Path("results/pick") / f"{name}.json"
         self.results_state: tuple[float, ...] = ()
         self.read_results()

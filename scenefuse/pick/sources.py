@@ -69,7 +69,7 @@ def sources_of(project: Project, name: str) -> list[Source]:
     row, found = project.objects[name], []
     if row.get("photos"):
         results = Path("results/objects") / name
-        pictures = object_pictures(Path(row["photos"]), results, project.settings["object"]["frames"])
+        pictures = object_pictures(Path(row["photos"]), results, project.of("object", name)["object"]["frames"])
         path, listed = _table(project, row, name, "prompts")
         models: tuple[Path, ...] = (results / "sparse",)
         found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed))

@@ -78,8 +78,9 @@ def complete(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, set
     if scene.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
-    if scene.fields:
-        notes.append(f"completed.ply has no {', '.join(sorted(scene.fields))}: the object's points have none")
+    left_out = sorted({*scene.fields, *obj.fields})
+    if left_out:
+        notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
     kept = with_source(unchecked(scene[fusion.kept]), FROM_SCENE)
     seconds = time.perf_counter() - start
     return Completed(fusion.kept, kept, added, fusion.fill_distance, settings.mode, notes, seconds)
@@ -133,23 +134,30 @@ def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
         further = type(header.vlrs)(_but_copc(header.evlrs or []))
         own = set(header.point_format.dimension_names)
-        names = {name: f"{name}_after" if name in own else name for name in done.added.fields}
+        names = {name: _free(name, own) for name in done.added.fields}
         header.add_extra_dims(
             [laspy.ExtraBytesParams(names[name], values.dtype.str[1:]) for name, values in done.added.fields.items()]
         )
         with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
-            bright = False
+            brightest = 0
             for chunk, fields in _kept_chunks(reader, done):
                 part = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
                 for name in chunk.array.dtype.names:
                     part.array[name] = chunk.array[name]
-                bright |= "red" in own and max(int(np.max(part[name], initial=0)) for name in COLOR) > 255
+                if "red" in own:
+                    brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
                 _fill_in(part, {names[name]: values for name, values in fields.items()})
                 writer.write_points(part)
-            writer.write_points(_added_record(header, done, names, 257 if bright else 1, scene))
+            colors = 1 if 0 < brightest <= 255 else 257
+            writer.write_points(_added_record(header, done, names, colors, scene))
             if further:
                 writer.write_evlrs(further)
     return [f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other]
+
+
+def _free(name: str, taken: set[str]) -> str:
+    """A name that no dimension has."""
+    return _free(f"{name}_after", taken) if name in taken else name
 
 
 def _but_copc(records: Iterable[Any]) -> list[Any]:

@@ -80,7 +80,7 @@ def ablation(*, results: Path = Path("results"), seeds: int = 3) -> None:
         results: folder of a finished demo.
         seeds: 0 to this.
     """
-    shipped, rows = read_settings(None)["registration"]["variants"], []
+    shipped, rows = read_settings(ROOT / "config/demo.yaml")["registration"]["variants"], []
     variants = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
     truth = results / "demo/demo/truth"
     scene_cameras = read_cameras(truth / "scene/cameras.json")

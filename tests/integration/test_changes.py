@@ -96,3 +96,19 @@ def test_a_photo_whose_name_holds_braces_is_listed_and_a_change_of_it_is_noticed
         shutil.copy(next((project / "flight").glob("*.jpg")), project / "flight/a{1}.jpg")
 
     assert "list_photos" in plan(add)
+
+
+def test_settings_of_a_row_rerun_that_row_only_and_what_reads_it(plan):
+    def of_object(path):
+        (path / "own.yaml").write_text("object: { undistort: { max_size_px: 900 } }")
+        table = (path / "objects.tsv").read_text().splitlines()
+        (path / "objects.tsv").write_text(f"{table[0]}\tconfig\n{table[1]}\town.yaml\n")
+
+    def of_scene(path):
+        (path / "own.yaml").write_text("scene: { undistort: { max_size_px: 900 } }")
+        (path / "scenes.tsv").write_text("scene\tphotos\tconfig\nyard\tflight\town.yaml\n")
+
+    assert plan(of_object) == {"undistort_object_photos", "make_masks", "crop_scene"}
+    assert "undistort_scene_photos" in plan(of_scene, place="scene") and "undistort_object_photos" not in plan(
+        of_scene, place="again"
+    )

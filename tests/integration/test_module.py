@@ -5,12 +5,24 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.user_project import planned
+
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER = """
 configfile: "mine.yaml"
+
+
+rule count_points:
+    input:
+        "results/scenes/yard/completed.ply",
+    output:
+        "points.txt",
+    shell:
+        "grep -a -m1 'element vertex' {{input}} > {{output}}"
 
 
 module completion:
@@ -21,24 +33,18 @@ module completion:
 
 
 use rule * from completion as completion_*
-
-
-rule count_points:
-    input:
-        "results/scenes/yard/completed.ply",
-    output:
-        "points.txt",
-    default_target: True
-    shell:
-        "grep -a -m1 'element vertex' {{input}} > {{output}}"
 """
 
 
-def plan(directory, *words):
-    command = [sys.executable, "-m", "snakemake", "--dry-run", *map(str, words)]
+def snakemake(directory, *words):
+    command = [sys.executable, "-m", "snakemake", *map(str, words)]
     env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=directory, env=env, capture_output=True, text=True)
     return done.returncode, done.stdout + done.stderr
+
+
+def plan(directory, *words):
+    return snakemake(directory, "--dry-run", *words)
 
 
 @pytest.fixture
@@ -59,15 +65,27 @@ def test_either_snakefile_makes_everything_from_any_folder(yard, snakefile):
     assert {"all", "map_scene_photos", "complete_scene", "write_summary", "write_report"} <= planned(output)
 
 
-def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own(yard):
+@pytest.mark.parametrize("snakefile", ["Snakefile", "workflow/Snakefile"])
+def test_another_workflow_uses_it_as_a_module_with_settings_and_rules_of_its_own(yard, snakefile):
     settings = (yard / "mine.yaml").read_text()
     (yard / "mine.yaml").write_text("completion:\n" + "".join(f"  {line}\n" for line in settings.splitlines()))
-    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
+    (yard / "Snakefile").write_text(OTHER.format(snakefile=ROOT / snakefile))
     status, output = plan(yard)
     assert status == 0, output
     rules = planned(output)
     assert {"count_points", "completion_map_scene_photos", "completion_complete_scene"} <= rules
     assert not {rule for rule in rules if not rule.startswith("completion_")} - {"count_points"}
+
+
+def test_jobs_of_a_module_run(tmp_path):
+    write_cloud(tmp_path / "yard.ply", Cloud(np.random.default_rng(0).uniform(0, 9, (500, 3))))
+    (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.ply\n")
+    (tmp_path / "objects.tsv").write_text("object\tscene\n")
+    (tmp_path / "mine.yaml").write_text("completion: { scenes: scenes.tsv, objects: objects.tsv }\n")
+    (tmp_path / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
+    status, output = snakemake(tmp_path, "--cores", "1", "results/scenes/yard/dense.ply")
+    assert status == 0, output
+    assert len(read_cloud(tmp_path / "results/scenes/yard/dense.ply")) == 500
 
 
 def test_a_prefix_would_not_reach_all_files_and_is_refused(yard):

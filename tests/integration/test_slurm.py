@@ -29,7 +29,7 @@ rule slow:
 RUN = """
 {snakemake} {targets} --snakefile {root}/Snakefile --directory clouds --configfile clouds/mine.yaml &> clouds.txt &
 {snakemake} --snakefile slow/Snakefile --directory slow &> slow.txt &
-for _ in $(seq 300); do [ -s slow/started ] && break; sleep 0.1; done
+for _ in $(seq 1200); do [ -s slow/started ] && break; sleep 0.1; done
 scontrol update JobId=$(cat slow/started) EndTime=now
 wait %1 && echo 0 > clouds.status || echo $? > clouds.status
 wait %2 && echo 0 > slow.status || echo $? > slow.status

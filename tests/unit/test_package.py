@@ -15,7 +15,7 @@ from packaging.requirements import Requirement
 from support.planted import plant
 from support.user_project import planned
 
-from scenefuse.io.clouds import read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.new_project import init
 from scenefuse.stage import StageError
 from scenefuse.version import VERSION
@@ -131,13 +131,42 @@ def test_an_installed_package_makes_a_project_and_plans_its_run(installed, tmp_p
     words = ("init", "yard", "--scene", "flight", "--objects", "my house")
     status, output = scenefuse(*words, cwd=tmp_path, library=installed)
     assert status == 0, output
-    (tmp_path / "yard/clicks.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t10\t10\n")
-    table = tmp_path / "yard/config/objects.tsv"
-    table.write_text(table.read_text().replace("my house\t\t", "my house\t\tclicks.tsv"))
+    clicks = tmp_path / "yard/config/my_house_prompts.tsv"
+    clicks.write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t10\t10\n")
     status, output = scenefuse("run", "-n", cwd=tmp_path / "yard", library=installed)
     assert status == 0, output
     assert {"map_scene_photos", "fuse_object", "complete_scene", "write_report"} <= planned(output)
     assert "render_scene" not in planned(output)
+
+
+def test_jobs_of_an_installed_package_run_its_own_code(installed, tmp_path):
+    write_cloud(tmp_path / "yard.ply", Cloud(np.random.default_rng(0).uniform(0, 9, (500, 3))))
+    assert scenefuse("init", "project", "--scene", "yard.ply", cwd=tmp_path, library=installed)[0] == 0
+    words = ("run", "--cores", "1", "results/scenes/yard/dense.ply")
+    status, output = scenefuse(*words, cwd=tmp_path / "project", library=installed)
+    assert status == 0, output
+    assert len(read_cloud(tmp_path / "project/results/scenes/yard/dense.ply")) == 500
+    log = (tmp_path / "project/results/logs/import_scene_cloud/yard.log").read_text()
+    assert log.startswith(f"python {installed}/scenefuse/shipped/scripts/io/import_scene_cloud.py")
+
+
+def test_code_has_the_same_fingerprint_in_a_clone_and_installed(installed):
+    ask = (
+        "import sys; from pathlib import Path; from scenefuse.fingerprint import fingerprint; root = Path(sys.argv[1]);"
+    )
+    ask += "print(fingerprint(root / 'scripts/fusion/fuse_object.py', root))"
+    found = set()
+    for library, root in ((ROOT, ROOT), (installed, installed / "scenefuse/shipped")):
+        command = [sys.executable, "-c", ask, root]
+        env = os.environ | {"PYTHONPATH": str(library)}
+        found.add(subprocess.run(command, env=env, cwd=installed, capture_output=True, text=True, check=True).stdout)
+    assert len(found) == 1
+
+
+def test_environments_of_conda_are_refused_where_they_would_lack_the_library(installed, tmp_path):
+    assert scenefuse("init", "yard", cwd=tmp_path, library=installed)[0] == 0
+    status, output = scenefuse("run", "-n", "--sdm", "conda", cwd=tmp_path / "yard", library=installed)
+    assert status == 1 and "run the workflow of a clone" in output
 
 
 def test_an_empty_project_says_what_is_missing(installed, tmp_path):

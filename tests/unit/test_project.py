@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scenefuse.io.settings import problem, with_defaults
+from scenefuse.io.settings import problem, read_differences, schema_of, with_defaults
+from scenefuse.new_project import init
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -28,6 +29,18 @@ def test_conda_files_pin_the_versions_of_the_default_environment():
     for path in (ROOT / "envs").glob("*.yaml"):
         packages = yaml.safe_load(path.read_text())["dependencies"][-1]["pip"]
         assert set(packages) <= pins, path.name
+
+
+def test_a_container_has_the_system_libraries_of_the_default_environment():
+    listed = re.search(r"PACKAGES=\((.*)\)", (ROOT / "envs/setup.sh").read_text())[1].split()
+    installed = re.search(r"--no-install-recommends (.*) \\\n", (ROOT / "Dockerfile").read_text())[1].split()
+    assert set(installed) == set(listed) - {"python3-venv"}
+
+
+def test_the_catalogue_is_told_how_the_workflow_is_used():
+    told = yaml.safe_load((ROOT / ".snakemake-workflow-catalog.yml").read_text())["usage"]
+    assert told["software-stack-deployment"]["conda"] and told["report"]
+    assert (ROOT / "workflow/Snakefile").is_file() and (ROOT / "config/README.md").is_file()
 
 
 def test_there_are_at_most_ninety_settings():
@@ -53,6 +66,19 @@ def test_the_shown_settings_are_the_shipped_ones():
     shown = yaml.safe_load((ROOT / "config/config.yaml").read_text())
     assert problem(shown, schema) is None
     assert with_defaults(shown, schema) == with_defaults({}, schema)
+
+
+@pytest.mark.parametrize("preset", ["draft", "normal", "high"])
+def test_a_preset_holds_settings_and_goes_into_a_new_project(preset, tmp_path):
+    found = read_differences(ROOT / f"config/presets/{preset}.yaml")
+    init(tmp_path / "yard", preset=preset)
+    assert read_differences(tmp_path / "yard/config/config.yaml") == found
+    width = with_defaults(found, schema_of("config"))["object"]["nerf"]["width_px"]
+    assert (preset, width > 480, width < 480) in {
+        ("draft", False, True),
+        ("normal", False, False),
+        ("high", True, False),
+    }
 
 
 SCRIPTS = sorted((ROOT / "scripts").rglob("*.py"))

@@ -1,12 +1,17 @@
 """A user's tables and settings: read as people write them, or refused in one sentence."""
 
 import codecs
+import re
+from pathlib import Path
 
 import pytest
+import yaml
 
 from scenefuse.io.project import read_project
 from scenefuse.io.tables import read_table, read_text
 from scenefuse.stage import StageError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -80,8 +85,15 @@ def project(tmp_path, monkeypatch):
     return read
 
 
+def test_as_shipped_only_the_registration_that_is_fused_runs_and_the_demo_adds_what_it_is_compared_with(project):
+    assert set(project().variants) == {"full"}
+    demo = yaml.safe_load((ROOT / "config/demo.yaml").read_text())
+    assert set(project(**demo).variants) == {"full", "paper", "clouds_only", "no_scale", "no_crop"}
+
+
 def test_variants_are_the_settings_of_registration_with_what_differs(project):
-    found = project(registration={"variants": ["full", "no_crop"], "crop": {"mode": "masks"}}).variants
+    whole = project(registration={"variants": ["full", "no_crop"], "crop": {"mode": "masks"}})
+    found = {variant: whole.registration("shed", variant) for variant in whole.variants}
     assert set(found) == {"full", "no_crop"}
     assert found["full"]["crop"]["mode"] == found["no_crop"]["crop"]["mode"] == "masks"
     assert found["no_crop"]["crop"] != found["full"]["crop"]
@@ -91,6 +103,80 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
 def test_with_recipe_paper_the_papers_registration_is_the_one_that_is_fused(project):
     shipped, paper = (project(object={"recipe": name}).variants for name in ("scenefuse", "paper"))
     assert paper["full"] == shipped["paper"] != shipped["full"]
+
+
+@pytest.fixture
+def own_project(tmp_path, monkeypatch):
+    """A project of two objects, one of which has settings of its own."""
+    monkeypatch.chdir(tmp_path)
+
+    def read(content, column="objects", **settings):
+        (tmp_path / "own.yaml").write_text(content)
+        cells = {name: "own.yaml" if name == column else "" for name in ("scenes", "objects")}
+        (tmp_path / "scenes.tsv").write_text(f"scene\tphotos\tconfig\nyard\tflight\t{cells['scenes']}\n")
+        rows = f"shed\tyard\tclose\t{cells['objects']}\nbarn\tyard\tother\t\n"
+        (tmp_path / "objects.tsv").write_text(f"object\tscene\tphotos\tconfig\n{rows}")
+        return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"} | settings)
+
+    return read
+
+
+def test_settings_of_a_row_are_those_of_the_run_with_what_differs(own_project):
+    text = "object: {nerf: {width_px: 800}}\nregistration: {crop: {shape: hull}}\nfusion: {nerf_only: true}"
+    run = {"object": {"nerf": {"levels": 10}}, "registration": {"variants": ["full", "no_crop"]}}
+    found = own_project(text, **run)
+    shed, barn = found.of("object", "shed"), found.of("object", "barn")
+    assert (shed["object"]["nerf"]["width_px"], barn["object"]["nerf"]["width_px"]) == (800, 480)
+    assert shed["object"]["nerf"]["levels"] == barn["object"]["nerf"]["levels"] == 10
+    assert shed["fusion"]["nerf_only"] and not barn["fusion"]["nerf_only"]
+    assert found.registration("shed", "full")["crop"]["shape"] == "hull"
+    assert found.registration("shed", "no_crop")["crop"] == shed["registration"]["crop"] | {"whole_scene": True}
+    assert found.registration("barn", "full")["crop"]["shape"] == "box"
+    assert barn == found.settings and shed["scene"] == found.settings["scene"]
+
+
+def test_a_scene_has_settings_of_its_own_too(own_project):
+    found = own_project("scene: {undistort: {max_size_px: 3000}}", "scenes")
+    assert found.of("scene", "yard")["scene"]["undistort"]["max_size_px"] == 3000
+    assert found.settings["scene"]["undistort"]["max_size_px"] == 2000
+
+
+@pytest.mark.parametrize(
+    "content, column, sentence",
+    [
+        (
+            "object: {nerf: {widht: 1}}",
+            "objects",
+            "object 'shed': own.yaml, object.nerf: unknown key 'widht'",
+        ),
+        (
+            "scene: {matches: {max_ratio: 0.8}}",
+            "objects",
+            "'scene' does not concern one object; it may hold object",
+        ),
+        ("object: {hold_out_every: 4}", "scenes", "'object' does not concern one scene; it may hold scene"),
+        ("seed: 3", "objects", "'seed' does not concern one object"),
+        ("scene: {chunks: 9}", "scenes", "scene.chunks is the same for the whole run"),
+        ("registration: {variants: [full]}", "objects", "registration.variants is the same for the whole run"),
+        (
+            "object: {stage1: {pose_source: network}}",
+            "objects",
+            "pose_source is the same for the whole run",
+        ),
+        ("[1, 2]", "objects", "own.yaml holds no settings"),
+        ("object: {", "objects", "own.yaml is no YAML"),
+    ],
+)
+def test_bad_settings_of_a_row_are_one_sentence(own_project, content, column, sentence):
+    with pytest.raises(StageError, match=re.escape(sentence)):
+        own_project(content, column)
+
+
+def test_settings_of_a_row_that_are_not_there_are_named_with_the_row(own_project, tmp_path):
+    own_project("")
+    (tmp_path / "own.yaml").unlink()
+    with pytest.raises(StageError, match="object 'shed': the settings file .*own.yaml cannot be read"):
+        read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"})
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
+from laspy.vlrs.vlrlist import VLRList
 from scipy.spatial import cKDTree
 from support.cloud_files import UTM
 from support.planted import plant
@@ -51,6 +52,24 @@ def write_survey(path, cloud, crs="EPSG:25832", bright=257):
     las.intensity = np.arange(len(cloud)) % 60_000
     las.height = cloud.points[:, 2]
     las.write(str(path))
+
+
+def test_an_index_that_more_points_make_untrue_is_left_out_and_other_records_stay(tmp_path):
+    scene = in_scene(sheet(0, 4))
+    write_survey(tmp_path / "flown.laz", scene)
+    las = laspy.read(tmp_path / "flown.laz")
+    for user, data in (("copc", bytes(160)), ("surveyor", b"Smith")):
+        las.header.vlrs.append(laspy.VLR(user, 1, "", data))
+    las = laspy.convert(las, point_format_id=7)
+    las.evlrs = VLRList([laspy.VLR("copc", 1000, "", bytes(32)), laspy.VLR("surveyor", 2, "", b"Jones")])
+    las.write(str(tmp_path / "yard.laz"))
+    read = read_cloud(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), read, read, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    header = laspy.read(tmp_path / "completed.laz").header
+    kept = [(record.user_id, bytes(record.record_data_bytes())) for record in [*header.vlrs, *header.evlrs]]
+    assert {("surveyor", b"Smith"), ("surveyor", b"Jones")} <= set(kept)
+    assert "copc" not in {user for user, _ in kept} and header.parse_crs().to_epsg() == 25832
 
 
 def sheet(low, high, color=(200, 100, 50)):
@@ -138,16 +157,18 @@ def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     assert after.red.max() <= 255 and after.red[-1] > 100
 
 
-def test_a_completed_scene_takes_a_second_object(tmp_path):
+def test_a_completed_scene_takes_further_objects(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
-    for number, (low, high) in enumerate([(2, 8), (6, 12)], 1):
+    scene = tmp_path / "yard.laz"
+    for number, (low, high) in enumerate([(2, 8), (6, 12), (10, 16)], 1):
         out = tmp_path / str(number)
-        scene = tmp_path / "yard.laz" if number == 1 else tmp_path / "1/completed.laz"
         read = read_cloud(scene)
         done = complete(own(sheet(low, high)), read, read, POSE, FILL)
         write_completed(out, done, tmp_path / "shed.ply", scene)
-    last = laspy.read(tmp_path / "2/completed.laz")
-    assert {(0, 0), (1, 0), (0, 1)} == set(zip(last.source.tolist(), last.source_after.tolist()))
+        scene = out / "completed.laz"
+    last = laspy.read(scene)
+    sources = zip(last.source.tolist(), last.source_after.tolist(), last.source_after_after.tolist())
+    assert set(sources) == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)}
     assert any(
         "'source' is 'source_after'" in note for note in value(read_json(tmp_path / "2/completed.json"), "notes")
     )
@@ -162,7 +183,7 @@ def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be
     written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.ply")
     assert [path.name for path in written] == ["completed.ply", "completed.json"]
     notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
-    for words in ("has no height", "grey in the scene", "neither side has photos"):
+    for words in ("leaves out the columns height", "grey in the scene", "neither side has photos"):
         assert any(words in note for note in notes) and words in printed
     added = read_cloud(written[0])
     assert (added.colors[added.fields["source"] == 1] == 128).all()

@@ -2,17 +2,19 @@
 from scenefuse.masks.algebra import mask_folders
 
 
-def kept_masks(name):
+def kept_masks(wildcards):
     """What an object's masks keep."""
-    return config["object"]["masks"]["keep"].replace("{object}", name)
+    keep = settings_of(wildcards)["object"]["masks"]["keep"]
+    return keep.replace("{object}", wildcards.object)
 
 
 def mask_inputs(wildcards):
     """What the masks of an object are made from: your own masks, or prompts and perhaps weights; masks to combine."""
-    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    row = object_row(wildcards.object)
+    settings = settings_of(wildcards)["object"]["masks"]
     photos_of(row, f"object '{wildcards.object}'")
     try:
-        folders = mask_folders(kept_masks(wildcards.object))
+        folders = mask_folders(kept_masks(wildcards))
     except StageError as error:
         raise WorkflowError(str(error)) from None
     where = f"object.masks.keep of '{wildcards.object}'"
@@ -34,9 +36,10 @@ def mask_inputs(wildcards):
 
 def mask_options(wildcards):
     """Settings of the masks; your own masks beat any method."""
-    row, settings = object_row(wildcards.object), config["object"]["masks"]
+    row = object_row(wildcards.object)
+    settings = settings_of(wildcards)["object"]["masks"]
     own = {
-        "keep": kept_masks(wildcards.object),
+        "keep": kept_masks(wildcards),
         "supplied": row.get("masks") or None,
         "prompts": None if row.get("masks") else row.get("prompts") or None,
     }

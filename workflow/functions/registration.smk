@@ -1,15 +1,20 @@
 # Settings of a registration variant, and what marks an object for the crop.
 
 
+def registration_of(wildcards):
+    """The settings of `registration` for an object and a variant."""
+    return PROJECT.registration(wildcards.object, wildcards.variant)
+
+
 def variant_options(part):
     """Params function: the settings of one step of a variant."""
-    return lambda wildcards: flags(VARIANTS[wildcards.variant][part])
+    return lambda wildcards: flags(registration_of(wildcards)[part])
 
 
 def crop_mode(wildcards):
     """How a variant crops: by the object's masks where the photos of both sides may be linked, else by the file in the
     column fiducials. Without either, the whole scene is kept: None."""
-    crop = VARIANTS[wildcards.variant]["crop"]
+    crop = registration_of(wildcards)["crop"]
     marked, linked = object_row(wildcards.object).get("fiducials"), is_linked(wildcards)
     if crop.get("whole_scene") or not (marked or linked):
         return None
@@ -43,4 +48,4 @@ def crop_options(wildcards):
     """Settings of a variant's crop."""
     mode = crop_mode(wildcards)
     own = {"mode": mode} if mode else {"whole_scene": True}
-    return flags(VARIANTS[wildcards.variant]["crop"] | own | crop_marks(wildcards))
+    return flags(registration_of(wildcards)["crop"] | own | crop_marks(wildcards))

@@ -11,7 +11,7 @@ from snakemake.exceptions import WorkflowError
 
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
-from scenefuse.io.settings import ROOT as SHIPPED
+from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.machine import has_gpu, memory_mb
 from scenefuse.sfm.photo_files import GEO_FILE, photo_files
 from scenefuse.stage import StageError
@@ -25,10 +25,17 @@ if workflow.modifier.path_modifier.replace_prefix("results") != "results":
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED
+# Where jobs import the library from: the clone, or where it was installed.
+LIBRARY = ROOT if (ROOT / "scenefuse").is_dir() else PACKAGE.parent
+if LIBRARY != ROOT and workflow.deployment_settings.deployment_method:
+    raise WorkflowError(
+        "the environments of --sdm lack scenefuse where it was installed by pip; leave --sdm out, or run the workflow of"
+        " a clone"
+    )
 # Jobs find the project's scripts, its package and this environment's Python without an activated shell.
 os.environ.update(
     SCENEFUSE=str(ROOT),
-    PYTHONPATH=str(ROOT),
+    PYTHONPATH=str(LIBRARY),
     PATH=f"{Path(sys.executable).parent}:{os.environ.get('PATH', '')}",
 )
 
@@ -83,6 +90,27 @@ def scene_row(name):
 
 def object_row(name):
     return row_of(name, OBJECTS, "objects")
+
+
+def settings_of(wildcards):
+    """The settings for what a job works on: its object or, without one, its scene, with those of the row's own file."""
+    kind = "object" if "object" in wildcards.keys() else "scene"
+    return PROJECT.of(kind, wildcards[kind])
+
+
+def settings(*sections, without=()):
+    """Params function: sections of these settings, `object.nerf` for instance, as command line flags; not those of some names."""
+
+    def words(wildcards):
+        found = {}
+        for section in sections:
+            part = settings_of(wildcards)
+            for name in section.split("."):
+                part = part[name]
+            found |= part if isinstance(part, dict) else {name: part}
+        return flags({name: found[name] for name in found if name not in without})
+
+    return words
 
 
 def in_scene(*paths):

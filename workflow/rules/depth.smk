@@ -4,8 +4,6 @@
 # OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
 
 
-STAGE1 = dict(config["object"]["stage1"])
-POSE_SOURCE = STAGE1.pop("pose_source")
 # The workspace that the training stages read; all have the same photos, and poses in the same frame. In recipe paper, the last one.
 POSED = (
     "results/objects/{object}/refined_poses"
@@ -13,9 +11,8 @@ POSED = (
     else {
         "sfm": "results/objects/{object}/undistorted",
         "network": "results/objects/{object}/poses",
-    }[POSE_SOURCE]
+    }[config["object"]["stage1"]["pose_source"]]
 )
-HELD_OUT = {"hold_out_every": config["object"]["hold_out_every"]}
 
 
 rule train_depth:
@@ -40,7 +37,9 @@ rule train_depth:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(STAGE1 | HELD_OUT),
+        options=settings(
+            "object.stage1", "object.hold_out_every", without=["pose_source"]
+        ),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
         script=script("depth/train_depth.py"),
@@ -78,7 +77,7 @@ rule refine_depth:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["stage3"] | HELD_OUT),
+        options=settings("object.stage3", "object.hold_out_every"),
         checkpoints="results/checkpoints/{object}/stage3",
         seed=config["seed"],
         script=script("depth/refine_depth.py"),

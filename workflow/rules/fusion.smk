@@ -36,7 +36,7 @@ rule fuse_object:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["fusion"]),
+        options=settings("fusion"),
         photos=options_of("object_workspace", "scene_workspace"),
         script=script("fusion/fuse_object.py"),
         code=code("fusion/fuse_object.py"),

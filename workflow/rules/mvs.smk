@@ -29,7 +29,7 @@ rule estimate_depth_maps:
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["scene"]["depth_maps"]),
+        options=settings("scene.depth_maps"),
         chunks=len(CHUNKS),
         seed=config["seed"],
         script=script("mvs/estimate_depth_maps.py"),
@@ -69,7 +69,7 @@ rule fuse_depth_maps:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        options=flags(config["scene"]["dense_cloud"]),
+        options=settings("scene.dense_cloud"),
         script=script("mvs/fuse_depth_maps.py"),
         code=code("mvs/fuse_depth_maps.py"),
     message:

@@ -29,7 +29,7 @@ rule train_object_nerf:
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
+        options=settings("object.nerf", "object.stage2", "object.hold_out_every"),
         previous="",
         checkpoints="results/checkpoints/{object}/stage2",
         seed=config["seed"],
@@ -62,7 +62,7 @@ use rule train_object_nerf as retrain_object_nerf with:
     benchmark:
         "results/benchmarks/retrain_object_nerf/{object}.tsv"
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
+        options=settings("object.nerf", "object.stage4", "object.hold_out_every"),
         previous="--previous results/objects/{object}/stage2",
         checkpoints="results/checkpoints/{object}/stage4",
         seed=config["seed"],
@@ -95,7 +95,7 @@ rule make_object_cloud:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["object"]["cloud"]),
+        options=settings("object.cloud"),
         seed=config["seed"],
         script=script("nerf/make_object_cloud.py"),
         code=code("nerf/make_object_cloud.py"),

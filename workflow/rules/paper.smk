@@ -16,9 +16,10 @@ ruleorder: register_for_fusion_as_paper > estimate_scale > register_coarsely > r
 
 
 def of_paper(stage):
-    """Epochs of a stage, and what stages 1 and 3 of the paper share."""
-    epochs = config["object"][stage]["epochs"]
-    return flags({"epochs": epochs, "pose_source": POSE_SOURCE} | HELD_OUT)
+    """Params function: epochs of a stage, and what stages 1 and 3 of the paper share."""
+    return settings(
+        f"object.{stage}.epochs", "object.stage1.pose_source", "object.hold_out_every"
+    )
 
 
 rule estimate_as_paper:
@@ -82,7 +83,7 @@ rule train_nerf_as_paper:
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage2"] | HELD_OUT),
+        options=settings("object.nerf", "object.stage2", "object.hold_out_every"),
         checkpoints="results/checkpoints/{object}/paper2",
         seed=config["seed"],
         script=script("paper/train_nerf_as_paper.py"),
@@ -156,7 +157,7 @@ use rule train_nerf_as_paper as retrain_nerf_as_paper with:
     benchmark:
         "results/benchmarks/retrain_nerf_as_paper/{object}.tsv"
     params:
-        options=flags(config["object"]["nerf"] | config["object"]["stage4"] | HELD_OUT),
+        options=settings("object.nerf", "object.stage4", "object.hold_out_every"),
         checkpoints="results/checkpoints/{object}/paper4",
         seed=config["seed"],
         script=script("paper/train_nerf_as_paper.py"),
@@ -172,7 +173,10 @@ use rule make_object_cloud as make_cloud_as_paper with:
     benchmark:
         "results/benchmarks/make_cloud_as_paper/{object}.tsv"
     params:
-        options=flags(config["object"]["cloud"] | {"match_reach_px": 0}),
+        options=lambda wildcards: settings("object.cloud", without=["match_reach_px"])(
+            wildcards
+        )
+        + " --match-reach-px 0",
         seed=config["seed"],
         script=script("nerf/make_object_cloud.py"),
         code=code("nerf/make_object_cloud.py"),

@@ -24,7 +24,7 @@ rule find_poses:
         runtime=lambda wildcards, attempt: 120 * attempt,
         gpu=config["gpu"],
     params:
-        options=flags(config["object"]["poses"]),
+        options=settings("object.poses"),
         seed=config["seed"],
         script=script("poses/find_poses.py"),
         code=code("poses/find_poses.py"),

@@ -35,7 +35,7 @@ rule align_models:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        options=flags(config["registration"]["alignment"]),
+        options=settings("registration.alignment"),
         seed=config["seed"],
         script=script("registration/align_models.py"),
         code=code("registration/align_models.py"),

@@ -60,7 +60,7 @@ rule extract_frames:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         source=object_source,
-        options=flags(config["object"]["frames"]),
+        options=settings("object.frames"),
         script=script("sfm/extract_frames.py"),
         files=state_of(object_photos),
         code=code("sfm/extract_frames.py"),
@@ -90,7 +90,7 @@ rule extract_scene_features:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        options=flags(config["scene"]["features"]),
+        options=settings("scene.features"),
         calibration=calibration_flag(scene_row, "scene"),
         files=state_of(calibration_of(scene_row, "scene")),
         script=script("sfm/extract_features.py"),
@@ -119,7 +119,7 @@ use rule extract_scene_features as extract_object_features with:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=flags(config["object"]["features"]),
+        options=settings("object.features"),
         calibration=calibration_flag(object_row, "object"),
         files=state_of(calibration_of(object_row, "object")),
         script=script("sfm/extract_features.py"),
@@ -148,7 +148,7 @@ rule match_scene_features:
         mem_mb=lambda wildcards, attempt: 6000 * attempt,
         runtime=lambda wildcards, attempt: 240 * attempt,
     params:
-        options=flags(config["scene"]["matches"]),
+        options=settings("scene.matches"),
         seed=config["seed"],
         script=script("sfm/match_features.py"),
         code=code("sfm/match_features.py"),
@@ -176,7 +176,7 @@ use rule match_scene_features as match_object_features with:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        options=flags(config["object"]["matches"]),
+        options=settings("object.matches"),
         seed=config["seed"],
         script=script("sfm/match_features.py"),
         code=code("sfm/match_features.py"),
@@ -205,7 +205,7 @@ rule map_scene_photos:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
     params:
-        options=flags(config["scene"]["sparse"]),
+        options=settings("scene.sparse"),
         calibrated=calibrated(scene_row, "scene"),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
@@ -235,7 +235,7 @@ use rule map_scene_photos as map_object_photos with:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        options=flags(config["object"]["sparse"]),
+        options=settings("object.sparse"),
         calibrated=calibrated(object_row, "object"),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
@@ -267,7 +267,7 @@ rule georegister:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
-        options=flags(config["scene"]["georegister"]),
+        options=settings("scene.georegister"),
         control=control_flag,
         files=state_of(control_of),
         seed=config["seed"],
@@ -346,7 +346,7 @@ rule undistort_scene_photos:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         upright=lambda wildcards, input: f"--georeference {input.report}",
-        options=flags(config["scene"]["undistort"]),
+        options=settings("scene.undistort"),
         script=script("sfm/undistort_photos.py"),
         code=code("sfm/undistort_photos.py"),
     message:
@@ -376,7 +376,7 @@ use rule undistort_scene_photos as undistort_object_photos with:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         upright="",
-        options=flags(config["object"]["undistort"]),
+        options=settings("object.undistort"),
         script=script("sfm/undistort_photos.py"),
         code=code("sfm/undistort_photos.py"),
     message:
