@@ -87,10 +87,7 @@ def test_the_completed_scene_holds_what_the_object_adds(finished):
     assert np.array_equal(completed.fields["source"], np.repeat([0, 1], [len(kept), len(added)]))
     assert json.loads((scene / "completed.json").read_text())["sources"]["value"] == {"0": "scene", "1": "house"}
     assert (scene / "completed.laz").stat().st_size > 0
-    of_scene, of_house = (
-        json.loads((folder / "metrics.json").read_text())["completion"]
-        for folder in (scene, house)
-    )
+    of_scene, of_house = (json.loads((folder / "metrics.json").read_text())["completion"] for folder in (scene, house))
     for name in ("surface_variation", "surface_variation_null", "nue", "primitive_fitting_score_after"):
         assert of_scene[name]["value"] == pytest.approx(of_house[name]["value"], rel=0.05)
 

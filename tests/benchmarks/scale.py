@@ -1,0 +1,226 @@
+"""What one object costs in scenes of ever more points: crop, registration, fusion, completed scene; memory and seconds.
+
+make bench-scale, or a part of it:
+PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --millions 1 10
+
+A planted house stands in a yard that goes on and on at the same density, so that what is near it is the same in all
+scenes. Up to --laz-millions the yard is a LAZ file that is imported as in the workflow, and laspy reads the same box of
+it; larger ones are written as the workflow indexes them. Up to --completed-millions the completed scene is written.
+"""
+
+import resource
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import laspy
+import numpy as np
+import pandas as pd
+from support.planted import Trial, errors, plant
+
+from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
+from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fusion.modes import FusionSettings
+from scenefuse.io.clouds import Cloud, laz_in_parts, read_cloud, write_cloud
+from scenefuse.io.import_cloud import import_scene_cloud
+from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.io.tiles.write_tiles import write_tiled
+from scenefuse.job_records import JobRecords
+from scenefuse.registration.coarse import CoarseSettings, register_coarsely
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.crop.crop_scene import CropInputs, around_marks, crop_scene
+from scenefuse.registration.decision import FineSettings
+from scenefuse.registration.fine import register_finely
+from scenefuse.registration.problem import Inputs
+from scenefuse.registration.scale import ScaleSettings, estimate_scale
+from scenefuse.stage import quantity, read_json, run, value, write_json
+from scenefuse.transforms import Array, Sim3
+
+OBJECT_POINTS = 100_000
+PART = 1_000_000
+"""Points of the yard that are made together."""
+CUT = 1.05
+"""The yard begins so many diagonals from the middle of the house, where its own ground ends."""
+
+
+def planted() -> Trial:
+    """The house, of which the scene shows 60 %."""
+    return plant("house", 0, coverage=0.6, object_points=OBJECT_POINTS, depth_maps=False)
+
+
+def density(trial: Trial) -> float:
+    """Points of the scene's ground for each unit of its area."""
+    low, high = (end(trial.scene.points[:, :2], axis=0) for end in (np.min, np.max))
+    edge = ((trial.scene.points[:, :2] < low + 0.1 * (high - low)).any(1)).sum()
+    return float(edge / (0.19 * np.prod(high - low)))
+
+
+def yard(trial: Trial, count: int) -> Iterator[Cloud]:
+    """A scene of about so many points in parts: the planted one, and strips of hills around it."""
+    side, middle = np.sqrt(count / density(trial)), trial.fiducials.mean(0)[:2]
+    own = (np.abs(trial.scene.points[:, :2] - middle) <= CUT * trial.diagonal).all(1)
+    yield trial.scene[own]
+    strips = max(1, round(count / PART))
+    for strip in range(strips):
+        rng = np.random.default_rng([1, strip])
+        xy = rng.uniform([-0.5, strip / strips - 0.5], [0.5, (strip + 1) / strips - 0.5], (count // strips, 2)) * side
+        xy = xy[(np.abs(xy) > CUT * trial.diagonal).any(1)]
+        away = np.linalg.norm(xy, axis=1) / (20 * trial.diagonal)
+        hills = np.minimum(away, 1) ** 2 * np.sin(xy / (8 * trial.diagonal)).sum(1) * 2 * trial.diagonal
+        z = hills + rng.normal(0, 0.005 * trial.diagonal, len(xy))
+        colors = rng.integers(60, 120, (len(xy), 3)).astype(np.uint8)
+        yield Cloud(np.column_stack([xy + middle, z]), np.tile(np.float32([0, 0, 1]), (len(xy), 1)), colors)
+
+
+def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, float, float]:
+    """What a function gives in a process of its own, its seconds, and the process's peak memory in GB."""
+    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+        return pool.submit(_measured, function, arguments, options).result()
+
+
+def _measured(
+    function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
+) -> tuple[Any, float, float]:
+    start = time.perf_counter()
+    found = function(*arguments, **options)
+    return found, time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+
+
+def make_laz(path: Path, count: int) -> None:
+    """The yard as a user has it."""
+    trial = planted()
+    side = np.sqrt(count / density(trial))
+    box = np.full(3, -side), np.full(3, side)
+    with laz_in_parts(path, Cloud(np.zeros((0, 3))), box, np.zeros(3), "EPSG:32632") as append:
+        for part in yard(trial, count):
+            append(part)
+
+
+def make_tiles(path: Path, count: int) -> None:
+    """The yard as the workflow has it."""
+    trial, total, sample = planted(), 0, []
+    for part in yard(trial, count):
+        total += len(part)
+        sample.append(part.points[::1000])
+    write_tiled(path, lambda: yard(trial, count), total, np.concatenate(sample))
+    write_json(path.with_name("georeference.json"), {"length_unit": quantity("scene units", "")})
+
+
+def laspy_reads(path: Path, low: Array, high: Array) -> int:
+    """Points that plain laspy reads out of a box of a LAZ file."""
+    count = 0
+    with laspy.open(path) as file:
+        for points in file.chunk_iterator(PART):
+            xy = np.column_stack([points.x, points.y])
+            count += int(((xy >= low[:2]) & (xy <= high[:2])).all(1).sum())
+    return count
+
+
+def tiles_read(path: Path, low: Array, high: Array) -> int:
+    """Points that a stage reads for the same box."""
+    return len(open_cloud(path).near(low, high)[1])
+
+
+def register(folder: Path) -> None:
+    """Scale, coarse and fine registration, as the workflow runs them."""
+    inputs = Inputs(object=folder / "object.ply", crop=folder / "crop.ply", crop_json=folder / "crop.json")
+    scale, coarse = folder / "scale.json", folder / "coarse.json"
+    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
+    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=CoarseSettings())
+    fine = folder / "house/fine.json"
+    register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=FineSettings())
+
+
+def stages(folder: Path, completed: bool) -> dict[str, tuple[float, float]]:
+    """Seconds and GB of every stage of one object in the scene of a folder."""
+    scene, georeference, house = folder / "dense.ply", folder / "georeference.json", folder / "house"
+    crop = CropInputs(scene=scene, georeference_json=georeference, fiducials=folder / "points.tsv")
+    fusion = FusionInputs(
+        object=folder / "object.ply", scene=scene, crop=folder / "crop.ply", crop_json=folder / "crop.json",
+        fine_json=house / "fine.json", georeference_json=georeference,
+    )  # fmt: skip
+    outputs = FusionOutputs(*(house / name for name in ("fused.ply", "checked.ply", "evidence.json", "fusion.json")))
+    found = {
+        "crop": timed(
+            crop_scene, inputs=crop, crop=folder / "crop.ply", report=folder / "crop.json", settings=CropSettings()
+        ),
+        "register": timed(register, folder),
+        "fuse": timed(fuse_object, inputs=fusion, outputs=outputs, settings=FusionSettings()),
+    }
+    if completed:
+        records = JobRecords(folder / "logs", folder / "benchmarks")
+        inputs = CompletionInputs(scene=scene, objects=[house], jobs=records, georeference_json=georeference)
+        files = {"completed": folder / "completed.ply", "completed_laz": folder / "completed.laz"}
+        found["completed"] = timed(complete_scene, inputs=inputs, **files, report=folder / "completed.json")
+    return {name: (seconds, memory) for name, (_, seconds, memory) in found.items()}
+
+
+def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[str, Any]:
+    """A row of the table."""
+    trial, folder, count = planted(), work / f"{millions:g}", round(millions * 1e6)
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    write_cloud(folder / "object.ply", trial.object)
+    rows = [f"p{k}\t{x:.4f}\t{y:.4f}\t{z:.4f}\n" for k, (x, y, z) in enumerate(trial.fiducials.tolist())]
+    (folder / "points.tsv").write_text("point\tx\ty\tz\n" + "".join(rows))
+    low, high = around_marks(trial.fiducials, CropSettings())
+    row: dict[str, Any] = {"millions": millions}
+    if laz:
+        _, row["make_s"], _ = timed(make_laz, folder / "yard.laz", count)
+        files = {"cloud": "dense.ply", "report": "dense.json", "georeference_json": "georeference.json"}
+        outputs = {name: folder / file for name, file in files.items()}
+        _, row["index_s"], row["index_gb"] = timed(import_scene_cloud, source=folder / "yard.laz", **outputs)
+        row["laspy_points"], row["laspy_s"], row["laspy_gb"] = timed(laspy_reads, folder / "yard.laz", low, high)
+        (folder / "yard.laz").unlink()
+        origin = np.array(value(read_json(folder / "georeference.json"), "origin_in_crs"))
+    else:
+        _, row["index_s"], row["index_gb"] = timed(make_tiles, folder / "dense.ply", count)
+        origin = np.zeros(3)
+    row["disk_gb"] = (folder / "dense.ply").stat().st_size / 1e9
+    read = timed(tiles_read, folder / "dense.ply", low - origin, high - origin)
+    row["near_points"], row["near_s"], row["near_gb"] = read
+    found = stages(folder, completed)
+    for name, (seconds, memory) in found.items():
+        row |= {f"{name}_s": seconds, f"{name}_gb": memory}
+    row["object_s"] = sum(found[name][0] for name in ("crop", "register", "fuse"))
+    row["most_gb"] = max(memory for _, memory in found.values())
+    pose = Sim3.from_matrix(np.array(value(read_json(folder / "house/fine.json"), "scene_from_object")))
+    placed = Sim3(pose.scale, pose.rotation, pose.translation + origin)
+    scale, turn, shift = errors(placed, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal)
+    row |= {"status": value(read_json(folder / "house/fusion.json"), "status")}
+    row |= {"scale_pct": scale, "turn_deg": turn, "shift": shift}
+    row["added"] = len(read_cloud(folder / "house/fused.ply"))
+    shutil.rmtree(folder)
+    return row
+
+
+def scale(
+    work: Path,
+    millions: tuple[float, ...] = (1, 10, 100),
+    laz_millions: float = 100,
+    completed_millions: float = 100,
+    table: Path | None = None,
+) -> None:
+    """Print a table, a row for each size.
+
+    Args:
+        work: folder to work in; 500 million points take 20 GB there, 100 million with the completed scene 12 GB.
+        millions: points of the scenes.
+        laz_millions: sizes up to this are imported from LAZ.
+        completed_millions: sizes up to this are written with the house in them.
+        table: output CSV, or nothing.
+    """
+    rows = []
+    for size in millions:
+        rows.append(one_size(work, size, size <= laz_millions, size <= completed_millions))
+        print(pd.DataFrame(rows).T.to_string(float_format="{:.3g}".format), flush=True)
+        if table is not None:
+            pd.DataFrame(rows).to_csv(table, index=False)
+
+
+if __name__ == "__main__":
+    run(scale)
