@@ -40,7 +40,7 @@ bench-nerf: .venv/ready
 	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7 rich==14.0.0 markdown-it-py==3.0.0 mdurl==0.1.2
 	PYTHONPATH=tests python tests/benchmarks/nerf.py --threads $(CORES)
 
-# One object in scenes of 1, 10 and 100 million points: crop, registration, fusion, completed scene. 12 GB of disk.
+# One object in scenes of 1, 10 and 100 million points: crop, registration, fusion, completed scene. 9 GB of disk.
 bench-scale: .venv/ready
 	PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --table results/bench/scale.csv
 

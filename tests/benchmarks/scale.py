@@ -25,10 +25,10 @@ from support.planted import Trial, errors, plant
 from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
 from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fusion.modes import FusionSettings
-from scenefuse.io.clouds import Cloud, laz_in_parts, read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, laz_in_parts, read_cloud, records_of, write_cloud
 from scenefuse.io.import_cloud import import_scene_cloud
-from scenefuse.io.tiles.tiled_cloud import open_cloud
-from scenefuse.io.tiles.write_tiles import write_tiled
+from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud
+from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.job_records import JobRecords
 from scenefuse.registration.coarse import CoarseSettings, register_coarsely
 from scenefuse.registration.crop.crop_cloud import CropSettings
@@ -42,7 +42,7 @@ from scenefuse.transforms import Array, Sim3
 
 OBJECT_POINTS = 100_000
 PART = 1_000_000
-"""Points of the yard that are made together."""
+"""Points that laspy reads together."""
 CUT = 1.05
 """The yard begins so many diagonals from the middle of the house, where its own ground ends."""
 
@@ -59,21 +59,37 @@ def density(trial: Trial) -> float:
     return float(edge / (0.19 * np.prod(high - low)))
 
 
-def yard(trial: Trial, count: int) -> Iterator[Cloud]:
-    """A scene of about so many points in parts: the planted one, and strips of hills around it."""
-    side, middle = np.sqrt(count / density(trial)), trial.fiducials.mean(0)[:2]
-    own = (np.abs(trial.scene.points[:, :2] - middle) <= CUT * trial.diagonal).all(1)
-    yield trial.scene[own]
-    strips = max(1, round(count / PART))
-    for strip in range(strips):
-        rng = np.random.default_rng([1, strip])
-        xy = rng.uniform([-0.5, strip / strips - 0.5], [0.5, (strip + 1) / strips - 0.5], (count // strips, 2)) * side
-        xy = xy[(np.abs(xy) > CUT * trial.diagonal).any(1)]
-        away = np.linalg.norm(xy, axis=1) / (20 * trial.diagonal)
-        hills = np.minimum(away, 1) ** 2 * np.sin(xy / (8 * trial.diagonal)).sum(1) * 2 * trial.diagonal
-        z = hills + rng.normal(0, 0.005 * trial.diagonal, len(xy))
-        colors = rng.integers(60, 120, (len(xy), 3)).astype(np.uint8)
-        yield Cloud(np.column_stack([xy + middle, z]), np.tile(np.float32([0, 0, 1]), (len(xy), 1)), colors)
+class Yard:
+    """A scene of about so many points in square tiles: the planted one, and hills around it in one pattern of points."""
+
+    def __init__(self, count: int):
+        self.trial = planted()
+        self.across, self.side = max(1, round(np.sqrt(count / TILE))), np.sqrt(TILE / density(self.trial))
+        self.middle = self.trial.fiducials.mean(0)[:2]
+        rng = np.random.default_rng(1)
+        self.pattern, self.colors = rng.random((TILE, 3)), rng.integers(60, 120, (TILE, 3), dtype=np.uint8)
+
+    def tiles(self) -> Iterator[tuple[Array, Array, int]]:
+        """Corners (3,) of each tile and its number; -1 is the planted scene."""
+        height, reach = 5 * self.trial.diagonal, np.full(2, CUT * self.trial.diagonal)
+        yield np.append(self.middle - reach, -height), np.append(self.middle + reach, height), -1
+        for number in range(self.across**2):
+            low = self.middle + (np.array(divmod(number, self.across)) - self.across / 2) * self.side
+            yield np.append(low, -height), np.append(low + self.side, height), number
+
+    def points(self, low: Array, number: int) -> Cloud:
+        """The points of a tile: about TILE."""
+        trial = self.trial
+        if number < 0:
+            own = (np.abs(trial.scene.points[:, :2] - self.middle) <= CUT * trial.diagonal).all(1)
+            return Cloud(trial.scene.points[own], None, trial.scene.colors[own])
+        away = self.pattern[:, :2] * self.side + low[:2] - self.middle
+        chosen = (np.abs(away) > CUT * trial.diagonal).any(1)
+        away = away[chosen]
+        steep = np.minimum((away**2).sum(1) / (20 * trial.diagonal) ** 2, 1) * 2 * trial.diagonal
+        hills = steep * np.sin(away / (8 * trial.diagonal)).sum(1)
+        z = hills + self.pattern[chosen, 2] * 0.01 * trial.diagonal
+        return Cloud(np.column_stack([away + self.middle, z]), None, self.colors[chosen])
 
 
 def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, float, float]:
@@ -92,21 +108,28 @@ def _measured(
 
 def make_laz(path: Path, count: int) -> None:
     """The yard as a user has it."""
-    trial = planted()
-    side = np.sqrt(count / density(trial))
-    box = np.full(3, -side), np.full(3, side)
+    yard = Yard(count)
+    box = np.full(3, -yard.across * yard.side), np.full(3, yard.across * yard.side)
     with laz_in_parts(path, Cloud(np.zeros((0, 3))), box, np.zeros(3), "EPSG:32632") as append:
-        for part in yard(trial, count):
-            append(part)
+        for low, _, number in yard.tiles():
+            append(yard.points(low, number))
 
 
 def make_tiles(path: Path, count: int) -> None:
-    """The yard as the workflow has it."""
-    trial, total, sample = planted(), 0, []
-    for part in yard(trial, count):
-        total += len(part)
-        sample.append(part.points[::1000])
-    write_tiled(path, lambda: yard(trial, count), total, np.concatenate(sample))
+    """The yard as the workflow has it once it is imported."""
+    yard = Yard(count)
+    tiles, own = list(yard.tiles()), CUT * yard.trial.diagonal
+    table = np.zeros(len(tiles), ROW_OF_TILE)
+    for row, (low, high, number) in zip(table, tiles):
+        beside = (low[:2] > yard.middle + own).any() or (high[:2] < yard.middle - own).any()
+        row["count"] = TILE if beside else len(yard.points(low, number))
+        for name, end in zip(BOX, (*low, *high)):
+            row[name] = end
+    like = records_of(yard.points(*tiles[0][::2]), path)
+    with reserved(path, like.dtype, int(table["count"].sum()), len(table)) as (file, _):
+        for low, _, number in tiles:
+            file.write(records_of(yard.points(low, number), path).tobytes())
+        file.write(table.tobytes())
     write_json(path.with_name("georeference.json"), {"length_unit": quantity("scene units", "")})
 
 
@@ -201,14 +224,14 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
 def scale(
     work: Path,
     millions: tuple[float, ...] = (1, 10, 100),
-    laz_millions: float = 100,
+    laz_millions: float = 10,
     completed_millions: float = 100,
     table: Path | None = None,
 ) -> None:
     """Print a table, a row for each size.
 
     Args:
-        work: folder to work in; 500 million points take 20 GB there, 100 million with the completed scene 12 GB.
+        work: folder to work in; 500 million points take 14 GB there, 100 million with the completed scene 9 GB.
         millions: points of the scenes.
         laz_millions: sizes up to this are imported from LAZ.
         completed_millions: sizes up to this are written with the house in them.
