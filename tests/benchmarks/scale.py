@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def density(trial: Trial) -> float:
 
 
 class Yard:
-    """A scene of about so many points in square tiles: the planted one, and hills around it in one pattern of points."""
+    """A scene of about so many points in square tiles: the planted one, and hills in one pattern of points."""
 
     def __init__(self, count: int):
         self.trial = planted()
@@ -92,18 +93,38 @@ class Yard:
         return Cloud(np.column_stack([away + self.middle, z]), None, self.colors[chosen])
 
 
-def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> tuple[Any, float, float]:
-    """What a function gives in a process of its own, its seconds, and the process's peak memory in GB."""
+@dataclass(frozen=True)
+class Cost:
+    """Of a function in a process of its own.
+
+    Attributes:
+        result: what it gave.
+        seconds: by the clock.
+        cpu_seconds: of all its threads.
+        peak_gb: largest memory of the process, with the libraries that it loads (0.5 GB).
+    """
+
+    result: Any
+    seconds: float
+    cpu_seconds: float
+    peak_gb: float
+
+    def row(self, name: str) -> dict[str, float]:
+        """Its columns of the table."""
+        return {f"{name}_s": self.seconds, f"{name}_cpu_s": self.cpu_seconds, f"{name}_gb": self.peak_gb}
+
+
+def timed(function: Callable[..., Any], *arguments: Any, **options: Any) -> Cost:
+    """What a function costs."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         return pool.submit(_measured, function, arguments, options).result()
 
 
-def _measured(
-    function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
-) -> tuple[Any, float, float]:
-    start = time.perf_counter()
+def _measured(function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]) -> Cost:
+    start, busy = time.perf_counter(), time.process_time()
     found = function(*arguments, **options)
-    return found, time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    return Cost(found, time.perf_counter() - start, time.process_time() - busy, peak)
 
 
 def make_laz(path: Path, count: int) -> None:
@@ -158,8 +179,8 @@ def register(folder: Path) -> None:
     register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=FineSettings())
 
 
-def stages(folder: Path, completed: bool) -> dict[str, tuple[float, float]]:
-    """Seconds and GB of every stage of one object in the scene of a folder."""
+def stages(folder: Path, completed: bool) -> dict[str, Cost]:
+    """Every stage of one object in the scene of a folder."""
     scene, georeference, house = folder / "dense.ply", folder / "georeference.json", folder / "house"
     crop = CropInputs(scene=scene, georeference_json=georeference, fiducials=folder / "points.tsv")
     fusion = FusionInputs(
@@ -179,7 +200,7 @@ def stages(folder: Path, completed: bool) -> dict[str, tuple[float, float]]:
         inputs = CompletionInputs(scene=scene, objects=[house], jobs=records, georeference_json=georeference)
         files = {"completed": folder / "completed.ply", "completed_laz": folder / "completed.laz"}
         found["completed"] = timed(complete_scene, inputs=inputs, **files, report=folder / "completed.json")
-    return {name: (seconds, memory) for name, (_, seconds, memory) in found.items()}
+    return found
 
 
 def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[str, Any]:
@@ -192,25 +213,27 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
     (folder / "points.tsv").write_text("point\tx\ty\tz\n" + "".join(rows))
     low, high = around_marks(trial.fiducials, CropSettings())
     row: dict[str, Any] = {"millions": millions}
+    origin = np.zeros(3)
     if laz:
-        _, row["make_s"], _ = timed(make_laz, folder / "yard.laz", count)
+        row |= timed(make_laz, folder / "yard.laz", count).row("make")
         files = {"cloud": "dense.ply", "report": "dense.json", "georeference_json": "georeference.json"}
         outputs = {name: folder / file for name, file in files.items()}
-        _, row["index_s"], row["index_gb"] = timed(import_scene_cloud, source=folder / "yard.laz", **outputs)
-        row["laspy_points"], row["laspy_s"], row["laspy_gb"] = timed(laspy_reads, folder / "yard.laz", low, high)
+        row |= timed(import_scene_cloud, source=folder / "yard.laz", **outputs).row("index")
+        by_laspy = timed(laspy_reads, folder / "yard.laz", low, high)
+        row |= by_laspy.row("laspy") | {"laspy_points": by_laspy.result}
         (folder / "yard.laz").unlink()
         origin = np.array(value(read_json(folder / "georeference.json"), "origin_in_crs"))
     else:
-        _, row["index_s"], row["index_gb"] = timed(make_tiles, folder / "dense.ply", count)
-        origin = np.zeros(3)
+        row |= timed(make_tiles, folder / "dense.ply", count).row("make")
     row["disk_gb"] = (folder / "dense.ply").stat().st_size / 1e9
     read = timed(tiles_read, folder / "dense.ply", low - origin, high - origin)
-    row["near_points"], row["near_s"], row["near_gb"] = read
+    row |= read.row("near") | {"near_points": read.result}
     found = stages(folder, completed)
-    for name, (seconds, memory) in found.items():
-        row |= {f"{name}_s": seconds, f"{name}_gb": memory}
-    row["object_s"] = sum(found[name][0] for name in ("crop", "register", "fuse"))
-    row["most_gb"] = max(memory for _, memory in found.values())
+    for name, cost in found.items():
+        row |= cost.row(name)
+    of_object = [found[name] for name in ("crop", "register", "fuse")]
+    row |= {"object_s": sum(c.seconds for c in of_object), "object_cpu_s": sum(c.cpu_seconds for c in of_object)}
+    row["most_gb"] = max(cost.peak_gb for cost in found.values())
     pose = Sim3.from_matrix(np.array(value(read_json(folder / "house/fine.json"), "scene_from_object")))
     placed = Sim3(pose.scale, pose.rotation, pose.translation + origin)
     scale, turn, shift = errors(placed, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal)
