@@ -13,7 +13,7 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -83,7 +83,7 @@ class Yard:
         trial = self.trial
         if number < 0:
             own = (np.abs(trial.scene.points[:, :2] - self.middle) <= CUT * trial.diagonal).all(1)
-            return Cloud(trial.scene.points[own], None, trial.scene.colors[own])
+            return replace(trial.scene[own], normals=None)
         away = self.pattern[:, :2] * self.side + low[:2] - self.middle
         chosen = (np.abs(away) > CUT * trial.diagonal).any(1)
         away = away[chosen]
