@@ -277,8 +277,8 @@ def laz_in_parts(
         except lazrs.LazrsError as error:  # it does not say why, and only writing can fail
             left = shutil.disk_usage(temporary.parent).free / 1e9
             raise StageError(
-                f"{path} could not be written ({error}); {left:.3g} GB of its disk are free: free some space and run this"
-                " again"
+                f"{path} could not be written ({error}); {left:.3g} GB of its disk are free: free some space and run"
+                " this again"
             ) from None
 
 
