@@ -5,7 +5,8 @@ PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --m
 
 A planted house stands in a yard that goes on and on at the same density, so that what is near it is the same in all
 scenes. Up to --laz-millions the yard is a LAZ file that is imported as in the workflow, and laspy reads the same box of
-it; larger ones are written as the workflow indexes them. Up to --completed-millions the completed scene is written.
+it, and of a COPC file; larger ones are written as the workflow indexes them. Up to --completed-millions the completed
+scene is written.
 """
 
 import resource
@@ -21,6 +22,7 @@ from typing import Any
 import laspy
 import numpy as np
 import pandas as pd
+from support.copc_file import write_copc
 from support.planted import Trial, errors, plant
 
 from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
@@ -136,6 +138,13 @@ def make_laz(path: Path, count: int) -> None:
             append(yard.points(low, number))
 
 
+def make_copc(path: Path, count: int) -> None:
+    """The same with an octree."""
+    yard = Yard(count)
+    parts = [yard.points(low, number) for low, _, number in yard.tiles()]
+    write_copc(path, *(np.concatenate([getattr(part, name) for part in parts]) for name in ("points", "colors")))
+
+
 def make_tiles(path: Path, count: int) -> None:
     """The yard as the workflow has it once it is imported."""
     yard = Yard(count)
@@ -162,6 +171,12 @@ def laspy_reads(path: Path, low: Array, high: Array) -> int:
             xy = np.column_stack([points.x, points.y])
             count += int(((xy >= low[:2]) & (xy <= high[:2])).all(1).sum())
     return count
+
+
+def copc_reads(path: Path, low: Array, high: Array) -> int:
+    """Points that laspy reads out of the same box of a COPC file."""
+    with laspy.CopcReader.open(path) as file:
+        return len(file.query(laspy.Bounds(mins=low[:2], maxs=high[:2])))
 
 
 def tiles_read(path: Path, low: Array, high: Array) -> int:
@@ -222,6 +237,10 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
         by_laspy = timed(laspy_reads, folder / "yard.laz", low, high)
         row |= by_laspy.row("laspy") | {"laspy_points": by_laspy.result}
         (folder / "yard.laz").unlink()
+        make_copc(folder / "yard.copc.laz", count)
+        by_copc = timed(copc_reads, folder / "yard.copc.laz", low, high)
+        row |= by_copc.row("copc") | {"copc_points": by_copc.result}
+        (folder / "yard.copc.laz").unlink()
         origin = np.array(value(read_json(folder / "georeference.json"), "origin_in_crs"))
     else:
         row |= timed(make_tiles, folder / "dense.ply", count).row("make")
