@@ -63,14 +63,15 @@ def density(trial: Trial) -> float:
 
 
 class Yard:
-    """A scene of about so many points in square tiles: the planted one, and hills in one pattern of points."""
+    """A scene of about so many points in square tiles: the planted one, and terraces in one pattern of points."""
 
     def __init__(self, count: int):
         self.trial = planted()
         self.across, self.side = max(1, round(np.sqrt(count / TILE))), np.sqrt(TILE / density(self.trial))
         self.middle = self.trial.fiducials.mean(0)[:2]
         rng = np.random.default_rng(1)
-        self.pattern, self.colors = rng.random((TILE, 3)), rng.integers(60, 120, (TILE, 3), dtype=np.uint8)
+        self.pattern = rng.random((TILE, 3)) * [self.side, self.side, 0.01 * self.trial.diagonal]
+        self.colors = rng.integers(60, 120, (TILE, 3), dtype=np.uint8)
 
     def tiles(self) -> Iterator[tuple[Array, Array, int]]:
         """Corners (3,) of each tile and its number; -1 is the planted scene."""
@@ -86,13 +87,13 @@ class Yard:
         if number < 0:
             own = (np.abs(trial.scene.points[:, :2] - self.middle) <= CUT * trial.diagonal).all(1)
             return replace(trial.scene[own], normals=None)
-        away = self.pattern[:, :2] * self.side + low[:2] - self.middle
-        chosen = (np.abs(away) > CUT * trial.diagonal).any(1)
-        away = away[chosen]
-        steep = np.minimum((away**2).sum(1) / (20 * trial.diagonal) ** 2, 1) * 2 * trial.diagonal
-        hills = steep * np.sin(away / (8 * trial.diagonal)).sum(1)
-        z = hills + self.pattern[chosen, 2] * 0.01 * trial.diagonal
-        return Cloud(np.column_stack([away + self.middle, z]), None, self.colors[chosen])
+        away = low[:2] + self.side / 2 - self.middle
+        steep = min(1.0, float(np.linalg.norm(away)) / (20 * trial.diagonal)) ** 2 * trial.diagonal
+        height = steep * float(np.sin(away / (8 * trial.diagonal)).sum())
+        found = Cloud(self.pattern + np.append(low[:2], height), None, self.colors)
+        if (np.abs(away) > CUT * trial.diagonal + self.side).any():
+            return found
+        return found[(np.abs(found.points[:, :2] - self.middle) > CUT * trial.diagonal).any(1)]
 
 
 @dataclass(frozen=True)
