@@ -140,7 +140,7 @@ use rule complete_scene as complete_scene_with_object with:
     benchmark:
         "results/benchmarks/complete_scene_with_object/{object}.tsv"
     params:
-        objects="results/objects/{object}",
+        objects=lambda wildcards: f"results/objects/{wildcards.object}",
         script=script("fusion/complete_scene.py"),
         code=code("fusion/complete_scene.py"),
     message:
