@@ -3,7 +3,7 @@ CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo test lint report bench bench-registration bench-nerf docs clean
+.PHONY: demo test lint report bench bench-registration bench-nerf bench-scale docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -39,6 +39,10 @@ bench-registration: .venv/ready
 bench-nerf: .venv/ready
 	pip install --quiet --disable-pip-version-check --no-deps nerfstudio==1.1.5 jaxtyping==0.3.3 wadler-lindig==0.1.7 rich==14.0.0 markdown-it-py==3.0.0 mdurl==0.1.2
 	PYTHONPATH=tests python tests/benchmarks/nerf.py --threads $(CORES)
+
+# One object in scenes of 1, 10 and 100 million points: crop, registration, fusion, completed scene. 9 GB of disk.
+bench-scale: .venv/ready
+	PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --table results/bench/scale.csv
 
 # Writes workflow/schemas/config.schema.yaml and the tables of config/README.md, from the settings dataclasses; nothing in docs/.
 docs: .venv/ready

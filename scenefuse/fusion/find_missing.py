@@ -106,6 +106,8 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     rows = photo_rows(plan, up, frame)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
+    if around_it is not near:
+        missing = replace(missing, notes=(*missing.notes, "points far from the object were thinned to plan stations"))
     content = _report(missing, plan, unit) | {"seconds": quantity(time.perf_counter() - start, "s")}
     write_json(outputs.report, content)
 

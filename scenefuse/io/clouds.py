@@ -1,6 +1,7 @@
 """Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
 
 import re
+import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -245,6 +246,7 @@ def laz_in_parts(
         StageError: the disk is full.
     """
     import laspy
+    import lazrs
     import pyproj
 
     header = laspy.LasHeader(point_format=7, version="1.4")
@@ -268,8 +270,16 @@ def laz_in_parts(
             points[names[name]] = values
         writer.write_points(points)
 
-    with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
-        yield append
+    with atomic_file(path) as temporary:
+        try:
+            with laspy.open(temporary, mode="w", header=header) as writer:
+                yield append
+        except lazrs.LazrsError as error:  # it does not say why, and only writing can fail
+            left = shutil.disk_usage(temporary.parent).free / 1e9
+            raise StageError(
+                f"{path} could not be written ({error}); {left:.3g} GB of its disk are free: free some space and run"
+                " this again"
+            ) from None
 
 
 def _file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:

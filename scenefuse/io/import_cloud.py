@@ -17,6 +17,8 @@ from scenefuse.transforms import Array, Sim3
 
 # Fewer different points give no features to register by.
 LEAST_POINTS = 200
+# Among so many points they are looked for before they are counted among all.
+ENOUGH = 10_000
 # Positions below this share of the points, and above the same share, are strays: they do not move the origin.
 STRAY_PERCENT = 1.0
 # Of a larger cloud, its place is found from every so manyth point: from so many at least.
@@ -141,8 +143,8 @@ def _survey(source: Path, parts: ColumnParts) -> _Survey:
     if count == 0:
         what = "point with a finite position" if left_out else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
-    different = len(np.unique(sample, axis=0))
-    if different < LEAST_POINTS:
+    different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
+    if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
         raise StageError(
             f"{source} has only {different} different positions among its {count} points; {LEAST_POINTS} or more"
             " are needed to place it"

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing
 from scenefuse.io.maps import read_depth, write_depth
+from scenefuse.io.tiles.tiled_cloud import WHOLE
 from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.io.units import length_unit
 from scenefuse.mvs.temporary_workspace import linked_workspace
@@ -27,7 +28,9 @@ FEW_FUSED = 0.01
 MAX_TRAVERSAL_DEPTH = 100
 """Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
 CACHED_MAPS = 64
-"""Depth maps that are kept in memory for the next photo's vote."""
+"""Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50."""
+BYTES_A_PIXEL = 20
+"""Of a photo with its maps."""
 OUTLIER_NEIGHBOURS = 8
 """Neighbours whose mean distance tells a point far from all others."""
 OUTLIER_RATIO = 4.0
@@ -148,6 +151,7 @@ def _fuse(
     Raises:
         StageError: no point at all.
     """
+    most = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
     widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
     with linked_workspace(workspace, beside, widths) as folder:
         for name, source in maps.items():
@@ -161,7 +165,7 @@ def _fuse(
         (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
         path = folder / "fused.ply"
         fused = cancellable(
-            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings), "PLY"
+            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings, most), "PLY"
         )
         if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
             raise _no_points(settings)
@@ -169,8 +173,8 @@ def _fuse(
     return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), 1 - left / max(measured, 1)
 
 
-def _options(settings: DenseCloudSettings) -> pycolmap.StereoFusionOptions:
-    """COLMAP's own settings."""
+def _options(settings: DenseCloudSettings, most_pixels: int) -> pycolmap.StereoFusionOptions:
+    """COLMAP's own settings; most_pixels: of the largest map."""
     options = pycolmap.StereoFusionOptions()
     options.num_threads = 1  # With more, which thread comes first decides the points.
     options.min_num_pixels = settings.min_photos
@@ -178,6 +182,7 @@ def _options(settings: DenseCloudSettings) -> pycolmap.StereoFusionOptions:
     options.max_depth_error = settings.max_depth_error
     options.max_normal_error = settings.max_normal_error_deg
     options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
+    options.use_cache, options.cache_size = True, CACHED_MAPS * most_pixels * BYTES_A_PIXEL / 1e9
     return options
 
 
@@ -230,5 +235,30 @@ def _near_others(points: Array) -> NDArray[np.bool_]:
     """(N,) True where a point's neighbours are about as near as they are for the others."""
     if len(points) <= OUTLIER_NEIGHBOURS:
         return np.ones(len(points), dtype=bool)
-    distance = cKDTree(points).query(points, k=OUTLIER_NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+    distance = neighbour_distance(points)
     return distance <= OUTLIER_RATIO * np.median(distance)
+
+
+def neighbour_distance(points: Array) -> Array:
+    """(N,) mean distance of each point's OUTLIER_NEIGHBOURS neighbours.
+
+    Of a large cloud they are looked for slab by slab; infinite where they are too far off to be near others.
+    """
+    if len(points) <= WHOLE:
+        return _mean_distance(points, points, np.inf)
+    axis = int(np.ptp(points, axis=0).argmax())
+    order = np.argsort(points[:, axis], kind="stable")
+    along, found = points[order, axis], np.empty(len(points))
+    few = points[order[:WHOLE]]
+    # Beyond it, the mean of the neighbours alone is more than OUTLIER_RATIO times that of others.
+    reach = 2 * OUTLIER_RATIO * OUTLIER_NEIGHBOURS * float(np.median(_mean_distance(few, few, np.inf)))
+    for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
+        first, last = np.searchsorted(along, along[rows[[0, -1]]] + np.array([-reach, reach]))
+        found[order[rows]] = _mean_distance(points[order[first:last]], points[order[rows]], reach)
+    return found
+
+
+def _mean_distance(points: Array, at: Array, reach: float) -> Array:
+    """(M,) of the neighbours of some of the points, as far as they are within reach."""
+    neighbours = cKDTree(points).query(at, k=OUTLIER_NEIGHBOURS + 1, distance_upper_bound=reach, workers=threads())
+    return np.asarray(neighbours[0][:, 1:].mean(1))

@@ -1,3 +1,5 @@
+import sys
+
 import numpy as np
 import pytest
 
@@ -89,3 +91,17 @@ def test_concatenate_keeps_what_all_clouds_have():
     )
     assert len(joined) == 53 and joined.normals is None and joined.colors is not None
     assert list(joined.fields) == ["source"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+def test_a_laz_file_that_does_not_fit_is_one_sentence_and_leaves_nothing(tmp_path):
+    import resource
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, limits[1]))
+    try:
+        with pytest.raises(StageError, match=r"a\.laz could not be written .* GB of its disk are free: free"):
+            write_laz(tmp_path / "a.laz", Cloud(np.random.default_rng(0).random((200_000, 3))), np.zeros(3), None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())

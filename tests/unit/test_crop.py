@@ -10,6 +10,8 @@ import pytest
 from support.planted import plant
 
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
+from scenefuse.io.tiles import tiled_cloud, write_tiles
+from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
 from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
@@ -79,6 +81,32 @@ def test_stage_writes_the_crop_and_its_box(tmp_path):
     crop_scene(**files, settings=replace(SETTINGS, whole_scene=True))
     assert len(read_cloud(files["crop"])) == len(trial.scene)
     assert value(read_json(files["report"]), "mode") == "none"
+
+
+def test_the_crop_of_a_large_scene_is_that_of_the_part_around_the_marks(tmp_path, monkeypatch):
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    crop_scene(**files, settings=SETTINGS)
+    alone, report = read_cloud(files["crop"]), read_json(files["report"])
+    far = np.random.default_rng(0).uniform(-1, 1, (60000, 3)) * 40 * trial.diagonal * [1, 1, 0.001]
+    far = far[(np.abs(far[:, :2]) > 4 * trial.diagonal).any(1)]
+    scene = concatenate([Cloud(far), Cloud(trial.scene.points)])
+    for module in (tiled_cloud, write_tiles):
+        monkeypatch.setattr(module, "WHOLE", 2000)
+        monkeypatch.setattr(module, "TILE", 500)
+    write_tiled(files["inputs"].scene, lambda: [scene], len(scene), scene.points)
+    crop_scene(**files, settings=SETTINGS)
+    found = read_cloud(files["crop"])
+    same = np.isin(found.points[:, 0], alone.points[:, 0]).sum()
+    assert same > 0.99 * max(len(found), len(alone))
+    assert value(read_json(files["report"]), "scene_points") == len(scene) > value(report, "scene_points")
+
+
+def test_a_large_scene_without_any_mark_is_one_sentence(tmp_path, monkeypatch):
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
+    monkeypatch.setattr("scenefuse.registration.crop.crop_scene.MOST_WHOLE", 1000)
+    with pytest.raises(StageError, match="nothing marks the object, and the scene has .* mark it"):
+        crop_scene(**stage_files(tmp_path, trial, trial.fiducials), settings=replace(SETTINGS, whole_scene=True))
 
 
 def test_bad_fiducials_end_in_one_sentence(tmp_path):

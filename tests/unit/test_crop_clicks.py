@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.tiles import tiled_cloud, write_tiles
+from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.stage import StageError, read_json, value
@@ -55,7 +57,7 @@ def crop(tmp_path):
         (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + "\n".join(lines) + "\n")
         (tmp_path / "sparse").mkdir(exist_ok=True)
         write_model(tmp_path / "sparse", [view, photo(EYE * [-1, 1, 1], "drone 2.jpg")])
-        write_cloud(tmp_path / "dense.ply", Cloud(points))
+        write_tiled(tmp_path / "dense.ply", lambda: [Cloud(points)], len(points), points)
         inputs = CropInputs(scene=tmp_path / "dense.ply", sparse=tmp_path / "sparse", fiducials=tmp_path / "clicks.tsv")
         report = tmp_path / "crop.json"
         crop_scene(inputs=inputs, crop=tmp_path / "crop.ply", report=report, settings=CropSettings(**settings))
@@ -84,6 +86,22 @@ def test_five_clicks_in_one_photo_cut_out_all_sides_of_the_object(crop):
 def test_clicks_have_the_depth_of_the_nearest_surface(crop):
     report = crop(inside(*CORNERS))[1]
     np.testing.assert_allclose(value(report, "fiducials"), CORNERS, atol=0.35)
+
+
+def test_in_a_large_scene_clicks_find_the_object_in_the_tiles_along_their_rays(crop, monkeypatch):
+    # Ground like the yard's as far as one sees, and a roof behind the photo's back.
+    far = np.random.default_rng(5).uniform([-50, -50, 0], [50, 50, 0.02], (250_000, 3))
+    far = far[(np.abs(far[:, :2]) > 20).any(1)]
+    points = np.concatenate([YARD, far, shell(SIZE, EYE + [4, -6, 3], 3000, 6)])
+    for module in (tiled_cloud, write_tiles):
+        monkeypatch.setattr(module, "WHOLE", 2000)
+        monkeypatch.setattr(module, "TILE", 1000)
+    whole, read = tiled_cloud.TiledCloud.read, []
+    monkeypatch.setattr(tiled_cloud.TiledCloud, "read", lambda *tiles: read.append(len(tiles[1])) or whole(*tiles))
+    kept, report = crop(inside(*CORNERS), points)
+    assert kept[: len(YARD)][OWN].mean() > 0.9 and kept.sum() < 1.02 * kept[: len(YARD)][OWN].sum()
+    np.testing.assert_allclose(value(report, "fiducials"), CORNERS, atol=0.35)
+    assert max(read) < 0.7 * len(points) / 1000
 
 
 BESIDE = np.concatenate([YARD, shell([4, 4, 2.5], [5.0, 0, 1.25], 6000, 2)])

@@ -12,6 +12,7 @@ import torch
 
 from scenefuse.io.clouds import read_cloud
 from scenefuse.io.maps import read_depth, read_normals, write_depth, write_normals
+from scenefuse.mvs import dense_cloud
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.matcher import Matcher
@@ -188,6 +189,15 @@ def test_a_cloud_of_few_of_the_measured_pixels_is_noted(workspace, maps, tmp_pat
     report = read_json(tmp_path / "dense.json")
     assert 0 < value(report, "fused_share") < 0.01
     assert "of the pixels with a depth are in the cloud" in value(report, "notes")[0]
+
+
+def test_neighbours_in_a_large_cloud_are_those_of_the_whole(monkeypatch):
+    points = np.random.default_rng(0).uniform(0, [100, 20, 1], (5000, 3))
+    points[7] = [50, 90, 0]
+    whole = dense_cloud.neighbour_distance(points)
+    monkeypatch.setattr(dense_cloud, "WHOLE", 400)
+    found = dense_cloud.neighbour_distance(points)
+    assert np.isinf(found[7]) and np.array_equal(np.delete(found, 7), np.delete(whole, 7))
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cloud_files import UTM, write_e57
+from support.copc_file import write_copc
 
 from scenefuse.fusion.fuse_object import possible
 from scenefuse.fusion.modes import FusionSettings
@@ -37,7 +38,9 @@ def imported_scene(path, source):
 
 def write_as(path, cloud):
     """The cloud as a file of the path's kind."""
-    if path.suffix in (".laz", ".las"):
+    if path.name.endswith(".copc.laz"):
+        write_copc(path, cloud.points, cloud.colors)
+    elif path.suffix in (".laz", ".las"):
         write_laz(path, Cloud(cloud.points - UTM, None, cloud.colors), UTM, "EPSG:32632")
     elif path.suffix == ".e57":
         write_e57(path, [(cloud.points, cloud.colors, np.array([1.0, 0, 0, 0]), np.zeros(3))])
@@ -58,16 +61,29 @@ def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path
     assert value(report, "points") == 500 and value(report, "source") == name
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.xyz"])
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.xyz", "a.copc.laz"])
 def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkeypatch):
     turned = np.random.default_rng(1).normal(size=(500, 3))
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
     whole, *jsons = imported_scene(tmp_path, source)
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
+    monkeypatch.setattr("scenefuse.io.import_cloud.SAMPLE", 220)  # of which the origin is found
     found, *others = imported_scene(tmp_path, source)
     assert jsons == others and np.array_equal(found.points, whole.points)
     assert np.array_equal(found.colors, cloud.colors)
     assert (found.normals is None) == (name != "a.ply") and np.array_equal(found.normals, whole.normals)
+
+
+def test_a_copc_of_many_nodes_is_read_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr("support.copc_file.NODE_POINTS", 500)
+    rng = np.random.default_rng(2)
+    points, colors = UTM + rng.uniform(0, 40, (9000, 3)) * [1, 1, 0.1], rng.integers(0, 256, (9000, 3)).astype(np.uint8)
+    write_copc(tmp_path / "a.copc.laz", points, colors)
+    found, _, georeference = imported_scene(tmp_path, tmp_path / "a.copc.laz")
+    back = scene_frame(georeference).in_crs(found.points)
+    order, other = np.lexsort(np.round(back, 3).T), np.lexsort(np.round(points, 3).T)
+    assert np.allclose(back[order], points[other], atol=1e-3)
+    assert np.array_equal(found.colors[order], colors[other])
 
 
 def test_colors_of_16_bits_are_told_from_bytes_by_the_whole_file(tmp_path, cloud, monkeypatch):
@@ -79,7 +95,7 @@ def test_colors_of_16_bits_are_told_from_bytes_by_the_whole_file(tmp_path, cloud
     assert imported_scene(tmp_path, tmp_path / "a.ply")[0].colors[-1].tolist() == [255, 1, 0]
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply"])
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.copc.laz"])
 def test_a_file_that_is_cut_short_is_one_sentence(tmp_path, cloud, name, monkeypatch):
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
     source = write_as(tmp_path / name, cloud)

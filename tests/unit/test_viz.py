@@ -287,6 +287,23 @@ def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(ca
     assert view.cloud.points.max() < 10 and len(view.cloud) == len(fused)
 
 
+def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_object(capture, tmp_path, monkeypatch):
+    monkeypatch.setattr("scenefuse.report.view.view_scene.MOST_READ", 2000)
+    scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
+    about = {"sources": quantity({"0": "scene", "1": "box"}, ""), "scene_points": quantity(len(scene), "points")}
+    write_json(tmp_path / "completed.json", about)
+    write_json(tmp_path / "georeference.json", {"length_unit": quantity("m", "")})
+    jsons = {"completed_json": tmp_path / "completed.json", "georeference_json": tmp_path / "georeference.json"}
+    view_scene(dense=capture / "dense.ply", completed=capture / "completed.ply", **jsons, folder=tmp_path / "view")
+    view = read_view(tmp_path / "view")
+    shown, source = view.cloud.fields["shown"], view.cloud.fields["source"]
+    # The same points of the scene before and after, so that none seems to come or go.
+    assert (source == 1).sum() == (shown == AFTER).sum() == len(fused) - len(scene)
+    every = -(-len(scene) // 2000)
+    assert set(shown) == {BOTH, AFTER} and (shown == BOTH).sum() == pytest.approx(len(scene) / every, rel=0.1)
+    assert (view.before_points, view.after_points) == (len(scene), len(fused))
+
+
 def test_a_refused_object_without_a_pose_still_gets_its_figures(capture, tmp_path):
     fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit equally well", "")}
     draw(capture, fine, tmp_path / "figures")

@@ -29,7 +29,7 @@ rule import_scene_cloud:
         "../../envs/registration.yaml"
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
+        runtime=by_size(30, all=0.1),
     params:
         source=cloud_path(scene_row, "scene"),
         files=state_of(cloud_of(scene_row, "scene")),
@@ -58,7 +58,7 @@ rule import_object_cloud:
     conda:
         "../../envs/registration.yaml"
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, all=50),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         source=cloud_path(object_row, "object"),

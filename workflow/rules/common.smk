@@ -241,3 +241,30 @@ def flags(settings):
         values = value if isinstance(value, list) else [value]
         words += [f"--{key.replace('_', '-')}", *(shlex.quote(str(v)) for v in values)]
     return " ".join(words)
+
+
+def by_size(least, **per_mb):
+    """Resources function: so much at least, and so much more for each MB of some inputs, of a folder for each MB in it; more with each
+    attempt. `all` is for all inputs. Before an input is made, Snakemake says <TBD>."""
+
+    def amount(wildcards, input, attempt):
+        inputs = {
+            name: input if name == "all" else input.get(name, []) for name in per_mb
+        }
+        mb = {name: megabytes(files) for name, files in inputs.items()}
+        return attempt * round(least + sum(per_mb[name] * mb[name] for name in per_mb))
+
+    return amount
+
+
+def megabytes(files):
+    """The size of a file, of what is in a folder, or of several."""
+    paths = [Path(file) for file in ([files] if isinstance(files, str) else files)]
+    inside = [
+        file
+        for path in paths
+        if path.is_dir()
+        for file in path.rglob("*")
+        if file.is_file()
+    ]
+    return sum(os.path.getsize(path) for path in [*paths, *inside]) / 1e6

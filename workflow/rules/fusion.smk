@@ -33,7 +33,7 @@ rule fuse_object:
         "../../envs/registration.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        mem_mb=by_size(5000, cloud=10),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=settings("fusion"),
@@ -75,7 +75,7 @@ rule find_missing:
         "../../envs/registration.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, cloud=10),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         photos=options_of("object_workspace", "scene_workspace", "masks"),
@@ -109,8 +109,8 @@ rule complete_scene:
     conda:
         "../../envs/registration.yaml"
     resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
-        runtime=lambda wildcards, attempt: 60 * attempt,
+        mem_mb=by_size(3000, objects=4, checked=4),
+        runtime=by_size(60, scene=0.05),
     params:
         objects=object_folders,
         script=script("fusion/complete_scene.py"),
@@ -140,7 +140,7 @@ use rule complete_scene as complete_scene_with_object with:
     benchmark:
         "results/benchmarks/complete_scene_with_object/{object}.tsv"
     params:
-        objects="results/objects/{object}",
+        objects=lambda wildcards: f"results/objects/{wildcards.object}",
         script=script("fusion/complete_scene.py"),
         code=code("fusion/complete_scene.py"),
     message:

@@ -66,8 +66,8 @@ rule fuse_depth_maps:
         "../../envs/reconstruction.yaml"
     threads: SCENE_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 8000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
+        mem_mb=by_size(8000, depth=0.5),
+        runtime=by_size(120, depth=0.05),
     params:
         options=settings("scene.dense_cloud"),
         script=script("mvs/fuse_depth_maps.py"),

@@ -31,7 +31,7 @@ rule draw_scene:
         "../../envs/report.yaml"
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
+        runtime=by_size(30, cloud=0.002),
     params:
         objects=object_folders,
         cameras=options_of("georeferenced"),
@@ -82,7 +82,7 @@ rule draw_object:
     conda:
         "../../envs/report.yaml"
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, cloud=10),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         photos=options_of("workspace", "masks", "stages"),
@@ -115,7 +115,7 @@ rule view_scene:
         "../../envs/report.yaml"
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
+        runtime=by_size(30, completed=0.002),
     params:
         script=script("report/view_scene.py"),
         code=code("report/view_scene.py"),

@@ -60,7 +60,7 @@ def write_tiled(path: Path, parts: Parts, count: int, sample: Array) -> None:
     low, high = np.full((len(tiles), 3), np.inf), np.full((len(tiles), 3), -np.inf)
     row = records_of(like, path).dtype
     with reserved(path, row, count, len(tiles)) as (file, offset):
-        for part in parts():
+        for part in (part for part in parts() if len(part)):
             cells = grid.cells(part.points)
             order = np.argsort(cells, kind="stable")
             records, points, cells = records_of(part, path)[order], part.points[order], cells[order]
@@ -68,11 +68,13 @@ def write_tiled(path: Path, parts: Parts, count: int, sample: Array) -> None:
             np.minimum.at(low, tile_of[cells[first]], np.minimum.reduceat(points, first))
             np.maximum.at(high, tile_of[cells[first]], np.maximum.reduceat(points, first))
             for cell, start, end in zip(cells[first], first, np.append(first[1:], len(cells))):
-                os.pwrite(file.fileno(), records[start:end].tobytes(), offset + int(begins[cell]) * row.itemsize)
+                file.seek(offset + int(begins[cell]) * row.itemsize)
+                file.write(records[start:end].tobytes())
                 begins[cell] += end - start
         for name, values in zip(BOX, np.concatenate([low, high], axis=1).T):
             table[name] = values
-        os.pwrite(file.fileno(), table.tobytes(), offset + count * row.itemsize)
+        file.seek(offset + count * row.itemsize)
+        file.write(table.tobytes())
 
 
 @contextmanager

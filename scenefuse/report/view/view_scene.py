@@ -50,7 +50,8 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     unit = length_unit(georeference_json)
     view = View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, *counts)
     write_view(folder, view)
-    print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points", flush=True)
+    of = "" if every == 1 else f"; of the scene away from its objects one in {every} was looked at"
+    print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points{of}", flush=True)
 
 
 def _objects(completed: TiledCloud, scene_points: int) -> list[tuple[Array, Array]]:
