@@ -116,7 +116,7 @@ def join(folder: Path, of: Path, scene: Path, fiducials: Path, settings: dict[st
     clouds = Inputs(folder / "object.ply", crop, crop.with_suffix(".json"), of / "undistorted.json")
     register_as_paper(
         inputs=clouds, scale_report=folder / "scale.json", coarse_report=folder / "coarse.json", report=fine,
-        picture=folder / "fine.png", seed=settings["seed"],
+        picture=folder / "fine.png", scale="ransac_svd", seed=settings["seed"],
     )  # fmt: skip
     ways = {"fused": "fused.ply", "fused_scene": "fused_scene.ply", "fused_laz": "fused_scene.laz"}
     ways |= {"checked": "checked.ply", "evidence": "evidence.json", "report": "fusion.json"}
