@@ -81,7 +81,8 @@ def register_as_paper(
     start = time.perf_counter()
     obj, scene = inputs.clouds()
     ups = inputs.ups()
-    ledger, said = estimates(obj, scene, ups), []
+    ledger = estimates(obj, scene, ups)
+    said: list[str] = []
     if scale == "ransac_svd":
         matched, said = matched_scale(obj, scene, seed)
         ledger = [Estimate(scale, ledger[0].scale if matched is None else matched, True), *ledger]
