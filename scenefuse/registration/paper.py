@@ -50,8 +50,9 @@ RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
 MUTUAL_SHARE = 0.1
-# Matches that determine a similarity.
-LEAST_MATCHES = 3
+# Matches that determine a similarity, and how much the sizes of object and crop, which is cut to it, may differ then:
+# matches that are wrong shrink the object into a spot.
+LEAST_MATCHES, LARGEST_FACTOR = 3, 2.0
 
 
 def register_as_paper(
@@ -85,7 +86,10 @@ def register_as_paper(
     said: list[str] = []
     if scale == "ransac_svd":
         matched, said = matched_scale(obj, scene, seed)
-        ledger = [Estimate(scale, ledger[0].scale if matched is None else matched, True), *ledger]
+        if matched is None:
+            scale = "rms"
+        else:
+            ledger = [Estimate(scale, matched, True), *ledger]
     problem = Problem(obj, scene, ScaleRange(ledger[0].scale, 0.0), Evidence(ups), seed)
     pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
@@ -160,12 +164,16 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
             registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),
         )
     pairs = np.asarray(result.correspondence_set)
-    if len(pairs) < LEAST_MATCHES:
-        note = f"{len(pairs)} matches agree on a similarity: the scale is the RMS ratio of the whole clouds"
+    matched = np.asarray(source.points)[pairs[:, 0]], np.asarray(target.points)[pairs[:, 1]]
+    ratio = rms(matched[1]) / rms(matched[0]) if len(pairs) >= LEAST_MATCHES else 0.0
+    if not 1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR:
+        note = (
+            f"{len(pairs)} matches make the object {ratio:.2g} times as large as the crop, more than a factor of"
+            f" {LARGEST_FACTOR:g} off: the scale is the RMS ratio of the whole clouds"
+        )
         print(note, flush=True)
         return None, [note]
-    matched = np.asarray(source.points)[pairs[:, 0]], np.asarray(target.points)[pairs[:, 1]]
-    return rms(matched[1]) / rms(matched[0]) * scene.diagonal / cloud.diagonal, []
+    return ratio * scene.diagonal / cloud.diagonal, []
 
 
 def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:

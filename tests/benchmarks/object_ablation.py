@@ -53,7 +53,7 @@ VARIANTS = {
     "poses_refined": Variant(nerf={"pose_learning_rate": POSE_RATE}),
     "no_adaptive_grid": Variant(nerf={"edge_boost": 0}),
     "adaptive_steps": Variant(nerf={"edge_boost": 0, "edge_rate": 1.0}),
-    "order_of_all": Variant(nerf={"order_of_all": True, "rank_weight": 0.1}),
+    "order_of_all": Variant(nerf={"order_of_all": True}),
     "no_samples_at_prior": Variant(nerf={"prior_share": 0.0}),
     "stage2_longer": Variant(long=True),
 }

@@ -93,6 +93,17 @@ def test_the_scale_of_matches_is_that_of_a_copy(copied, seed):
     assert scale == pytest.approx(pose.scale, rel=0.05) and notes == []
 
 
+def test_matches_that_shrink_the_object_give_no_scale_and_say_so(copied, monkeypatch, capsys):
+    ball = np.random.default_rng(0).normal(size=(3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    found = SimpleNamespace(correspondence_set=np.array([[0, 5], [9, 5], [20, 5], [30, 6]]))
+    name = "registration_ransac_based_on_feature_matching"
+    monkeypatch.setattr(o3d.pipelines.registration, name, lambda *_: found)
+    scale, notes = matched_scale(Cloud(ball), copied[1], 0)
+    assert scale is None and "the scale is the RMS ratio of the whole clouds" in notes[0]
+    assert notes[0] in capsys.readouterr().out
+
+
 def test_the_papers_recipe_finds_the_pose_of_a_copy(copied):
     obj, scene, pose = copied
     found, _ = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Evidence(), seed=0))
