@@ -55,6 +55,7 @@ VARIANTS = {
     "adaptive_steps": Variant(nerf={"edge_boost": 0, "edge_rate": 1.0}),
     "order_of_all": Variant(nerf={"order_of_all": True}),
     "no_samples_at_prior": Variant(nerf={"prior_share": 0.0}),
+    "papers_rates": Variant(nerf={"learning_rate": 1e-3, "grid_learning_rate": 1e-3, "warmup_epochs": 2}),
     "stage2_longer": Variant(long=True),
 }
 
