@@ -1,7 +1,7 @@
 """Poses chained from a pose network, frame after frame, and brought into the frame that masks and registration use."""
 
 import shutil
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +19,6 @@ from scenefuse.transforms import Array, Sim3, fit_sim3
 from scenefuse.workspace import read_workspace, write_model
 
 
-@dataclass(frozen=True)
-class Chain:
-    """Poses of V frames.
-
-    Attributes:
-        own: (V, 4, 4) first_from_cam, in the networks' unit.
-        placed: (V, 4, 4) object_from_cam: the same after one similarity, which fits their centres to those of SfM.
-        object_from_first: that similarity; its scale is object units per unit of the networks.
-    """
-
-    own: Array
-    placed: Array
-    object_from_first: Sim3
-
-
 @torch.no_grad()
 def chained(network: PoseNetwork, frames: DepthPhotos) -> Array:
     """(V, 4, 4) poses in the frame of the first camera: the motions between consecutive frames one after the other."""
@@ -45,8 +30,11 @@ def chained(network: PoseNetwork, frames: DepthPhotos) -> Array:
     return np.stack(poses)
 
 
-def place_chain(own: Array, known: Array) -> Chain:
+def place_chain(own: Array, known: Array) -> tuple[Array, Sim3]:
     """Lay a chain (V, 4, 4) on SfM's poses (V, 4, 4) by one similarity: masks and gravity count in their frame.
+
+    Returns:
+        (V, 4, 4) object_from_cam, and object_from_first; its scale is object units per unit of the networks.
 
     Raises:
         StageError: the chain does not move, or along one line only.
@@ -61,7 +49,7 @@ def place_chain(own: Array, known: Array) -> Chain:
         ) from None
     placed = own.copy()
     placed[:, :3, :3], placed[:, :3, 3] = fit.rotation @ own[:, :3, :3], fit.apply(own[:, :3, 3])
-    return Chain(own, placed, fit)
+    return placed, fit
 
 
 def write_posed(workspace: Path, posed: Path, views: Views, poses: Array) -> None:
@@ -75,14 +63,14 @@ def write_posed(workspace: Path, posed: Path, views: Views, poses: Array) -> Non
         write_model(folder / "sparse", moved)
 
 
-def chain_quantities(chain: Chain, known: Array, pose_source: str) -> dict[str, Any]:
-    """How far the chain is from SfM's poses (V, 4, 4), and what later stages read of poses.json."""
-    rotations, centres = chain.placed[:, :3, :3], chain.placed[:, :3, 3]
+def chain_quantities(own: Array, known: Array, used: Array, pose_source: str) -> dict[str, Any]:
+    """How far a chain is from SfM's poses, all (V, 4, 4), and what later stages read of those that are used."""
+    error = trajectory_error("chain", own, known)
     return {
         "pose_source": quantity(pose_source, ""),
         "photos_with_pose": quantity(len(known), "1"),
-        "unit": quantity(chain.object_from_first.scale, "object units per unit of the networks"),
+        "chain_is_a_trajectory": quantity(bool(error), ""),
         "frame": quantity("sfm", ""),
-        "up_in_camera_frame": quantity(estimate_up(rotations, centres)[0], "1"),
-        **trajectory_error("chain", chain.own, known),
+        "up_in_camera_frame": quantity(estimate_up(used[:, :3, :3], used[:, :3, 3])[0], "1"),
+        **error,
     }

@@ -19,7 +19,7 @@ from scenefuse.depth.pose_network import pose_quantities
 from scenefuse.depth.self_supervision import sample
 from scenefuse.depth.training import Networks, loss_quantities, optimise, predict, prepare_torch, save_networks
 from scenefuse.mvs.views import Views, load_views
-from scenefuse.paper.chain import Chain, chain_quantities, chained, place_chain, write_posed
+from scenefuse.paper.chain import chain_quantities, chained, place_chain, write_posed
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
@@ -54,14 +54,14 @@ class Placed:
     """What the networks say, in the object's frame.
 
     Attributes:
-        chain: of the pose network.
+        chain: (V, 4, 4) first_from_cam of the pose network, in its unit.
         poses: (V, 4, 4) object_from_cam that later stages use: the chain's or SfM's.
         depth: (V, 1, H, W) in object units.
         unit: object units per unit of the networks.
         measured: the photos at these poses, with SfM's points to measure residuals at.
     """
 
-    chain: Chain
+    chain: Array
     poses: Array
     depth: Tensor
     unit: float
@@ -142,10 +142,11 @@ def place(
     raw: Tensor, networks: Networks, frames: DepthPhotos, views: Views, pose_source: PoseSource, seed: int
 ) -> Placed:
     """Depths (V, 1, H, W) and poses of the networks in the object's frame; errors as of `estimate_as_paper`."""
-    chain = place_chain(chained(networks.pose, frames), views.object_from_cam)
+    chain = chained(networks.pose, frames)
     if pose_source == "chain":
-        unit = chain.object_from_first.scale
-        return Placed(chain, chain.placed, raw * unit, unit, photos_at(chain.placed, views, frames))
+        poses, object_from_first = place_chain(chain, views.object_from_cam)
+        unit = object_from_first.scale
+        return Placed(chain, poses, raw * unit, unit, photos_at(poses, views, frames))
     known = photos_at(views.object_from_cam, views, frames)
     unit = median_ratio(raw, known)
     return Placed(chain, views.object_from_cam, align_maps(raw * unit, known, seed), unit, known)
@@ -191,12 +192,13 @@ def write_stage(
         write_maps(folder, whole_frames(views), depth, consistency.confidence)
         save_networks(folder / "networks.pt", networks, asdict(settings) | {"unit": placed.unit})
     write_posed(workspace, outputs.posed, views, placed.poses)
-    chain = chain_quantities(placed.chain, views.object_from_cam, pose_source)
+    chain = chain_quantities(placed.chain, views.object_from_cam, placed.poses, pose_source)
     write_json(outputs.posed_json, chain)
     aligned = align_maps(placed.depth, measured, 0)
     residuals = np.concatenate(residuals_at_points(aligned, measured.checks))
     return {
         **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
+        "unit": quantity(placed.unit, "object units per unit of the networks"),
         **map_quantities(depth, consistency, measured),
         "residual_each_map_aligned": quantity(float(np.median(residuals)) if len(residuals) else None, "1"),
     }

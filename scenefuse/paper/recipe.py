@@ -25,7 +25,7 @@ NERF = NerfRecipe(
     prior_share=0.0,
     appearance=False,
 )
-# It gives no weights. The distortion is not among its losses; the ranking weighs as much as the mask.
-LOSSES = LossWeights(rank_weight=0.1, distortion_weight=0.0)
+# It gives no weights: they are the shipped ones. The distortion is not among its losses.
+LOSSES = LossWeights(distortion_weight=0.0)
 # Where there is a GPU: instant-ngp's field, which the paper's encoding is. On a CPU, the field of `object.nerf`.
 FIELD = FieldSettings(levels=16, log2_table=19, finest=2048, width=64)

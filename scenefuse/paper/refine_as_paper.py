@@ -12,7 +12,7 @@ from scenefuse.depth.pose_network import pose_quantities
 from scenefuse.depth.refine_depth import EarlierStages, blend_depths, read_rendered
 from scenefuse.depth.training import load_networks, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.mvs.views import load_views
-from scenefuse.paper.chain import chained, place_chain
+from scenefuse.paper.chain import chained
 from scenefuse.paper.estimate_as_paper import (
     PoseSource,
     StageOutputs,
@@ -76,7 +76,7 @@ def refine_as_paper(
     used = load_views(poses, masks, state["settings"]["width_px"], hold_out_every).object_from_cam
     frames, networks = frames_of(views, device), new_monocular_networks(device)
     networks.load(state)
-    crops, before = whole_frames(views), place_chain(chained(networks.pose, frames), views.object_from_cam)
+    crops, before = whole_frames(views), chained(networks.pose, frames)
     predicted, _ = read_maps(earlier.previous, crops, device)
     rendered = read_rendered(earlier.rendered, *read_maps(earlier.rendered, crops, device)) * frames.masks
     blend = blend_depths(predicted, rendered, photos_at(used, views, frames))
@@ -90,7 +90,7 @@ def refine_as_paper(
     content = {
         **{name: quantity(share, "1") for name, share in blend.shares.items()},
         "steps": quantity(recipe.steps(frames), "1"),
-        "poses_moved_over_extent": quantity(shift_over_extent(before.placed, placed.chain.placed), "1"),
+        "chain_moved_over_extent": quantity(shift_over_extent(before, placed.chain), "1"),
         **write_stage(outputs, workspace, views, networks, placed, settings, pose_source),
         **loss_quantities(losses),
         **pose_quantities(networks.pose, frames, in_unit(views.object_from_cam, placed.unit)),
@@ -103,5 +103,5 @@ def refine_as_paper(
 
 def shift_over_extent(before: Array, after: Array) -> float:
     """Root mean square shift of the centres of poses (V, 4, 4), as a share of their extent."""
-    extent = np.linalg.norm(np.ptp(before[:, :3, 3], axis=0))
+    extent = max(float(np.linalg.norm(np.ptp(before[:, :3, 3], axis=0))), 1e-9)
     return float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(1).mean()) / extent)

@@ -84,8 +84,8 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
     """
     even_obj, even_scene = (voxel_downsample(c, EVEN_FRACTION * c.diagonal).points for c in (obj, scene))
     found = [
-        Estimate("rms", _rms(scene.points) / _rms(obj.points), False),
-        Estimate("rms_even", _rms(even_scene) / _rms(even_obj), True),
+        Estimate("rms", rms(scene.points) / rms(obj.points), False),
+        Estimate("rms_even", rms(even_scene) / rms(even_obj), True),
     ]
     if ups is None:
         extents = {"hull": [_hull_size(p) for p in (even_obj, even_scene)]}
@@ -114,7 +114,7 @@ def prior(ledger: list[Estimate], settings: ScaleSettings) -> ScaleRange:
     return ScaleRange(centre, settings.width_log)
 
 
-def _rms(points: Array) -> float:
+def rms(points: Array) -> float:
     """Root mean square distance of points from their centroid."""
     return float(np.sqrt(((points - points.mean(0)) ** 2).sum(1).mean()))
 

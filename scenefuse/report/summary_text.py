@@ -28,6 +28,7 @@ _COLUMNS = ("value", *BESIDE)
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
 _CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "mode", "workspace", "kept", "kernels")
+_CHOICES += ("pose_source",)
 
 
 def summary_text(

@@ -227,7 +227,7 @@ def test_training_mends_a_wrong_first_depth_and_the_pose_network_learns_the_pose
 
     def depth_off():
         depth = predict(networks.depth, photos, supervision)[:, 0].numpy()
-        return np.median(np.abs(depth / truth - 1.0)[views.masks])
+        return np.median(np.abs(depth[views.masks] / truth[views.masks] - 1.0))
 
     def turned_off():
         found = pose_quantities(networks.pose, photos, views.object_from_cam)

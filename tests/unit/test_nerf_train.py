@@ -120,10 +120,11 @@ def test_training_finds_the_sphere(sphere):
     assert result["steps"] == 400
 
 
-def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch):
-    whole = _train(sphere, steps=24)[0]
-    assert torch.equal(whole.field.table, _train(sphere, steps=24)[0].field.table)
-    assert not torch.equal(whole.field.table, _train(sphere, steps=24, seed=1)[0].field.table)
+@pytest.mark.parametrize("edge_rate", [0.0, 1.0])
+def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch, edge_rate):
+    whole = _train(sphere, steps=24, edge_rate=edge_rate)[0]
+    assert torch.equal(whole.field.table, _train(sphere, steps=24, edge_rate=edge_rate)[0].field.table)
+    assert not torch.equal(whole.field.table, _train(sphere, steps=24, edge_rate=edge_rate, seed=1)[0].field.table)
 
     def draw_and_end_at_ten(*arguments):
         if arguments[3] == 10:
@@ -133,11 +134,11 @@ def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, mon
     monkeypatch.setattr(training_module, "draw_batch", draw_and_end_at_ten)
     checkpoint = tmp_path / "state.pt"
     with pytest.raises(SystemExit):
-        _train(sphere, steps=24, checkpoint=checkpoint)
+        _train(sphere, steps=24, edge_rate=edge_rate, checkpoint=checkpoint)
     assert torch.load(checkpoint, weights_only=True)["step"] == 11
     monkeypatch.setattr(training_module, "draw_batch", draw_batch)
     lines = []
-    resumed = _train(sphere, steps=24, checkpoint=checkpoint, report=lines.append)[0]
+    resumed = _train(sphere, steps=24, edge_rate=edge_rate, checkpoint=checkpoint, report=lines.append)[0]
     assert "resumed at step 11 of 24" in lines[0]
     assert torch.equal(whole.field.table, resumed.field.table)
     assert torch.equal(whole.occupancy.density, resumed.occupancy.density)

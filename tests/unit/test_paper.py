@@ -5,12 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import open3d as o3d
 import pytest
+from support.planted import plant
 
-from scenefuse.io.clouds import Cloud
+from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.paper import paper_coarse, paper_fine
-from scenefuse.registration.problem import Evidence, Problem
-from scenefuse.transforms import Sim3
+from scenefuse.registration.paper import matched_scale, paper_coarse, paper_fine, register_as_paper
+from scenefuse.registration.problem import Evidence, Inputs, Problem
+from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.transforms import Sim3, rotation_angle_deg, rotation_between
 
 SCALE = 2.5
 
@@ -73,6 +75,57 @@ def test_icp_pairs_points_within_two_fifths_of_a_voxel_for_35_iterations_and_hol
     assert np.allclose(target.points, thinned(scene.points, voxel / 2))
     assert distance == pytest.approx(0.4 * voxel) and np.array_equal(first, np.eye(4))
     assert criteria.max_iteration == 35 and not estimation.with_scaling
+
+
+@pytest.fixture
+def copied():
+    """A house in its own unit, and a turned, larger copy of it made of other points, with scene_from_object."""
+    house = plant("house", 0, coverage=1.0, object_points=8000, depth_maps=False).object.points
+    turn = rotation_between(np.array([1.0, 0.0, 0.0]), np.array([0.6, 0.8, 0.0]))
+    pose = Sim3(SCALE, turn, np.array([4.0, -2.0, 1.0]))
+    return Cloud(house[::2]), Cloud(pose.apply(house[1::2])), pose
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_scale_of_matches_is_that_of_a_copy(copied, seed):
+    obj, scene, pose = copied
+    scale, notes = matched_scale(obj, scene, seed)
+    assert scale == pytest.approx(pose.scale, rel=0.05) and notes == []
+
+
+def test_matches_that_shrink_the_object_give_no_scale_and_say_so(copied, monkeypatch, capsys):
+    ball = np.random.default_rng(0).normal(size=(3000, 3))
+    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
+    found = SimpleNamespace(correspondence_set=np.array([[0, 5], [9, 5], [20, 5], [30, 6]]))
+    name = "registration_ransac_based_on_feature_matching"
+    monkeypatch.setattr(o3d.pipelines.registration, name, lambda *_: found)
+    scale, notes = matched_scale(Cloud(ball), copied[1], 0)
+    assert scale is None and "the scale is the RMS ratio of the whole clouds" in notes[0]
+    assert notes[0] in capsys.readouterr().out
+
+
+def test_the_papers_recipe_finds_the_pose_of_a_copy(copied):
+    obj, scene, pose = copied
+    found, _ = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Evidence(), seed=0))
+    found = paper_fine(obj, scene, found)
+    assert rotation_angle_deg(found.rotation @ pose.rotation.T) < 3
+    off = np.linalg.norm(found.apply(obj.points) - pose.apply(obj.points), axis=1)
+    assert off.max() < 0.03 * diagonal(scene.points)
+
+
+def test_scale_by_matches_is_held_and_the_ratio_of_whole_clouds_stands_beside_it(copied, tmp_path):
+    obj, scene, pose = copied
+    write_cloud(tmp_path / "object.ply", obj)
+    write_cloud(tmp_path / "crop.ply", scene)
+    write_json(tmp_path / "crop.json", {"diagonal": quantity(1.0, "m")})
+    reports = {name: tmp_path / f"{name}.json" for name in ("scale_report", "coarse_report", "report")}
+    inputs = Inputs(tmp_path / "object.ply", tmp_path / "crop.ply", tmp_path / "crop.json")
+    register_as_paper(inputs=inputs, **reports, scale="ransac_svd", seed=0)
+    said, fine = read_json(reports["scale_report"]), read_json(reports["report"])
+    ledger = {row["name"]: row for row in value(said, "ledger")}
+    assert value(said, "method") == "ransac_svd" and ledger["ransac_svd"]["used"] and not ledger["rms"]["used"]
+    assert value(said, "scale") == ledger["ransac_svd"]["scale"] == pytest.approx(value(fine, "scale"))
+    assert ledger["rms"]["scale"] == pytest.approx(pose.scale, rel=0.02)
 
 
 @pytest.mark.parametrize(("shapes", "notes"), [("alike", 0), ("unlike", 1)])

@@ -2,22 +2,28 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
+import pycolmap
 import pytest
 import torch
 import yaml
+from support.painted_sphere import CENTER, RADIUS, sphere_views
 from support.sideways_video import SHIFT_PX, sideways_video
 from support.textured_plane import plane_views
 
 from scenefuse.depth import training
 from scenefuse.depth.pose_network import small_photos
-from scenefuse.depth.training import Recipe, optimise, predict
+from scenefuse.depth.refine_depth import EarlierStages
+from scenefuse.depth.training import Recipe, load_networks, optimise, predict
 from scenefuse.io.settings import ROOT, read_settings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
+from scenefuse.nerf.training import Schedule
 from scenefuse.paper import recipe
+from scenefuse.paper import train_nerf_as_paper as nerf_stage
 from scenefuse.paper.chain import chained, place_chain
-from scenefuse.paper.estimate_as_paper import few_frames, place
+from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper, few_frames, place
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
@@ -27,9 +33,11 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
-from scenefuse.paper.train_nerf_as_paper import as_paper
-from scenefuse.stage import StageError
+from scenefuse.paper.refine_as_paper import refine_as_paper
+from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
+from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3, rotation_between
+from scenefuse.workspace import View, read_workspace
 
 CPU = torch.device("cpu")
 
@@ -138,8 +146,8 @@ def test_a_chain_of_true_motions_is_the_trajectory_and_a_similarity_places_it():
     assert np.allclose(own, np.linalg.inv(poses[0]) @ poses, atol=1e-6)
     known = poses.copy()
     known[:, :3, :3], known[:, :3, 3] = fit.rotation @ poses[:, :3, :3], fit.apply(poses[:, :3, 3])
-    chain = place_chain(own, known)
-    assert np.allclose(chain.placed, known, atol=1e-6) and chain.object_from_first.scale == pytest.approx(2.5)
+    placed, object_from_first = place_chain(own, known)
+    assert np.allclose(placed, known, atol=1e-6) and object_from_first.scale == pytest.approx(2.5)
 
 
 @pytest.mark.parametrize("source", ["chain", "sfm"])
@@ -177,3 +185,73 @@ def test_bad_videos_are_one_sentence():
 def test_fewer_frames_than_a_batch_are_said(capsys):
     assert few_frames(24) == [] and "23 frames are fewer than the paper's batch" in few_frames(23)[0]
     assert "23 frames" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def ball(tmp_path_factory):
+    """A workspace of the painted sphere, with masks and some SfM points."""
+    root = tmp_path_factory.mktemp("ball")
+    images, masks, k, poses, depths = sphere_views()
+    for folder in ("undistorted/images", "undistorted/sparse", "masks"):
+        (root / folder).mkdir(parents=True)
+    points = CENTER + RADIUS * (lambda x: x / np.linalg.norm(x, axis=1, keepdims=True))(
+        np.random.default_rng(0).normal(size=(60, 3))
+    )
+    model = pycolmap.Reconstruction()
+    size = images.shape[1]
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(model="PINHOLE", width=size, height=size, params=[size, size, size / 2, size / 2], camera_id=1)
+    )
+    tracks: list[list[pycolmap.TrackElement]] = [[] for _ in points]
+    for number, (image, mask, pose) in enumerate(zip(images, masks, poses), 1):
+        name = f"{number:02d}.png"
+        cv2.imwrite(str(root / "undistorted/images" / name), image[..., ::-1])
+        cv2.imwrite(str(root / "masks" / name), mask.astype(np.uint8) * 255)
+        view = View(name, k[0], np.linalg.inv(pose), size, size)
+        seen = np.flatnonzero(((points - CENTER) * (pose[:3, 3] - points)).sum(1) > 0)
+        at = [pycolmap.Point2D(pixel) for pixel in view.project(points)[0][seen]]
+        taken = pycolmap.Image(name=name, camera_id=1, image_id=number, points2D=pycolmap.Point2DList(at))
+        model.add_image_with_trivial_frame(taken, pycolmap.Rigid3d(view.cam_from_world[:3]))
+        for place_in_photo, point in enumerate(seen):
+            tracks[point].append(pycolmap.TrackElement(number, place_in_photo))
+    for point, track in zip(points, tracks):
+        model.add_point3D(point, pycolmap.Track(track), np.zeros(3, np.uint8))
+    model.write(root / "undistorted/sparse")
+    return root
+
+
+def test_all_stages_run_from_sfm_poses_and_stage_3_refines_both_networks(ball, tmp_path, monkeypatch):
+    # A hash grid learns too little in a test's few steps at the paper's rate.
+    fast = replace(recipe.NERF, learning_rate=1e-2, grid_learning_rate=2e-2, rays_per_image=20, occupancy_cells=32)
+    monkeypatch.setattr(nerf_stage, "NERF", fast)
+    given = {"masks": ball / "masks", "hold_out_every": 4, "seed": 0}
+
+    def outputs(stage, posed):
+        return StageOutputs(tmp_path / stage, tmp_path / f"{stage}.json", tmp_path / posed, tmp_path / f"{posed}.json")
+
+    def nerf(stage, prior, posed):
+        field = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
+        settings = NerfSettings(device="cpu", width_px=48, field=field, schedule=Schedule(20, 6000))
+        train_nerf_as_paper(
+            workspace=tmp_path / posed, prior=tmp_path / prior, stage=tmp_path / stage,
+            report=tmp_path / f"{stage}.json", checkpoints=tmp_path / "checkpoints", settings=settings, **given,
+        )  # fmt: skip
+
+    common = {"workspace": ball / "undistorted", "pose_source": "sfm", "checkpoints": tmp_path / "checkpoints"}
+    estimate_as_paper(outputs=outputs("stage1", "poses"), settings=MonocularSettings(2), **common, **given)
+    nerf("stage2", "stage1", "poses")
+    refine_as_paper(
+        poses=tmp_path / "poses", earlier=EarlierStages(tmp_path / "stage1", tmp_path / "stage2"),
+        outputs=outputs("stage3", "refined_poses"), settings=MonocularSettings(2), **common, **given,
+    )  # fmt: skip
+    nerf("stage4", "stage3", "refined_poses")
+    first, refined, last = (read_json(tmp_path / f"{stage}.json") for stage in ("stage1", "stage3", "stage4"))
+    assert value(first, "pose_source") == value(refined, "pose_source") == "sfm"
+    assert "9 frames are fewer" in value(first, "notes")[0] and value(refined, "rendered_share") > 0
+    assert value(refined, "chain_moved_over_extent") > 0
+    before, after = (load_networks(tmp_path / stage / "networks.pt") for stage in ("stage1", "stage3"))
+    for name in ("depth", "pose"):
+        assert any(not torch.equal(before[name][key], after[name][key]) for key in before[name])
+    assert not value(last, "started_from_previous") and not value(last, "field_is_the_papers")
+    assert value(last, "rays_per_epoch_paper") >= value(last, "rays_per_epoch") == 6000
+    assert [view.name for view in read_workspace(tmp_path / "refined_poses").views][:2] == ["01.png", "02.png"]

@@ -185,7 +185,7 @@ use rule make_object_cloud as make_cloud_as_paper with:
 
 
 use rule register_as_paper as register_for_fusion_as_paper with:
-    # The paper's registration is the one that is fused.
+    # The paper's registration is the one that is fused; its scale is that of its text (R2).
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
@@ -201,3 +201,9 @@ use rule register_as_paper as register_for_fusion_as_paper with:
         "results/logs/register_for_fusion_as_paper/{object}.log",
     benchmark:
         "results/benchmarks/register_for_fusion_as_paper/{object}.tsv"
+    params:
+        options="--scale ransac_svd",
+        gravity=options_of("workspace_json"),
+        seed=config["seed"],
+        script=script("registration/register_as_paper.py"),
+        code=code("registration/register_as_paper.py"),

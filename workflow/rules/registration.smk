@@ -225,6 +225,7 @@ rule register_as_paper:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
+        options="--scale rms",
         gravity=options_of("workspace_json"),
         seed=config["seed"],
         script=script("registration/register_as_paper.py"),
@@ -234,7 +235,7 @@ rule register_as_paper:
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
         " {params.gravity} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
-        " --picture {output.picture} --seed {params.seed} &> {log}"
+        " --picture {output.picture} --seed {params.seed} {params.options} &> {log}"
 
 
 rule write_frame_ledger:
