@@ -98,12 +98,13 @@ def georeference(
         there, where = frame.apply(positions), str(control.path)
         placement, notes = place_by_control(control.sightings, there, up, where, seed)
         if by_gps:
-            placement = beside_gps(placement, control.sightings, there, gps, frame.apply(gps.positions), where)
+            positions = frame.apply(gps.positions)
+            placement = beside_gps(placement, control.sightings, there, gps, positions, where, settings)
         return Georeference(placement, frame, gps, replace(control, notes=[*control.notes, *notes]))
     if by_gps:
         frame = local_frame(gps.positions)
-        typical = replace(settings, gps_accuracy_m=float(np.median(gps.sd_m[:, 0])))
-        return Georeference(place_by_gps(gps.centres, frame.apply(gps.positions), up, typical, seed), frame, gps)
+        there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
+        return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m), frame, gps)
     reason = f"{len(gps.names)} registered photos have a GPS position, {MIN_GPS_PHOTOS} are needed"
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 

@@ -110,8 +110,15 @@ def read_capture(folder: Path) -> Capture:
     return Capture(read_model(folder / "sparse"), lens, read_photos(folder / "photos.json"))
 
 
-def leave_one_out(photos: Path, control: Path, work: Path) -> None:
-    """Make each control point a check point in turn, and compare where its clicks put it with its coordinates."""
+def leave_one_out(photos: Path, control: Path, work: Path, sd_m: float | None = None) -> None:
+    """Make each control point a check point in turn, and compare where its clicks put it with its coordinates.
+
+    Args:
+        photos: folder of photos.
+        control: gcp_list.txt.
+        work: folder for the model.
+        sd_m: standard deviation of the coordinates, where the file states none.
+    """
     capture = mapped(photos, work)
     whole = read_sighted(control, capture.model, capture.photos)
     for note in whole.notes:
@@ -120,7 +127,10 @@ def leave_one_out(photos: Path, control: Path, work: Path) -> None:
     rows = [k for k, s in enumerate(whole.sightings) if not (s.problem or s.point.check)]
     print("point\tclicks\tbefore: east north up (m)\tafter: east north up (m)")
     for row in rows:
-        sightings = [replace(s, point=replace(s.point, check=k == row)) for k, s in enumerate(whole.sightings)]
+        sightings = [
+            replace(s, point=replace(s.point, check=k == row, sd_m=(sd_m, sd_m) if sd_m else s.point.sd_m))
+            for k, s in enumerate(whole.sightings)
+        ]
         others = replace(whole, sightings=sightings)
         left.append([error[0] for error in solved(capture, others, [sightings[row]], NO_GPS)])
         point = whole.sightings[row].point

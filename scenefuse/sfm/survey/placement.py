@@ -20,7 +20,7 @@ MIN_GPS_PHOTOS = 5
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
 OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
-BENT = 0.02
+BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
 # Rounds in which the common shift of GPS positions and the similarity are fitted in turn.
@@ -136,7 +136,13 @@ def place_by_control(
 
 
 def beside_gps(
-    placement: Placement, sightings: list[Sighting], there: Array, gps: GpsCameras, target: Array, where: str
+    placement: Placement,
+    sightings: list[Sighting],
+    there: Array,
+    gps: GpsCameras,
+    target: Array,
+    where: str,
+    settings: GeoreferenceSettings,
 ) -> Placement:
     """A placement by control points, refined by GPS positions up to a shift that all of them share.
 
@@ -150,6 +156,7 @@ def beside_gps(
         gps: N photos with positions.
         target: (N, 3) the positions in the local frame, likewise.
         where: the control points' file, for messages.
+        settings: for the limit of outliers.
 
     Raises:
         StageError: GPS saw the cameras more than a kilometre away.
@@ -162,7 +169,7 @@ def beside_gps(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
             " correct their CRS or swapped axes, or switch use_gps off if GPS is wrong"
         )
-    limit = max(OUTLIER * float(np.median(gps.sd_m)), BENT * _extent(target)[0])
+    limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
     start = np.concatenate([[s.x_in_model for s, u in zip(sightings, points) if u], gps.centres[inliers]])
     sd_m = np.concatenate([[s.point.sd_m[0] for s, u in zip(sightings, points) if u], gps.sd_m[inliers, 0]])
@@ -174,21 +181,28 @@ def beside_gps(
     return replace(placement, local_from_model=fitted, inliers=inliers, gps_shift=shift)
 
 
+def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
+    """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
+    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, BENT * extent))
+
+
 def _middle(difference: Array) -> Array:
     """(3,) medians of (N, 3) differences; 0 where none is known."""
     known = np.isfinite(difference)
     return np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
 
 
-def place_by_gps(centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int) -> Placement:
+def place_by_gps(
+    centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int, sd_m: float | None = None
+) -> Placement:
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
     the tilt: then the cameras' up direction (3,) closes it. Positions within five times the GPS accuracy of each other
-    say nothing about scale: then the model is only turned upright.
+    say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
     """
-    accuracy_m, extent = settings.gps_accuracy_m, _extent(target)
-    limit = max(OUTLIER * accuracy_m, BENT * extent[0])
+    accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
+    limit = _limit(accuracy_m, extent[0], settings)
     if extent[0] < SPREAD * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)

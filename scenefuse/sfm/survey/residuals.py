@@ -18,6 +18,10 @@ COLUMNS = ["kind", "name", "used", "east_m", "north_m", "up_m", "horizontal_sd_m
 COLUMNS += ["photos", "reprojection_px"]
 
 
+# Control points that miss their coordinates by so many standard deviations deserve a note.
+MISFIT = 5.0
+
+
 @dataclass(frozen=True)
 class Georeference:
     """Where a model lies, and by what.
@@ -145,6 +149,14 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
         if rows.any():
             height = "heights unknown" if vertical is None else f"vertically {vertical:.3f} m"
             print(f"{rows.sum()} {kind} points: RMS horizontally {horizontal:.3f} m, {height}", flush=True)
+    used = [s.point.sd_m[0] for s, u in zip(control.sightings, found.placement.used) if u]
+    miss_m, sd_m = content["control_rms_horizontal_m"]["value"], float(np.median(used))
+    if miss_m > MISFIT * sd_m:
+        print(
+            f"note: the control points miss their coordinates by {miss_m:.2f} m, but {sd_m:g} m is stated for them;"
+            " give their standard deviations in columns 8 and 9, or correct coordinates and clicks",
+            flush=True,
+        )
     return content
 
 

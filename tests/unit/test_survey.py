@@ -1,0 +1,247 @@
+"""Control and check points, positions with their accuracy, and the adjustment to both, against a planted truth."""
+
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pyproj
+import pytest
+from support.surveyed import FRAME, fly, gcp_lines, write_inputs
+
+from scenefuse.sfm.geodesy import scene_frame
+from scenefuse.sfm.georeference import camera_poses, georegister
+from scenefuse.sfm.survey.control_file import read_control
+from scenefuse.sfm.survey.placement import GeoreferenceSettings
+from scenefuse.stage import StageError, read_json, value
+
+FLIGHT = fly()
+PLACES = np.array(
+    [[-30, -20, 1], [30, -20, 0.5], [28, 20, -1], [-28, 22, 2], [0, 0, 0], [12, -12, 1.5], [-15, 8, 1], [10, 14, 0.0]]
+)
+NAMES = ["a", "b", "c", "d", "e", "f", "CHK-1", "chk-2"]
+
+
+@pytest.fixture(scope="module")
+def model():
+    return FLIGHT.model()
+
+
+def georeferenced(folder, model, photos, lines=None, **settings):
+    """Run the stage; its report, the model, and the lines of residuals.tsv by name."""
+    folder.mkdir(exist_ok=True)
+    write_inputs(folder, model, photos)
+    control = None
+    if lines is not None:
+        control = folder / "gcp_list.txt"
+        control.write_text("\n".join(lines) + "\n")
+    georegister(
+        sparse=folder / "sparse",
+        sparse_json=folder / "sparse.json",
+        photos=folder / "photos.json",
+        control=control,
+        georeferenced=folder / "georeferenced",
+        residuals=folder / "residuals.tsv",
+        report=folder / "georeference.json",
+        settings=GeoreferenceSettings(**settings),
+        seed=0,
+    )
+    with open(folder / "residuals.tsv") as file:
+        rows = {row["name"]: row for row in csv.DictReader(file, delimiter="\t")}
+    return read_json(folder / "georeference.json"), pycolmap.Reconstruction(folder / "georeferenced"), rows
+
+
+def without_gps():
+    return [replace(p, latitude_deg=None, longitude_deg=None, altitude_m=None) for p in FLIGHT.photos()]
+
+
+def changed(lines, ending, column, change):
+    """Lines of a point with one column changed, a function of the number there."""
+    found = []
+    for line in lines:
+        cells = line.split("\t")
+        if cells[-1] == ending:
+            cells[column] = f"{change(float(cells[column])):.12g}"
+        found.append("\t".join(cells))
+    return found
+
+
+def off(report, model):
+    """(N,) distances of camera centres from the true ones, in metres."""
+    names, _, centres = camera_poses(model)
+    assert names == FLIGHT.names
+    return np.linalg.norm(centres - scene_frame(report).apply(FRAME.inverse(FLIGHT.centres)), axis=1)
+
+
+def test_control_points_give_metres_and_check_points_are_only_measured(tmp_path, model):
+    lines = gcp_lines(FLIGHT, PLACES, NAMES, noise_px=0.3)
+    report, found, rows = georeferenced(tmp_path / "a", model, without_gps(), lines)
+    assert value(report, "status") == "georeferenced" and value(report, "crs") == "EPSG:32632"
+    assert (value(report, "control_points"), value(report, "check_points")) == (6, 2)
+    # A pixel is 9 cm on the ground.
+    assert value(report, "check_rms_horizontal_m") < 0.05 and value(report, "check_rms_vertical_m") < 0.1
+    assert off(report, found).max() < 0.4
+    assert (rows["a"]["kind"], rows["a"]["used"]) == ("control point", "yes")
+    assert rows["CHK-1"]["kind"] == rows["chk-2"]["kind"] == "check point" and rows["chk-2"]["used"] == "no"
+    again, same, _ = georeferenced(tmp_path / "b", model, without_gps(), changed(lines, "CHK-1", 2, lambda z: z + 5))
+    apart = scene_frame(again).inverse(camera_poses(same)[2]) - scene_frame(report).inverse(camera_poses(found)[2])
+    np.testing.assert_allclose(apart, 0, atol=1e-6)
+    assert value(again, "check_rms_vertical_m") == pytest.approx(5 / np.sqrt(2), abs=0.1)
+
+
+def test_points_with_larger_stated_deviations_weigh_less(tmp_path, model):
+    right = gcp_lines(FLIGHT, PLACES, NAMES)
+    high = changed(right, "e", 2, lambda z: z + 0.4)
+    up_m = {}
+    for name, lines, sd in (("right", right, "0.02"), ("trusted", high, "0.02"), ("rough", high, "1.0")):
+        stated = [f"{line}\t{sd}\t{sd}" if line.endswith("\te") else line for line in lines]
+        rows = georeferenced(tmp_path / name, model, without_gps(), stated)[2]
+        up_m[name] = {point: float(rows[point]["up_m"]) for point in "abcdef"}
+    moved = {name: max(abs(up_m[name][p] - up_m["right"][p]) for p in "abcdf") for name in up_m}
+    assert up_m["rough"]["e"] == pytest.approx(up_m["right"]["e"] - 0.4, abs=0.02)
+    assert moved["rough"] < moved["trusted"] / 3
+
+
+def test_rtk_positions_straighten_a_model_that_a_wrong_lens_bent(tmp_path):
+    bent = FLIGHT.model(off_centre_px=3.0)
+    exact = FLIGHT.photos(noise_m=0.02, sd_m=0.02, seed=1)
+    silent = [replace(photo, horizontal_sd_m=None, vertical_sd_m=None) for photo in exact]
+    rough_report, rough, _ = georeferenced(tmp_path / "rough", bent, silent)
+    report, found, rows = georeferenced(tmp_path / "rtk", bent, exact)
+    assert off(rough_report, rough).max() > 3 * off(report, found).max()
+    assert off(report, found).max() < 0.1
+    assert value(report, "adjusted_to_positions") == 24 and rows["00.jpg"]["horizontal_sd_m"] == "0.0200"
+
+
+def test_a_wild_rtk_position_is_named_and_harmless(tmp_path, model):
+    photos = FLIGHT.photos(noise_m=0.02, sd_m=0.02)
+    wild = FRAME.inverse(FLIGHT.centres[5:6] + [0, 60, 0])[0].tolist()
+    photos[5] = replace(photos[5], latitude_deg=wild[0], longitude_deg=wild[1])
+    report, found, rows = georeferenced(tmp_path, model, photos)
+    assert value(report, "gps_outliers") == ["05.jpg"] and rows["05.jpg"]["used"] == "no"
+    assert off(report, found).max() < 0.2
+
+
+def test_identical_positions_give_no_metre(tmp_path, model):
+    one = FLIGHT.photos(sd_m=0.02)[0]
+    photos = [replace(one, name=photo.name) for photo in FLIGHT.photos()]
+    report, _, rows = georeferenced(tmp_path, model, photos)
+    assert value(report, "status") == "upright" and "spread over 0.0 m" in value(report, "reason")
+    assert rows == {} and value(report, "length_unit") == "scene units"
+
+
+def test_positions_along_one_line_do_not_tilt_the_model(tmp_path, model):
+    in_line = [p if k // 6 == 1 else replace(p, latitude_deg=None) for k, p in enumerate(FLIGHT.photos(noise_m=0.5))]
+    report, _, _ = georeferenced(tmp_path, model, in_line)
+    assert "adjusted_to_positions" not in report and "levelled by the cameras" in value(report, "reason")
+
+
+def test_gps_of_another_datum_beside_control_points_is_shifted_and_helps(tmp_path, model):
+    lines = gcp_lines(FLIGHT, PLACES, NAMES)
+    photos = [replace(p, altitude_m=p.altitude_m + 47.0) for p in FLIGHT.photos(noise_m=0.02, sd_m=0.02)]
+    report, found, rows = georeferenced(tmp_path, model, photos, lines)
+    assert value(report, "gps_shift")[2] == pytest.approx(47.0, abs=0.1)
+    alone = georeferenced(tmp_path / "alone", model, without_gps(), lines)[:2]
+    assert off(report, found).mean() < off(*alone).mean() and value(report, "check_rms_horizontal_m") < 0.05
+    assert rows["00.jpg"]["kind"] == "position" and abs(float(rows["00.jpg"]["up_m"])) < 0.1
+
+
+def test_a_gross_click_is_named_with_its_photo_and_left_out(tmp_path, model, capsys):
+    lines = gcp_lines(FLIGHT, PLACES, NAMES)
+    row = next(k for k, line in enumerate(lines) if line.endswith("\tc"))
+    cells = lines[row].split("\t")
+    lines[row] = "\t".join([*cells[:3], f"{float(cells[3]) - 120:.2f}", *cells[4:]])
+    report, found, rows = georeferenced(tmp_path, model, without_gps(), lines)
+    (note,) = value(report, "control_notes")
+    assert note.startswith(f"c: the click in {cells[5]} is 1") and "px off" in note and note in capsys.readouterr().out
+    assert rows["c"]["used"] == "yes" and rows["c"]["photos"] == "4"
+    assert off(report, found).max() < 0.4
+
+
+def test_a_point_with_wrong_coordinates_is_left_out_and_named(tmp_path, model):
+    lines = changed(gcp_lines(FLIGHT, PLACES, NAMES), "d", 0, lambda x: x + 30)
+    report, found, rows = georeferenced(tmp_path, model, without_gps(), lines)
+    (note,) = value(report, "control_notes")
+    assert note.startswith("d is left out") and "30" in note and rows["d"]["used"] == "no"
+    assert value(report, "control_points") == 5 and off(report, found).max() < 0.4
+
+
+def test_heights_may_be_unknown_and_the_crs_may_have_a_vertical_part(tmp_path, model):
+    lines = gcp_lines(FLIGHT, PLACES, NAMES, crs="EPSG:25832")
+    lines = ["EPSG:25832+7837", *changed(lines[1:], "e", 2, lambda z: np.nan)]
+    report, _, rows = georeferenced(tmp_path, model, without_gps(), lines)
+    assert rows["e"]["up_m"] == "" and rows["e"]["used"] == "yes"
+    crs = pyproj.CRS.from_user_input(value(report, "crs"))
+    assert crs.is_compound and "DHHN2016" in crs.name
+    place = scene_frame(report).in_crs(scene_frame(report).apply(FRAME.inverse(PLACES[:1])))[0]
+    np.testing.assert_allclose(place, [float(c) for c in lines[1].split("\t")[:3]], atol=1e-3)
+
+
+def test_feet_stay_feet_in_the_results(tmp_path, model):
+    foot = 0.3048006096012192
+    lines = gcp_lines(FLIGHT, PLACES, NAMES, crs="EPSG:32632")
+    in_feet = ["+proj=utm +zone=32 +ellps=WGS84 +units=us-ft +no_defs"]
+    for line in lines[1:]:
+        cells = line.split("\t")
+        in_feet.append("\t".join([*(f"{float(c) / foot:.12g}" for c in cells[:3]), *cells[3:]]))
+    report, found, _ = georeferenced(tmp_path, model, without_gps(), in_feet)
+    assert value(report, "length_unit") == "m" and report["origin_in_crs"]["unit"] == "US survey foot"
+    assert off(report, found).max() < 0.4
+    place = scene_frame(report).in_crs(scene_frame(report).apply(FRAME.inverse(PLACES[:1])))[0]
+    np.testing.assert_allclose(place, [float(c) for c in in_feet[1].split("\t")[:3]], atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda lines: [lines[0]], "holds no points"),
+        (lambda lines: lines[1:], "names no coordinate reference system"),
+        (lambda lines: [lines[0], "1 2 3 4 5"], "line 2: expected x y z"),
+        (lambda lines: [lines[0], lines[1], lines[1]], "clicked more than once in"),
+        (lambda lines: [*lines[:3], *changed(lines[3:4], "a", 0, lambda x: x + 1), *lines[4:]], "different coordinates"),
+        (lambda lines: [line.replace(".jpg", ".JPG") for line in lines], "none of the 24 photos"),
+        (lambda lines: changed(lines, "b", 3, lambda x: x + 900), "lies outside"),
+        (lambda lines: [line for line in lines if line[-1] not in "abcd"], "2 control points with a height"),
+        (lambda lines: lines[:1] + [lines[k] for k in range(1, len(lines), 5)], "clicked in"),
+        (lambda lines: [swapped(line) for line in lines], "x and y are swapped"),
+        (lambda lines: ["EPSG:4326", *(line.replace("\t", "\t", 1) for line in lines[1:])], "does not lie in"),
+    ],
+)  # fmt: skip
+def test_bad_control_points_are_named(tmp_path, model, spoil, words):
+    lines = spoil(gcp_lines(FLIGHT, PLACES, NAMES))
+    with pytest.raises(StageError, match=words):
+        georeferenced(tmp_path, model, without_gps(), lines)
+
+
+def swapped(line):
+    cells = line.split("\t")
+    return "\t".join([cells[1], cells[0], *cells[2:]]) if len(cells) > 1 else line
+
+
+def test_swapped_axes_within_one_country_turn_the_model_upside_down(tmp_path, model):
+    grid = "+proj=tmerc +lat_0=47.37 +lon_0=8.55 +ellps=WGS84 +units=m +no_defs"
+    lines = [swapped(line) for line in gcp_lines(FLIGHT, PLACES * [1, 1, 0.01], NAMES, crs=grid)]
+    with pytest.raises(StageError, match="upside down"):
+        georeferenced(tmp_path, model, without_gps(), lines)
+
+
+def test_control_points_along_one_line_are_refused(tmp_path, model):
+    along = np.array([[t, 0.5 * t, 0.1] for t in (-30, -10, 0, 15, 30)])
+    with pytest.raises(StageError, match="along one line"):
+        georeferenced(tmp_path, model, without_gps(), gcp_lines(FLIGHT, along, list("abcde")))
+
+
+def test_control_points_far_from_gps_are_refused(tmp_path, model):
+    lines = [
+        changed([line], line.split("\t")[-1], 1, lambda y: y + 5000)[0] for line in gcp_lines(FLIGHT, PLACES, NAMES)[1:]
+    ]
+    with pytest.raises(StageError, match="5 km from where GPS saw"):
+        georeferenced(tmp_path, model, FLIGHT.photos(), ["EPSG:32632", *lines])
+
+
+def test_points_without_names_are_told_by_their_coordinates(tmp_path):
+    path = tmp_path / "gcp_list.txt"
+    path.write_text("WGS84 UTM 32N\n# a comment\n466000 5246000 NaN 10 20 a.jpg\n466000 5246000 NaN 30 40 b.jpg\n")
+    (point,) = read_control(path).points
+    assert [photo for photo, _ in point.clicks] == ["a.jpg", "b.jpg"] and np.isnan(point.position[2])
+    assert point.sd_m == (0.02, 0.03) and not point.check
