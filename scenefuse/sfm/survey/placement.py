@@ -171,8 +171,12 @@ def beside_gps(
         )
     limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
-    start = np.concatenate([[s.x_in_model for s, u in zip(sightings, points) if u], gps.centres[inliers]])
-    sd_m = np.concatenate([[s.point.sd_m[0] for s, u in zip(sightings, points) if u], gps.sd_m[inliers, 0]])
+    used = [s for s, u in zip(sightings, points) if u]
+    start = np.concatenate([[s.x_in_model for s in used], gps.centres[inliers]])
+    # Clicks add to what was stated of the coordinates.
+    misses = there[points] - fitted.apply(start[: len(used)])
+    miss_m = float(np.sqrt(np.nanmean(misses**2)))
+    sd_m = np.concatenate([[max(s.point.sd_m[0], miss_m) for s in used], gps.sd_m[inliers, 0]])
     for _ in range(SHIFT_ROUNDS if inliers.any() else 0):
         here = fitted.apply(start)
         wanted = np.concatenate([there[points], target[inliers] - shift])

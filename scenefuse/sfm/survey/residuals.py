@@ -9,7 +9,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.survey.control import Control, Sighting, errors
+from scenefuse.sfm.survey.control import Control, Sighting, seen_at
 from scenefuse.sfm.survey.placement import GpsCameras, Placement
 from scenefuse.stage import atomic_file, quantity
 from scenefuse.transforms import Array
@@ -71,7 +71,8 @@ def residuals_of(model: pycolmap.Reconstruction, found: Georeference) -> Residua
     names, positions = found.gps.names, found.frame.apply(found.gps.positions) - found.placement.gps_shift
     centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
     target = found.frame.apply(np.array([s.point.position for s in found.sightings]).reshape(-1, 3))
-    return Residuals(centres - positions, *errors(found.sightings, model, target))
+    places, rms_px = seen_at(found.sightings, model)
+    return Residuals(centres - positions, places - target, rms_px)
 
 
 def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
