@@ -5,9 +5,10 @@
     python tests/benchmarks/control_points.py positions --photos PHOTOS --work FOLDER
 
 The first makes each control point a check point in turn. The second clicks 12 control points in the demo's photos by
-its true cameras (SCENE is results/scenes/demo), with 1 px of noise, and 4 check points without any, and gives positions
-2 cm or 3 m of noise. The third holds out every fifth photo's GPS position. "before" is the similarity alone, "after" the
-adjusted model. A model is made once for each FOLDER, by the workflow's own stages with their shipped settings, and kept.
+its true cameras (SCENE is results/scenes/demo), with 1 px of noise, and 4 check points without any, and gives
+positions 2 cm or 3 m of noise. The third holds out every fifth photo's GPS position. "before" is the similarity alone,
+"after" the adjusted model. A model is made once for each FOLDER, by the workflow's own stages with their shipped
+settings, and kept.
 """
 
 import contextlib

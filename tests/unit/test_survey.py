@@ -7,10 +7,13 @@ import numpy as np
 import pycolmap
 import pyproj
 import pytest
+from PIL import Image
+from PIL.ExifTags import IFD, Base
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
+from scenefuse.sfm.photos import gps_accuracies, list_photos, read_photos
 from scenefuse.sfm.survey.control_file import read_control
 from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.stage import StageError, read_json, value
@@ -247,3 +250,64 @@ def test_points_without_names_are_told_by_their_coordinates(tmp_path):
     (point,) = read_control(path).points
     assert [photo for photo, _ in point.clicks] == ["a.jpg", "b.jpg"] and np.isnan(point.position[2])
     assert point.sd_m == (0.02, 0.03) and not point.check
+
+
+def a_photo(folder, name, xmp=b"", orientation=1):
+    folder.mkdir(exist_ok=True)
+    exif = Image.Exif()
+    exif[Base.Orientation] = orientation
+    exif[IFD.GPSInfo] = {1: "N", 2: (47.0, 30.0, 0.0), 3: "E", 4: (8.0, 15.0, 0.0), 5: b"\0", 6: 500.0}
+    pixels = np.random.default_rng(len(name) + ord(name[0])).integers(0, 255, (40, 60, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(folder / name, exif=exif, xmp=xmp)
+
+
+def listed(folder, tmp_path):
+    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "photos.json")
+    return {photo.name: photo for photo in read_photos(tmp_path / "photos.json")}
+
+
+def test_accuracies_are_read_from_xmp(tmp_path):
+    folder = tmp_path / "flight"
+    dji = b'<x drone-dji:RtkStdLon="0.012" drone-dji:RtkStdLat="0.016" drone-dji:RtkStdHgt="0.03"/>'
+    pix4d = b"<Camera:GPSXYAccuracy>0.05</Camera:GPSXYAccuracy><Camera:GPSZAccuracy>0.1</Camera:GPSZAccuracy>"
+    a_photo(folder, "a.jpg", dji)
+    a_photo(folder, "b.jpg", pix4d, orientation=6)
+    a_photo(folder, "c.jpg", b'<x drone-dji:RtkStdLon="0.0" drone-dji:RtkStdLat="0.0" drone-dji:RtkStdHgt="n/a"/>')
+    photos = listed(folder, tmp_path)
+    assert photos["a.jpg"].horizontal_sd_m == pytest.approx(np.sqrt((0.012**2 + 0.016**2) / 2))
+    assert photos["a.jpg"].vertical_sd_m == 0.03
+    assert (photos["b.jpg"].horizontal_sd_m, photos["b.jpg"].vertical_sd_m) == (0.05, 0.1)
+    assert (photos["c.jpg"].horizontal_sd_m, photos["c.jpg"].vertical_sd_m) == (None, None)
+    assert gps_accuracies(list(photos.values()), 3.0)[2].tolist() == [3.0, 3.0]
+
+
+def test_a_geo_file_takes_the_place_of_exif(tmp_path, capsys):
+    folder = tmp_path / "flight"
+    for name in ("a.jpg", "b.jpg", "c.jpg"):
+        a_photo(folder, name)
+    x, y = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(8.5, 47.4)
+    lines = ["EPSG:32632", f"a.jpg {x} {y} 431.5 10 -90 0 0.02 0.04", f"b.jpg {x + 5} {y}", f"z.jpg {x} {y}"]
+    (folder / "geo.txt").write_text("\n".join(lines))
+    photos = listed(folder, tmp_path)
+    assert photos["a.jpg"].latitude_deg == pytest.approx(47.4, abs=1e-8)
+    assert (photos["a.jpg"].altitude_m, photos["a.jpg"].vertical_sd_m) == (431.5, 0.04)
+    assert photos["b.jpg"].altitude_m is None and photos["b.jpg"].has_gps
+    assert not photos["c.jpg"].has_gps and "gives 2 of 3 positions" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "text, words",
+    [
+        ("a.jpg 8.5 47.4\n", "names no coordinate reference system"),
+        ("EPSG:4326\na.jpg 8.5 north\n", "line 2: expected photo x y"),
+        ("EPSG:4326\na.jpg 8.5 47.4\na.jpg 8.5 47.4\n", "given more than once"),
+        ("EPSG:4326\nq.jpg 8.5 47.4\n", "names none of the photos"),
+        ("EPSG:25832\na.jpg 5246000 466000\n", "x and y are swapped"),
+        ("EPSG:25832\n", "holds no positions"),
+    ],
+)
+def test_a_bad_geo_file_is_named(tmp_path, text, words):
+    a_photo(tmp_path / "flight", "a.jpg")
+    (tmp_path / "flight/geo.txt").write_text(text)
+    with pytest.raises(StageError, match=words):
+        listed(tmp_path / "flight", tmp_path)

@@ -167,7 +167,7 @@ def check_spread(target: Array, names: list[str], where: str) -> None:
 
 
 def seen_at(sightings: list[Sighting], model: pycolmap.Reconstruction) -> tuple[Array, Array]:
-    """Places (N, 3) of points in a model by their clicks, and RMS distances (N,) of these from them in the photos, pixels.
+    """Places (N, 3) of points in a model by their clicks, and RMS distances (N,) of clicks from these, in pixels.
 
     NaN where clicks give nothing.
     """
