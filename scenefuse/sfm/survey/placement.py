@@ -23,8 +23,6 @@ OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
 BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
-# Rounds in which the common shift of GPS positions and the similarity are fitted in turn.
-SHIFT_ROUNDS = 300
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 
@@ -147,7 +145,7 @@ def beside_gps(
     """A placement by control points, refined by GPS positions up to a shift that all of them share.
 
     Another datum, heights above a geoid or a base station of its own move all positions alike: the control points say
-    where the model lies, the positions help to turn and scale it. Shift and similarity are fitted in turn.
+    where the model lies, the positions help to turn and scale it: a least-squares fit of both about their own means.
 
     Args:
         placement: by control points.
@@ -171,17 +169,24 @@ def beside_gps(
         )
     limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
-    used = [s for s, u in zip(sightings, points) if u]
-    start = np.concatenate([[s.x_in_model for s in used], gps.centres[inliers]])
+    if not inliers.any():
+        return replace(placement, inliers=inliers, gps_shift=shift)
+    start = [np.array([s.x_in_model for s, u in zip(sightings, points) if u]), gps.centres[inliers]]
+    wanted = [there[points], target[inliers]]
     # Clicks add to what was stated of the coordinates.
-    misses = there[points] - fitted.apply(start[: len(used)])
-    miss_m = float(np.sqrt(np.nanmean(misses**2)))
-    sd_m = np.concatenate([[max(s.point.sd_m[0], miss_m) for s in used], gps.sd_m[inliers, 0]])
-    for _ in range(SHIFT_ROUNDS if inliers.any() else 0):
-        here = fitted.apply(start)
-        wanted = np.concatenate([there[points], target[inliers] - shift])
-        fitted = fit_sim3(start, np.where(np.isfinite(wanted), wanted, here), sd_m**-2.0)
-        shift = _middle(target[inliers] - fitted.apply(gps.centres[inliers]))
+    miss_m = float(np.sqrt(np.nanmean((wanted[0] - fitted.apply(start[0])) ** 2)))
+    sd_m = [np.array([max(s.point.sd_m[0], miss_m) for s, u in zip(sightings, points) if u]), gps.sd_m[inliers, 0]]
+    for _ in range(FILL_ROUNDS):
+        here = [fitted.apply(part) for part in start]
+        here[1] += shift
+        filled = [np.where(np.isfinite(b), b, a) for a, b in zip(here, wanted)]
+        means = [
+            [np.average(part, axis=0, weights=sd**-2.0) for part, sd in zip(side, sd_m)] for side in (start, filled)
+        ]
+        centred = [np.concatenate([p - m for p, m in zip(side, mean)]) for side, mean in zip((start, filled), means)]
+        turn = fit_sim3(centred[0], centred[1], np.concatenate(sd_m) ** -2.0)
+        fitted = replace(turn, translation=means[1][0] - turn.scale * turn.rotation @ means[0][0])
+        shift = means[1][1] - fitted.apply(means[0][1])
     return replace(placement, local_from_model=fitted, inliers=inliers, gps_shift=shift)
 
 
