@@ -83,7 +83,9 @@ def _survey_lines(fields: Fields) -> list[str]:
         names = (f"{kind} points", "RMS horizontally", "vertically")
         if values[0]:
             lines += _line(kind, _pairs([(n, v, u) for n, v, u in zip(names, values, ("", "m", "m"))]))
-    return lines
+    long = [("known lengths", find(fields, "georeference.lengths"), "")]
+    long += [("RMS", find(fields, "georeference.length_rms_m"), "m")]
+    return lines + _line("lengths", _pairs(long))
 
 
 def _beside(measure: str, column: str) -> str:

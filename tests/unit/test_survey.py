@@ -30,7 +30,7 @@ def model():
     return FLIGHT.model()
 
 
-def georeferenced(folder, model, photos, lines=None, **settings):
+def georeferenced(folder, model, photos, lines=None, lengths=None):
     """Run the stage; its report, the model, and the lines of residuals.tsv by name."""
     folder.mkdir(exist_ok=True)
     write_inputs(folder, model, photos)
@@ -43,10 +43,11 @@ def georeferenced(folder, model, photos, lines=None, **settings):
         sparse_json=folder / "sparse.json",
         photos=folder / "photos.json",
         control=control,
+        lengths=lengths,
         georeferenced=folder / "georeferenced",
         residuals=folder / "residuals.tsv",
         report=folder / "georeference.json",
-        settings=GeoreferenceSettings(**settings),
+        settings=GeoreferenceSettings(),
         seed=0,
     )
     with open(folder / "residuals.tsv") as file:
@@ -311,3 +312,51 @@ def test_a_bad_geo_file_is_named(tmp_path, text, words):
     (tmp_path / "flight/geo.txt").write_text(text)
     with pytest.raises(StageError, match=words):
         listed(tmp_path / "flight", tmp_path)
+
+
+BARS = {
+    name: (first, second, round(float(np.linalg.norm(first - second)), 4))
+    for name, first, second in zip(("door", "kerb", "path"), PLACES[[0, 2, 4]], PLACES[[1, 3, 6]])
+}
+
+
+def length_lines(spoil=lambda cells: cells):
+    lines = ["length\tmetres\tend\tphoto\tx_px\ty_px"]
+    for name, (*ends, metres) in BARS.items():
+        for end, place in zip("ab", ends):
+            for photo, pixel in FLIGHT.clicks(place)[:3]:
+                lines.append("\t".join(spoil([name, f"{metres}", end, photo, f"{pixel[0]:.3f}", f"{pixel[1]:.3f}"])))
+    return lines
+
+
+def test_known_lengths_give_metres_without_gps(tmp_path, model):
+    path = tmp_path / "lengths.tsv"
+    path.write_text("\n".join(length_lines()) + "\n")
+    report, found, rows = georeferenced(tmp_path, model, without_gps(), lengths=path)
+    assert (value(report, "status"), value(report, "length_unit")) == ("scaled", "m") and "crs" not in report
+    assert value(report, "lengths_used") and value(report, "length_rms_pct") < 0.5
+    assert rows["door"]["kind"] == "length" and abs(float(rows["door"]["error_m"])) < 0.2
+    size = [np.linalg.norm(c - c.mean(0), axis=1).mean() for c in (camera_poses(found)[2], FLIGHT.centres)]
+    assert size[0] / size[1] == pytest.approx(1, abs=0.01)
+    (tmp_path / "gps").mkdir()
+    beside, _, _ = georeferenced(tmp_path / "gps", model, FLIGHT.photos(sd_m=0.02), lengths=path)
+    assert value(beside, "status") == "georeferenced" and not value(beside, "lengths_used")
+    assert value(beside, "length_rms_m") < 0.2
+
+
+@pytest.mark.parametrize(
+    "spoil, words",
+    [
+        (lambda cells: [cells[0], "2.0" if cells[0] == "door" else cells[1], *cells[2:]], "contradict each other"),
+        (lambda cells: [cells[0], "-1", *cells[2:]], "one positive length"),
+        (lambda cells: [*cells[:2], "a", *cells[3:]], "has the ends a"),
+        (lambda cells: [*cells[:3], "none.jpg", *cells[4:]], "none.jpg, which is not among"),
+        (lambda cells: cells[:4], "line 2: expected"),
+        (lambda cells: [*cells[:2], cells[2] + cells[3], *cells[3:]], "has the ends"),
+    ],
+)
+def test_bad_lengths_are_named(tmp_path, model, spoil, words):
+    path = tmp_path / "lengths.tsv"
+    path.write_text("\n".join(length_lines(spoil)) + "\n")
+    with pytest.raises(StageError, match=words):
+        georeferenced(tmp_path, model, without_gps(), lengths=path)

@@ -53,15 +53,20 @@ def calibration_flag(row, kind):
     )
 
 
-def control_of(wildcards):
-    """Input function: the control points of a scene, where the table has them."""
-    given = scene_row(wildcards.scene).get("control")
-    return [given] if given else []
+def surveyed(scene):
+    """Control points and known lengths of a scene, where the table has them: column -> file."""
+    row = scene_row(scene)
+    return {column: row[column] for column in ("control", "lengths") if row.get(column)}
 
 
-def control_flag(wildcards):
-    """The same as a command-line option."""
-    return flags(dict(zip(["control"], control_of(wildcards))))
+def survey_of(wildcards):
+    """Input function: their files."""
+    return list(surveyed(wildcards.scene).values())
+
+
+def survey_flags(wildcards):
+    """The same as command-line options."""
+    return flags(surveyed(wildcards.scene))
 
 
 def calibrated(row, kind):

@@ -1,6 +1,6 @@
 # Structure from motion: from photos to cameras, the same steps for a scene and for an object.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration, control; config: scene, object, seed
+# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration, control, lengths; config: scene, object, seed
 # OUTPUTS   results/scenes/{scene}/photos/, photos.json                     the photos, checked and upright, with GPS
 #           results/objects/{object}/frames/, photos.json                   the same, at most a given width
 #           .../features.db, database.db, matches.json                      COLMAP databases
@@ -247,7 +247,7 @@ use rule map_scene_photos as map_object_photos with:
 rule georegister:
     """Bring the model into metres, east, north and up, by control points or the photos' GPS, and adjust it to them."""
     input:
-        control_of,
+        survey_of,
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/sparse",
         report="results/scenes/{scene}/sparse.json",
@@ -268,15 +268,15 @@ rule georegister:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=flags(config["scene"]["georegister"]),
-        control=control_flag,
-        files=state_of(control_of),
+        survey=survey_flags,
+        files=state_of(survey_of),
         seed=config["seed"],
         script=script("sfm/georegister.py"),
         code=code("sfm/georegister.py"),
     message:
         "Scene {wildcards.scene}: georeferencing"
     shell:
-        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.control}"
+        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.survey}"
         " --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 

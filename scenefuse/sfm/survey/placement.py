@@ -42,7 +42,7 @@ class Placement:
     """How a model was placed.
 
     Attributes:
-        status: "georeferenced" (metres), "upright" (scene units).
+        status: "georeferenced" (metres, in a CRS), "scaled" (metres by known lengths), "upright" (scene units).
         reason: why, in words.
         local_from_model: similarity into the new frame.
         inliers: (N,) bool over the GPS positions used, or empty.
@@ -252,6 +252,14 @@ def upright(up: Array, reason: str) -> Placement:
     """Only turn the model so that `up` (3,) becomes z; scale and origin stay."""
     rotation = rotation_between(up, UP)
     return Placement("upright", reason, Sim3(1.0, rotation, np.zeros(3)), np.zeros(0, dtype=bool))
+
+
+def scaled(placement: Placement, metres_per_unit: float, lengths: int) -> Placement:
+    """An upright placement in metres, by known lengths."""
+    one = replace(placement.local_from_model, scale=metres_per_unit)
+    return replace(
+        placement, status="scaled", reason=f"{placement.reason}; {lengths} known lengths", local_from_model=one
+    )
 
 
 def fit_measured(centres: Array, target: Array, limit: float, seed: int) -> tuple[Sim3, NDArray[np.bool_]]:
