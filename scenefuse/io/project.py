@@ -15,7 +15,7 @@ from scenefuse.io.tables import Row, read_table
 from scenefuse.stage import StageError
 
 # Columns that say something about a row's photos.
-OF_PHOTOS = ("calibration", "control", "lengths", "prompts", "masks", "truth")
+OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
 
 
 @dataclass(frozen=True)
