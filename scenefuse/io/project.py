@@ -15,7 +15,7 @@ from scenefuse.io.tables import Row, read_table
 from scenefuse.stage import StageError
 
 # Columns that say something about a row's photos.
-OF_PHOTOS = ("calibration", "control", "prompts", "masks", "truth")
+OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
 # Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
 OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
 OF_THE_RUN = ("scene.chunks", "object.recipe", "object.stage1.pose_source", "registration.variants")

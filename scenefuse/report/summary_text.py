@@ -68,11 +68,26 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     given = _given(fields, "dense")
     lines = _line("given", given) if given else _line("cameras", _cameras(row, "photos"))
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
-    lines += _line("frame", _pairs(frame))
+    lines += _line("frame", _pairs(frame)) + _survey_lines(fields)
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
     measures = [{"measure": name, **{c: row.get(_beside(name, c)) for c in _COLUMNS}} for name in COMPLETION]
     lines += _completed_lines(fields) + _completion_lines(measures)
     return lines + _truth_lines(fields) + _remarks(fields)
+
+
+def _survey_lines(fields: Fields) -> list[str]:
+    """Control and check points: how many, and how far the model is from them."""
+    lines = []
+    for kind in ("control", "check"):
+        values = [
+            find(fields, f"georeference.{kind}_{name}") for name in ("points", "rms_horizontal_m", "rms_vertical_m")
+        ]
+        names = (f"{kind} points", "RMS horizontally", "vertically")
+        if values[0]:
+            lines += _line(kind, _pairs([(n, v, u) for n, v, u in zip(names, values, ("", "m", "m"))]))
+    long = [("known lengths", find(fields, "georeference.lengths"), "")]
+    long += [("RMS", find(fields, "georeference.length_rms_m"), "m")]
+    return lines + _line("lengths", _pairs(long))
 
 
 def _beside(measure: str, column: str) -> str:

@@ -34,6 +34,10 @@ REGISTRATION: dict[str, str] = {
 # The completion metrics of the completed scene that scenes.tsv holds, each with what stands beside it.
 COMPLETION = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
 BESIDE = ("null", "before", "after")
+# Columns of scenes.tsv for surveyed points, in `georeference.json` too.
+SURVEYED = tuple(
+    f"{kind}_{name}" for kind in ("control", "check") for name in ("points", "rms_horizontal_m", "rms_vertical_m")
+)
 
 
 def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
@@ -126,6 +130,7 @@ def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
             "reprojection_error_px": number_in(fields, "sparse.mean_reprojection_error_px"),
             "length_unit": plain(find(fields, "georeference.length_unit")),
             "gps_residual_median_m": number_in(fields, "georeference.gps_residual_median_m"),
+            **{name: number_in(fields, f"georeference.{name}") for name in SURVEYED},
             "points": number_in(fields, "dense.points"),
             "spacing": number_in(fields, "dense.spacing"),
             "backend": plain(find(fields, "dense.backend")),

@@ -15,6 +15,7 @@ from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.sfm.survey.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.sfm.survey.control import Control, read_sighted
+from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.sfm.survey.placement import (
     MIN_GPS_PHOTOS,
     UP,
@@ -23,6 +24,7 @@ from scenefuse.sfm.survey.placement import (
     beside_gps,
     place_by_control,
     place_by_gps,
+    scaled,
     upright,
 )
 from scenefuse.sfm.survey.residuals import Georeference, georeference_report, residuals_of, write_residuals
@@ -38,6 +40,7 @@ def georegister(
     sparse_json: Path,
     photos: Path,
     control: Path | None = None,
+    lengths: Path | None = None,
     georeferenced: Path,
     residuals: Path,
     report: Path,
@@ -46,13 +49,14 @@ def georegister(
 ) -> None:
     """Move a sparse model into east, north, up in metres by control points or its photos' GPS, and adjust it to them.
 
-    Without either it is turned upright and has no unit.
+    Without either it is turned upright, and in metres only by known lengths.
 
     Args:
         sparse: COLMAP model.
         sparse_json: JSON of the mapping stage, for the lens.
         photos: JSON list of the photos with their GPS positions.
         control: control and check points with their clicks, an OpenDroneMap gcp_list.txt.
+        lengths: known lengths between clicked points, `lengths.tsv`; beside control points or GPS only measured.
         georeferenced: output, COLMAP model.
         residuals: output, tab-separated: what is left at every surveyed point and every photo with a position.
         report: output, JSON: status, transform, origin, CRS, residuals.
@@ -60,7 +64,7 @@ def georegister(
         seed: of RANSAC.
 
     Raises:
-        StageError: what `read_sighted`, `place_by_control` and `beside_gps` say.
+        StageError: what `read_sighted`, `read_lengths`, `place_by_control` and `beside_gps` say.
     """
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
@@ -68,12 +72,15 @@ def georegister(
     up, cue = estimate_up(rotations, centres)
     surveyed = None if control is None else read_sighted(control, model, listed)
     found = georeference(gps, surveyed, up, settings, seed)
+    if lengths is not None and not found.metric:
+        known = read_lengths(lengths, model, listed)
+        found = replace(found, placement=scaled(found.placement, known.scale, len(known.names)))
     transform = found.placement.local_from_model
     model.transform(pycolmap.Sim3d(transform.scale, pycolmap.Rotation3d(transform.rotation), transform.translation))
     adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
     with atomic_directory(georeferenced) as temporary:
         model.write(temporary)
-    left = residuals_of(model, found)
+    left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, listed))
     write_residuals(residuals, found, left)
     _, turned, _ = camera_poses(model)
     write_json(report, georeference_report(found, left, cue, roll_spread_deg(turned, UP)) | adjustment)
@@ -98,12 +105,13 @@ def georeference(
         there, where = frame.apply(positions), str(control.path)
         placement, notes = place_by_control(control.sightings, there, up, where, seed)
         if by_gps:
-            placement = beside_gps(placement, control.sightings, there, gps, frame.apply(gps.positions), where)
+            positions = frame.apply(gps.positions)
+            placement = beside_gps(placement, control.sightings, there, gps, positions, where, settings)
         return Georeference(placement, frame, gps, replace(control, notes=[*control.notes, *notes]))
     if by_gps:
         frame = local_frame(gps.positions)
-        typical = replace(settings, gps_accuracy_m=float(np.median(gps.sd_m[:, 0])))
-        return Georeference(place_by_gps(gps.centres, frame.apply(gps.positions), up, typical, seed), frame, gps)
+        there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
+        return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m), frame, gps)
     reason = f"{len(gps.names)} registered photos have a GPS position, {MIN_GPS_PHOTOS} are needed"
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 

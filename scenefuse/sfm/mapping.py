@@ -18,7 +18,8 @@ from scenefuse.sfm.bundle.adjustment import (
     adjust,
     drop_outliers,
 )
-from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, choose_lens, describe_lens
+from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
+from scenefuse.sfm.given.cameras import triangulated
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import read_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, scratch_directory, setting, threads, write_json
@@ -45,6 +46,7 @@ def map_photos(
     sparse: Path,
     report: Path,
     calibrated: bool = False,
+    cameras: Path | None = None,
     settings: MappingSettings,
     seed: int,
 ) -> None:
@@ -57,13 +59,17 @@ def map_photos(
         sparse: output, COLMAP model, the one with most photos.
         report: output, JSON: photos registered, errors, the lens and why, models left out.
         calibrated: whether the database holds a known calibration; it is held then.
+        cameras: cameras that another program found, see `triangulated`; nothing is mapped or adjusted then.
         settings: mapping settings.
         seed: of RANSAC and of the choice of the first pair.
 
     Raises:
-        StageError: too small a share of the photos is registered.
+        StageError: too small a share of the photos is registered; what `triangulated` says.
     """
     names = [p.name for p in read_photos(photos)]
+    if cameras is not None:
+        _take_cameras(cameras, folder, names, database, sparse, report, settings, seed)
+        return
     ranked = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
     _check_registered(ranked, names, settings.min_registered_share)
     before_px = ranked[0].compute_mean_reprojection_error()
@@ -106,6 +112,30 @@ def map_photos(
         "seed": quantity(seed, "1"),
     }
     write_json(report, content)
+
+
+def _take_cameras(
+    cameras: Path,
+    folder: Path,
+    names: list[str],
+    database: Path,
+    sparse: Path,
+    report: Path,
+    settings: MappingSettings,
+    seed: int,
+) -> None:
+    """The same outputs from given cameras."""
+    work = sparse.with_name(f"{sparse.name}-given")
+    model = triangulated(cameras, folder, database, work, _mapper_options(len(names), True, seed))
+    _check_registered([model], names, settings.min_registered_share)
+    drop_outliers(model)
+    summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
+    print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
+    with atomic_directory(sparse) as temporary:
+        model.write(temporary)
+    notes = [f"cameras are those of {cameras.name}, held"]
+    content = {"models_left_out": quantity([], ""), "notes": quantity(notes, ""), "seed": quantity(seed, "1")}
+    write_json(report, summary | content)
 
 
 def _models(

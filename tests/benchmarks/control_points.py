@@ -1,13 +1,14 @@
 """Errors at points and positions that the georeferencing did not use, before and after the adjustment to the survey.
 
     python tests/benchmarks/control_points.py leave-one-out --photos PHOTOS --control gcp_list.txt --work FOLDER
-    python tests/benchmarks/control_points.py simulated --scene results/scenes/demo --truth results/demo/demo/truth/scene
+    python tests/benchmarks/control_points.py simulated --scene SCENE --truth results/demo/demo/truth/scene
     python tests/benchmarks/control_points.py positions --photos PHOTOS --work FOLDER
 
 The first makes each control point a check point in turn. The second clicks 12 control points in the demo's photos by
-its true cameras, with 1 px of noise, and 4 check points without any, and gives positions 2 cm or 3 m of noise. The
-third holds out every fifth photo's GPS position. "before" is the similarity alone, "after" the adjusted model. A model
-is made once for each FOLDER, by the workflow's own stages with their shipped settings, and kept.
+its true cameras (SCENE is results/scenes/demo), with 1 px of noise, and 4 check points without any, and gives
+positions 2 cm or 3 m of noise. The third holds out every fifth photo's GPS position. "before" is the similarity alone,
+"after" the adjusted model. A model is made once for each FOLDER, by the workflow's own stages with their shipped
+settings, and kept.
 """
 
 import contextlib
@@ -35,7 +36,7 @@ from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import match_features
 from scenefuse.sfm.pairs import MatchSettings
 from scenefuse.sfm.photos import Photo, list_photos, read_photos
-from scenefuse.sfm.survey.control import Control, Sighting, errors, read_sighted, sight
+from scenefuse.sfm.survey.control import Control, Sighting, read_sighted, seen_at, sight
 from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint
 from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.sfm.survey.residuals import rms
@@ -70,10 +71,10 @@ def solved(
     t = found.placement.local_from_model
     placed = copy.deepcopy(capture.model)
     placed.transform(pycolmap.Sim3d(t.scale, pycolmap.Rotation3d(t.rotation), t.translation))
-    before = errors(checks, placed, target)[0]
+    before = seen_at(checks, placed)[0] - target
     with contextlib.redirect_stdout(io.StringIO()):
         adjust_georeferenced(placed, found, LENSES[capture.lens].freedom)
-    return [before, errors(checks, placed, target)[0]]
+    return [before, seen_at(checks, placed)[0] - target]
 
 
 def mapped(photos: Path, work: Path) -> Capture:
@@ -110,8 +111,15 @@ def read_capture(folder: Path) -> Capture:
     return Capture(read_model(folder / "sparse"), lens, read_photos(folder / "photos.json"))
 
 
-def leave_one_out(photos: Path, control: Path, work: Path) -> None:
-    """Make each control point a check point in turn, and compare where its clicks put it with its coordinates."""
+def leave_one_out(photos: Path, control: Path, work: Path, sd_m: float | None = None) -> None:
+    """Make each control point a check point in turn, and compare where its clicks put it with its coordinates.
+
+    Args:
+        photos: folder of photos.
+        control: gcp_list.txt.
+        work: folder for the model.
+        sd_m: standard deviation of the coordinates, where the file states none.
+    """
     capture = mapped(photos, work)
     whole = read_sighted(control, capture.model, capture.photos)
     for note in whole.notes:
@@ -120,7 +128,10 @@ def leave_one_out(photos: Path, control: Path, work: Path) -> None:
     rows = [k for k, s in enumerate(whole.sightings) if not (s.problem or s.point.check)]
     print("point\tclicks\tbefore: east north up (m)\tafter: east north up (m)")
     for row in rows:
-        sightings = [replace(s, point=replace(s.point, check=k == row)) for k, s in enumerate(whole.sightings)]
+        sightings = [
+            replace(s, point=replace(s.point, check=k == row, sd_m=(sd_m, sd_m) if sd_m else s.point.sd_m))
+            for k, s in enumerate(whole.sightings)
+        ]
         others = replace(whole, sightings=sightings)
         left.append([error[0] for error in solved(capture, others, [sightings[row]], NO_GPS)])
         point = whole.sightings[row].point
@@ -149,7 +160,7 @@ def simulated(scene: Path, truth: Path, seeds: int = 3) -> None:
 
 
 def _ground(truth: Path, cameras: Cameras) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Places (P, 3) in the mapped area far from each other, their pixels (P, N, 2), and the photos that show them (P, N)."""
+    """Places (P, 3) in the mapped area, far apart, their pixels (P, N, 2), and which photos show them (P, N)."""
     content = read_json(truth / "cameras.json")
     meshes = [read_mesh(truth / "meshes" / f"{name}.ply") for name in ["world", *content["objects"]]]
     low, high = (np.array(corner) for corner in value(content, "mapped_area"))

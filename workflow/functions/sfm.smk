@@ -53,15 +53,59 @@ def calibration_flag(row, kind):
     )
 
 
-def control_of(wildcards):
-    """Input function: the control points of a scene, where the table has them."""
-    given = scene_row(wildcards.scene).get("control")
-    return [given] if given else []
+def cameras_of(row, kind):
+    """Input function: the files of cameras that another program found for a scene or an object, where the table has them."""
+
+    def files(wildcards):
+        given = row(wildcards[kind]).get("cameras")
+        if not given:
+            return []
+        if not Path(given).is_dir():
+            return [given]
+        names = (
+            f"{n}.{e}"
+            for n in ("cameras", "images", "frames", "rigs")
+            for e in ("bin", "txt")
+        )
+        names = [
+            *names,
+            "transforms.json",
+            "transforms_train.json",
+            "reconstruction.json",
+        ]
+        places = [
+            Path(given, place) for place in (".", "sparse", "sparse/0", "opensfm")
+        ]
+        found = [str(p / n) for p in places for n in names if (p / n).is_file()]
+        return found or [given]
+
+    return files
 
 
-def control_flag(wildcards):
+def cameras_flag(row, kind):
     """The same as a command-line option."""
-    return flags(dict(zip(["control"], control_of(wildcards))))
+
+    def words(wildcards):
+        given = row(wildcards[kind]).get("cameras")
+        return flags({"cameras": given} if given else {})
+
+    return words
+
+
+def surveyed(scene):
+    """Control points and known lengths of a scene, where the table has them: column -> file."""
+    row = scene_row(scene)
+    return {column: row[column] for column in ("control", "lengths") if row.get(column)}
+
+
+def survey_of(wildcards):
+    """Input function: their files."""
+    return list(surveyed(wildcards.scene).values())
+
+
+def survey_flags(wildcards):
+    """The same as command-line options."""
+    return flags(surveyed(wildcards.scene))
 
 
 def calibrated(row, kind):

@@ -1,6 +1,6 @@
 # Structure from motion: from photos to cameras, the same steps for a scene and for an object.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration, control; config: scene, object, seed
+# INPUTS    config/scenes.tsv, config/objects.tsv: photos, calibration, cameras, control, lengths; config: scene, object, seed
 # OUTPUTS   results/scenes/{scene}/photos/, photos.json                     the photos, checked and upright, with GPS
 #           results/objects/{object}/frames/, photos.json                   the same, at most a given width
 #           .../features.db, database.db, matches.json                      COLMAP databases
@@ -187,6 +187,7 @@ use rule match_scene_features as match_object_features with:
 rule map_scene_photos:
     """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
+        cameras_of(scene_row, "scene"),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
@@ -207,6 +208,8 @@ rule map_scene_photos:
     params:
         options=settings("scene.sparse"),
         calibrated=calibrated(scene_row, "scene"),
+        cameras=cameras_flag(scene_row, "scene"),
+        files=state_of(cameras_of(scene_row, "scene")),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
@@ -214,11 +217,12 @@ rule map_scene_photos:
         "Scene {wildcards.scene}: cameras and sparse points"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --database {input.database}"
-        " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} --seed {params.seed} {params.options} &> {log}"
+        " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} {params.cameras} --seed {params.seed} {params.options} &> {log}"
 
 
 use rule map_scene_photos as map_object_photos with:
     input:
+        cameras_of(object_row, "object"),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
@@ -237,6 +241,8 @@ use rule map_scene_photos as map_object_photos with:
     params:
         options=settings("object.sparse"),
         calibrated=calibrated(object_row, "object"),
+        cameras=cameras_flag(object_row, "object"),
+        files=state_of(cameras_of(object_row, "object")),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
@@ -247,7 +253,7 @@ use rule map_scene_photos as map_object_photos with:
 rule georegister:
     """Bring the model into metres, east, north and up, by control points or the photos' GPS, and adjust it to them."""
     input:
-        control_of,
+        survey_of,
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/sparse",
         report="results/scenes/{scene}/sparse.json",
@@ -268,15 +274,15 @@ rule georegister:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=settings("scene.georegister"),
-        control=control_flag,
-        files=state_of(control_of),
+        survey=survey_flags,
+        files=state_of(survey_of),
         seed=config["seed"],
         script=script("sfm/georegister.py"),
         code=code("sfm/georegister.py"),
     message:
         "Scene {wildcards.scene}: georeferencing"
     shell:
-        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.control}"
+        "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.survey}"
         " --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from scenefuse.sfm.fiducials import intersect, model_pixel
 from scenefuse.sfm.photos import Photo
@@ -167,22 +166,20 @@ def check_spread(target: Array, names: list[str], where: str) -> None:
         )
 
 
-def errors(
-    sightings: list[Sighting], model: pycolmap.Reconstruction, target: Array
-) -> tuple[Array, NDArray[np.float64]]:
-    """Points by their clicks in a model minus their coordinates (N, 3), and RMS distances in the photos (N,) in pixels.
+def seen_at(sightings: list[Sighting], model: pycolmap.Reconstruction) -> tuple[Array, Array]:
+    """Places (N, 3) of points in a model by their clicks, and RMS distances (N,) of clicks from these, in pixels.
 
-    NaN where clicks or coordinates give nothing.
+    NaN where clicks give nothing.
     """
     images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
-    difference, rms = np.full((len(sightings), 3), np.nan), np.full(len(sightings), np.nan)
+    places, rms_px = np.full((len(sightings), 3), np.nan), np.full(len(sightings), np.nan)
     for row, sighting in enumerate(sightings):
-        if np.isfinite(sighting.x_in_model).all():
+        if not sighting.problem:
             seen = [images[photo] for photo, _ in sighting.point.clicks]
             position, residual = intersect(seen, np.array([pixel for _, pixel in sighting.point.clicks]))
             if position is not None:
-                difference[row], rms[row] = position - target[row], residual
-    return difference, rms
+                places[row], rms_px[row] = position, residual
+    return places, rms_px
 
 
 def describe_misses(sighting: Sighting, local_from_model: Sim3, target: Array) -> str:

@@ -20,11 +20,9 @@ MIN_GPS_PHOTOS = 5
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
 OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
-BENT = 0.02
+BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
-# Rounds in which the common shift of GPS positions and the similarity are fitted in turn.
-SHIFT_ROUNDS = 300
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 
@@ -44,7 +42,7 @@ class Placement:
     """How a model was placed.
 
     Attributes:
-        status: "georeferenced" (metres), "upright" (scene units).
+        status: "georeferenced" (metres, in a CRS), "scaled" (metres by known lengths), "upright" (scene units).
         reason: why, in words.
         local_from_model: similarity into the new frame.
         inliers: (N,) bool over the GPS positions used, or empty.
@@ -136,12 +134,18 @@ def place_by_control(
 
 
 def beside_gps(
-    placement: Placement, sightings: list[Sighting], there: Array, gps: GpsCameras, target: Array, where: str
+    placement: Placement,
+    sightings: list[Sighting],
+    there: Array,
+    gps: GpsCameras,
+    target: Array,
+    where: str,
+    settings: GeoreferenceSettings,
 ) -> Placement:
     """A placement by control points, refined by GPS positions up to a shift that all of them share.
 
     Another datum, heights above a geoid or a base station of its own move all positions alike: the control points say
-    where the model lies, the positions help to turn and scale it. Shift and similarity are fitted in turn.
+    where the model lies, the positions help to turn and scale it: a least-squares fit of both about their own means.
 
     Args:
         placement: by control points.
@@ -150,6 +154,7 @@ def beside_gps(
         gps: N photos with positions.
         target: (N, 3) the positions in the local frame, likewise.
         where: the control points' file, for messages.
+        settings: for the limit of outliers.
 
     Raises:
         StageError: GPS saw the cameras more than a kilometre away.
@@ -162,16 +167,32 @@ def beside_gps(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
             " correct their CRS or swapped axes, or switch use_gps off if GPS is wrong"
         )
-    limit = max(OUTLIER * float(np.median(gps.sd_m)), BENT * _extent(target)[0])
+    limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
-    start = np.concatenate([[s.x_in_model for s, u in zip(sightings, points) if u], gps.centres[inliers]])
-    sd_m = np.concatenate([[s.point.sd_m[0] for s, u in zip(sightings, points) if u], gps.sd_m[inliers, 0]])
-    for _ in range(SHIFT_ROUNDS if inliers.any() else 0):
-        here = fitted.apply(start)
-        wanted = np.concatenate([there[points], target[inliers] - shift])
-        fitted = fit_sim3(start, np.where(np.isfinite(wanted), wanted, here), sd_m**-2.0)
-        shift = _middle(target[inliers] - fitted.apply(gps.centres[inliers]))
+    if not inliers.any():
+        return replace(placement, inliers=inliers, gps_shift=shift)
+    start = [np.array([s.x_in_model for s, u in zip(sightings, points) if u]), gps.centres[inliers]]
+    wanted = [there[points], target[inliers]]
+    # Clicks add to what was stated of the coordinates.
+    miss_m = float(np.sqrt(np.nanmean((wanted[0] - fitted.apply(start[0])) ** 2)))
+    sd_m = [np.array([max(s.point.sd_m[0], miss_m) for s, u in zip(sightings, points) if u]), gps.sd_m[inliers, 0]]
+    for _ in range(FILL_ROUNDS):
+        here = [fitted.apply(part) for part in start]
+        here[1] += shift
+        filled = [np.where(np.isfinite(b), b, a) for a, b in zip(here, wanted)]
+        means = [
+            [np.average(part, axis=0, weights=sd**-2.0) for part, sd in zip(side, sd_m)] for side in (start, filled)
+        ]
+        centred = [np.concatenate([p - m for p, m in zip(side, mean)]) for side, mean in zip((start, filled), means)]
+        turn = fit_sim3(centred[0], centred[1], np.concatenate(sd_m) ** -2.0)
+        fitted = replace(turn, translation=means[1][0] - turn.scale * turn.rotation @ means[0][0])
+        shift = means[1][1] - fitted.apply(means[0][1])
     return replace(placement, local_from_model=fitted, inliers=inliers, gps_shift=shift)
+
+
+def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
+    """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
+    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, BENT * extent))
 
 
 def _middle(difference: Array) -> Array:
@@ -180,15 +201,17 @@ def _middle(difference: Array) -> Array:
     return np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
 
 
-def place_by_gps(centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int) -> Placement:
+def place_by_gps(
+    centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int, sd_m: float | None = None
+) -> Placement:
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
     the tilt: then the cameras' up direction (3,) closes it. Positions within five times the GPS accuracy of each other
-    say nothing about scale: then the model is only turned upright.
+    say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
     """
-    accuracy_m, extent = settings.gps_accuracy_m, _extent(target)
-    limit = max(OUTLIER * accuracy_m, BENT * extent[0])
+    accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
+    limit = _limit(accuracy_m, extent[0], settings)
     if extent[0] < SPREAD * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
@@ -229,6 +252,14 @@ def upright(up: Array, reason: str) -> Placement:
     """Only turn the model so that `up` (3,) becomes z; scale and origin stay."""
     rotation = rotation_between(up, UP)
     return Placement("upright", reason, Sim3(1.0, rotation, np.zeros(3)), np.zeros(0, dtype=bool))
+
+
+def scaled(placement: Placement, metres_per_unit: float, lengths: int) -> Placement:
+    """An upright placement in metres, by known lengths."""
+    one = replace(placement.local_from_model, scale=metres_per_unit)
+    return replace(
+        placement, status="scaled", reason=f"{placement.reason}; {lengths} known lengths", local_from_model=one
+    )
 
 
 def fit_measured(centres: Array, target: Array, limit: float, seed: int) -> tuple[Sim3, NDArray[np.bool_]]:

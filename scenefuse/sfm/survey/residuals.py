@@ -9,13 +9,18 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.survey.control import Control, Sighting, errors
+from scenefuse.sfm.survey.control import Control, Sighting, seen_at
+from scenefuse.sfm.survey.lengths import Lengths
 from scenefuse.sfm.survey.placement import GpsCameras, Placement
 from scenefuse.stage import atomic_file, quantity
 from scenefuse.transforms import Array
 
-COLUMNS = ["kind", "name", "used", "east_m", "north_m", "up_m", "horizontal_sd_m", "vertical_sd_m"]
+COLUMNS = ["kind", "name", "used", "error_m", "east_m", "north_m", "up_m", "horizontal_sd_m", "vertical_sd_m"]
 COLUMNS += ["photos", "reprojection_px"]
+
+
+# Control points that miss their coordinates by so many standard deviations deserve a note.
+MISFIT = 5.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +47,7 @@ class Georeference:
     @property
     def metric(self) -> bool:
         """Whether the model is in metres."""
-        return self.placement.status == "georeferenced" and self.frame is not None
+        return self.placement.status != "upright"
 
 
 @dataclass(frozen=True)
@@ -53,39 +58,52 @@ class Residuals:
         cameras: (N, 3) at the photos with positions, which are first moved by their common shift.
         points: (P, 3) at the surveyed points.
         points_px: (P,) RMS distances of clicks from the points that they show together.
+        lengths: known lengths as the model has them; None where there are none.
     """
 
     cameras: Array
     points: Array
     points_px: Array
+    lengths: Lengths | None = None
 
 
-def residuals_of(model: pycolmap.Reconstruction, found: Georeference) -> Residuals:
+def residuals_of(model: pycolmap.Reconstruction, found: Georeference, lengths: Lengths | None = None) -> Residuals:
     """Compare a georeferenced model with what was surveyed. Points lie where their clicks' rays meet."""
-    if not found.metric or found.frame is None:
-        return Residuals(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+    if found.placement.status != "georeferenced" or found.frame is None:
+        return Residuals(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), lengths)
     names, positions = found.gps.names, found.frame.apply(found.gps.positions) - found.placement.gps_shift
     centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
     target = found.frame.apply(np.array([s.point.position for s in found.sightings]).reshape(-1, 3))
-    return Residuals(centres - positions, *errors(found.sightings, model, target))
+    places, rms_px = seen_at(found.sightings, model)
+    return Residuals(centres - positions, places - target, rms_px, lengths)
 
 
 def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
     """Write a line for every surveyed point and every photo with a position; cells without a value are empty."""
     rows: list[list[Any]] = []
-    if found.metric:
+    if left.lengths is not None:
+        used = "yes" if found.placement.status == "scaled" else "no"
+        for name, error in zip(left.lengths.names, left.lengths.in_model - left.lengths.metres):
+            rows.append(["length", name, used, error, *[""] * 7])
+    if found.placement.status == "georeferenced":
         for row, sighting in enumerate(found.sightings):
             point, kind = sighting.point, "check point" if sighting.point.check else "control point"
             used = "yes" if found.placement.used[row] else "no"
             counts = [len(point.clicks), left.points_px[row]]
-            rows.append([kind, point.name, used, *left.points[row], *point.sd_m, *counts])
+            rows.append([kind, point.name, used, _length(left.points[row]), *left.points[row], *point.sd_m, *counts])
         for row, name in enumerate(found.gps.names):
             chosen = found.placement.inliers
             used = "yes" if len(chosen) and chosen[row] else "no"
-            rows.append(["position", name, used, *left.cameras[row], *found.gps.sd_m[row], "", ""])
+            error = left.cameras[row]
+            rows.append(["position", name, used, _length(error), *error, *found.gps.sd_m[row], "", ""])
     with atomic_file(path) as temporary:
         lines = ["\t".join(COLUMNS), *("\t".join(map(_cell, row)) for row in rows)]
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _length(error: Array) -> float:
+    """Length of an error (3,) over its known coordinates; NaN where none is."""
+    return float(np.sqrt(np.nansum(error**2))) if np.isfinite(error).any() else np.nan
 
 
 def _cell(value: Any) -> str:
@@ -111,7 +129,8 @@ def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg
         "up_cue": quantity(cue if placement.levelled else "control points" if found.control else "GPS", ""),
         "camera_roll_median_deg": quantity(roll_deg, "deg"),
     }
-    if not found.metric or found.frame is None:
+    content |= {} if left.lengths is None else _of_lengths(left.lengths, found.placement.status)
+    if found.placement.status != "georeferenced" or found.frame is None:
         return content
     frame, crs_from_local = found.frame, found.frame.crs_from_local()
     measured = placement.heights == "measured"
@@ -127,6 +146,20 @@ def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg
     if found.control is not None:
         content |= _of_points(found, found.control, left)
     return content | (_of_cameras(found, left) if len(placement.inliers) else {})
+
+
+def _of_lengths(lengths: Lengths, status: str) -> dict[str, Any]:
+    """Errors of known lengths, as quantities."""
+    error = lengths.in_model - lengths.metres
+    content = {
+        "lengths": quantity(len(error), "1"),
+        "lengths_used": quantity(status == "scaled", ""),
+        "length_errors_m": quantity(dict(zip(lengths.names, error.round(5).tolist())), "m"),
+        "length_rms_m": quantity(rms(error[:, None]), "m"),
+        "length_rms_pct": quantity(100 * (rms(error[:, None] / lengths.metres[:, None]) or 0.0), "%"),
+    }
+    print(f"{len(error)} known lengths: RMS {content['length_rms_m']['value']:.4f} m", flush=True)
+    return content
 
 
 def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[str, Any]:
@@ -145,6 +178,14 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
         if rows.any():
             height = "heights unknown" if vertical is None else f"vertically {vertical:.3f} m"
             print(f"{rows.sum()} {kind} points: RMS horizontally {horizontal:.3f} m, {height}", flush=True)
+    used = [s.point.sd_m[0] for s, u in zip(control.sightings, found.placement.used) if u]
+    miss_m, sd_m = content["control_rms_horizontal_m"]["value"], float(np.median(used))
+    if miss_m > MISFIT * sd_m:
+        print(
+            f"note: the control points miss their coordinates by {miss_m:.2f} m, but {sd_m:g} m is stated for them;"
+            " give their standard deviations in columns 8 and 9, or correct coordinates and clicks",
+            flush=True,
+        )
     return content
 
 

@@ -1,0 +1,113 @@
+"""A sparse model from cameras that another program found: its poses and lenses, and points triangulated from matches."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from scenefuse.sfm.given.opensfm import find_opensfm, read_opensfm
+from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.photos import SHAPE_TOLERANCE
+from scenefuse.sfm.posed_photos import PosedPhoto, find_posed_photos
+from scenefuse.stage import StageError, scratch_directory
+
+# Cameras that fit their photos give each photo so many points at least, in the median.
+MIN_POINTS = 20
+# Parameters of lenses that differ by less, relatively, are of one camera.
+SAME_LENS = 1e-6
+
+
+def triangulated(
+    cameras: Path, folder: Path, database: Path, work: Path, options: pycolmap.IncrementalPipelineOptions
+) -> pycolmap.Reconstruction:
+    """The model of given cameras: poses and lenses as they are, points from the photos' own matches.
+
+    Args:
+        cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json; or a folder with one.
+        folder: of the photos.
+        database: COLMAP database with verified matches.
+        work: folder for files in between; it is removed again.
+        options: COLMAP's, of triangulation.
+
+    Raises:
+        StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
+            camera in the database but not here; cameras that do not fit the photos.
+    """
+    posed = _by_name(read_given(cameras, folder), cameras)
+    with scratch_directory(work) as scratch:
+        calibrated = scratch / "database.db"
+        shutil.copyfile(database, calibrated)
+        with pycolmap.Database.open(calibrated) as opened:
+            images = {image.image_id: posed.get(Path(image.name).name) for image in opened.read_all_images()}
+            shared: dict[int, PosedPhoto] = {}
+            for image in opened.read_all_images():
+                photo = images[image.image_id]
+                if photo is not None:
+                    own = opened.read_camera(image.camera_id)
+                    _check_same(shared.setdefault(image.camera_id, photo), photo, cameras)
+                    opened.update_camera(_fitted(photo, own, cameras))
+            if not shared:
+                some = ", ".join(sorted(posed)[:3])
+                raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
+            cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+        model = pycolmap.Reconstruction()
+        model.load(cache)
+        for number, photo in images.items():
+            if photo is not None and number in model.images:
+                pose = pycolmap.Rigid3d(np.linalg.inv(photo.object_from_cam)[:3])
+                frame = model.images[number].frame
+                assert frame is not None
+                frame.set_cam_from_world(model.images[number].camera_id, pose)
+                model.register_frame(frame.frame_id)
+        (scratch / "points").mkdir()
+        found = cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
+    points = [found.images[i].num_points3D for i in found.reg_image_ids()]
+    if not points or np.median(points) < MIN_POINTS:
+        raise StageError(
+            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
+            " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
+        )
+    return found
+
+
+def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
+    """The posed photos of any format that is read."""
+    if not cameras.exists():
+        raise StageError(f"the cameras {cameras} do not exist; correct the path")
+    file = find_opensfm(cameras)
+    if file is not None:
+        return read_opensfm(file, folder)
+    has_json = cameras.is_file() or any((cameras / f"transforms{end}.json").is_file() for end in ("", "_train"))
+    return find_posed_photos(cameras, None if has_json else folder)[0]
+
+
+def _by_name(photos: list[PosedPhoto], cameras: Path) -> dict[str, PosedPhoto]:
+    names = [photo.file.name for photo in photos]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"{cameras}: two photos are called {twice}; give every photo a name of its own")
+    return dict(zip(names, photos))
+
+
+def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:
+    """StageError where photos of one camera in the database have two lenses here."""
+    a, b = first.camera, photo.camera
+    if a.model != b.model or not np.allclose(a.params, b.params, rtol=SAME_LENS):
+        raise StageError(
+            f"{cameras}: {first.file.name} and {photo.file.name} have different lenses, but count as photos of one"
+            " camera; set features.camera_mode to per_photo"
+        )
+
+
+def _fitted(photo: PosedPhoto, own: pycolmap.Camera, cameras: Path) -> pycolmap.Camera:
+    """A given camera at the size of the photos, with the id of the database's."""
+    camera = pycolmap.Camera(photo.camera.todict())
+    if abs(camera.width / camera.height * own.height / own.width - 1) > SHAPE_TOLERANCE:
+        raise StageError(
+            f"{cameras}: the camera of {photo.file.name} has {camera.width} x {camera.height} pixels, but the photo"
+            f" {own.width} x {own.height}; give the photos that the cameras were computed for"
+        )
+    camera.rescale(own.width, own.height)
+    camera.camera_id, camera.has_prior_focal_length = own.camera_id, True
+    return camera

@@ -1,0 +1,71 @@
+"""Cameras of OpenSfM, which OpenDroneMap runs: reconstruction.json."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from scipy.spatial.transform import Rotation
+
+from scenefuse.sfm.posed_photos import PosedPhoto
+from scenefuse.stage import StageError
+
+FILE = "reconstruction.json"
+# Where an OpenDroneMap project has it.
+PLACES = (FILE, f"opensfm/{FILE}")
+
+
+def find_opensfm(data: Path) -> Path | None:
+    """The reconstruction.json of a folder, or the file itself; None where there is none."""
+    if data.is_file():
+        return data if data.name == FILE else None
+    return next((data / place for place in PLACES if (data / place).is_file()), None)
+
+
+def read_opensfm(file: Path, folder: Path) -> list[PosedPhoto]:
+    """The posed photos of the reconstruction with most of them; lenses perspective and brown.
+
+    OpenSfM counts pixels from the middle of the photo, in units of its longer side; a pose is an angle-axis rotation
+    and a translation into the camera, whose axes are OpenCV's.
+
+    Args:
+        file: reconstruction.json.
+        folder: of the photos.
+
+    Raises:
+        StageError: the file is no such JSON, or has a lens of another kind.
+    """
+    try:
+        parts = json.loads(file.read_text())
+        largest = max(parts, key=lambda part: len(part["shots"]))
+        cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in largest["cameras"].items()}
+        return [
+            PosedPhoto(name, folder / name, cameras[shot["camera"]], _pose(shot), None, False)
+            for name, shot in sorted(largest["shots"].items())
+        ]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise StageError(f"{file} is no reconstruction of OpenSfM ({error!r}); export it again") from None
+
+
+def _camera(entry: dict[str, Any], where: str) -> pycolmap.Camera:
+    width, height, kind = int(entry["width"]), int(entry["height"]), entry["projection_type"]
+    size = max(width, height)
+    if kind == "perspective":
+        params = [entry["focal"] * size, width / 2, height / 2, entry["k1"], entry["k2"]]
+        return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
+    if kind == "brown":
+        focal = [entry["focal_x"] * size, entry["focal_y"] * size]
+        middle = [width / 2 + entry["c_x"] * size, height / 2 + entry["c_y"] * size]
+        bent = [entry[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+        params = [*focal, *middle, *bent, 0.0, 0.0, 0.0]
+        return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    raise StageError(f"{where} is of the kind {kind}; perspective and brown are read")
+
+
+def _pose(shot: dict[str, Any]) -> np.ndarray:
+    """(4, 4) world_from_cam."""
+    cam_from_world = np.eye(4)
+    cam_from_world[:3, :3] = Rotation.from_rotvec(shot["rotation"]).as_matrix()
+    cam_from_world[:3, 3] = shot["translation"]
+    return np.asarray(np.linalg.inv(cam_from_world))

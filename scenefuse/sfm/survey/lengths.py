@@ -1,0 +1,100 @@
+"""Known lengths in photos: scale bars, which bring a model into metres where there is neither GPS nor control."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from scenefuse.sfm.fiducials import Clicks, triangulate
+from scenefuse.sfm.photos import Photo
+from scenefuse.sfm.survey.control import CLICK_LIMIT
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+
+COLUMNS = ["length", "metres", "end", "photo", "x_px", "y_px"]
+# Lengths that differ by more from one scale say that one of them is wrong.
+MOST_OFF = 0.05
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Known lengths in a model.
+
+    Attributes:
+        names: of L lengths.
+        metres: (L,) how long they are.
+        in_model: (L,) how long they are in the model.
+    """
+
+    names: list[str]
+    metres: Array
+    in_model: Array
+
+    @property
+    def scale(self) -> float:
+        """Metres in a unit of the model, by least squares."""
+        return float(self.metres @ self.in_model / (self.in_model @ self.in_model))
+
+
+def read_lengths(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]) -> Lengths:
+    """Read lengths.tsv, a line a click: name of the length, metres, end (any two words), photo, pixel. Both ends are
+    clicked in two photos or more.
+
+    Raises:
+        StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
+            different values, an end that is missing, clicks that contradict each other, lengths that do.
+    """
+    metres, ends, clicks = _read(path)
+    sizes = {p.name: (p.width, p.height) for p in photos}
+    limit_px = CLICK_LIMIT * max(max(camera.width, camera.height) for camera in model.cameras.values())
+    names, places, _ = triangulate(clicks, model, limit_px, sizes)
+    at = dict(zip(names, places))
+    in_model = np.array([np.linalg.norm(np.subtract(*(at[f"{name} {end}"] for end in ends[name]))) for name in metres])
+    if not (in_model > 0).all():
+        raise StageError(
+            f"{path}: both ends of {list(metres)[int(in_model.argmin())]} lie at one place; click them again"
+        )
+    found = Lengths(list(metres), np.array(list(metres.values())), in_model)
+    off = found.scale * in_model / found.metres - 1
+    if np.abs(off).max() > MOST_OFF:
+        each = ", ".join(f"{name} {100 * o:+.1f} %" for name, o in zip(metres, off))
+        raise StageError(f"{path}: the lengths contradict each other: off one scale by {each}; correct the wrong one")
+    return found
+
+
+def _read(path: Path) -> tuple[dict[str, float], dict[str, list[str]], Clicks]:
+    """Lengths and ends by name, and the clicks on `name end`."""
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (FileNotFoundError, IsADirectoryError):
+        raise StageError(f"the file of lengths {path} does not exist; write it, or correct its path") from None
+    except UnicodeDecodeError:
+        raise StageError(f"{path} is no text; save the lengths as tab-separated text (UTF-8)") from None
+    rows = [(n, [c.strip() for c in line.split("\t")]) for n, line in enumerate(lines, 1) if line.strip()]
+    rows = [(n, cells) for n, cells in rows if not cells[0].startswith("#")]
+    if not rows or rows[0][1] != COLUMNS or len(rows) == 1:
+        raise StageError(
+            f"{path} has to begin with the tab-separated header '{' '.join(COLUMNS)}', and to go on with clicks"
+        )
+    metres: dict[str, float] = {}
+    ends: dict[str, list[str]] = {}
+    found: list[tuple[str, str, list[float]]] = []
+    for number, cells in rows[1:]:
+        try:
+            name, end, photo = cells[0], cells[2], cells[3]
+            long, *pixel = (float(cell) for cell in (cells[1], *cells[4:6]))
+            if len(cells) != 6 or not np.isfinite([long, *pixel]).all():
+                raise ValueError
+        except (ValueError, IndexError):
+            raise StageError(f"{path}, line {number}: expected {' '.join(COLUMNS)}, got '{' '.join(cells)}'") from None
+        if long <= 0 or metres.setdefault(name, long) != long:
+            raise StageError(f"{path}, line {number}: {name} is {long:g} m here; give one positive length, in metres")
+        ends.setdefault(name, [])
+        ends[name] += [] if end in ends[name] else [end]
+        found.append((f"{name} {end}", photo, pixel))
+    odd = next((name for name, two in ends.items() if len(two) != 2), None)
+    if odd is not None:
+        raise StageError(f"{path}: {odd} has the ends {', '.join(ends[odd])}; click two, each in two photos or more")
+    pixels = np.array([pixel for _, _, pixel in found])
+    return metres, ends, Clicks(path, [point for point, _, _ in found], [photo for _, photo, _ in found], pixels)

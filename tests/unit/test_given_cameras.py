@@ -1,0 +1,128 @@
+"""Cameras of other programs in the place of mapping: written by the test, read back, and triangulated."""
+
+import json
+
+import numpy as np
+import pycolmap
+import pytest
+from scipy.spatial.transform import Rotation
+from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
+
+from scenefuse.sfm.georeference import camera_poses
+from scenefuse.sfm.given.cameras import read_given
+from scenefuse.sfm.mapping import MappingSettings, map_photos
+from scenefuse.sfm.photos import write_photos
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.workspace import write_model
+
+FLIGHT = fly(rows=3, columns=3)
+
+
+def with_database(folder):
+    """A database of exact observations and verified matches, and the list of photos; their names and sizes."""
+    write_photos(folder / "photos.json", FLIGHT.photos(), folder, "photos", [])
+    (folder / "photos").mkdir()
+    with pycolmap.Database.open(folder / "database.db") as database:
+        camera = pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[500.0, 400, 300, 0])
+        number = database.write_camera(camera)
+        rig = pycolmap.Rig()
+        rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number))
+        rig_id, rows = database.write_rig(rig), []
+        for view in FLIGHT.views:
+            (folder / "photos" / view.name).write_bytes(b"")
+            image = database.write_image(pycolmap.Image(name=view.name, camera_id=number))
+            frame = pycolmap.Frame()
+            frame.rig_id = rig_id
+            data = pycolmap.data_t(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, number), image)
+            frame.add_data_id(data)
+            database.write_frame(frame)
+            seen, pixels, _ = view.visible(FLIGHT.ground)
+            database.write_keypoints(image, view.project(FLIGHT.ground[seen])[0].astype(np.float32))
+            rows.append((image, {int(point): k for k, point in enumerate(seen)}))
+        for k, (first, a) in enumerate(rows):
+            for second, b in rows[k + 1 :]:
+                both = sorted(a.keys() & b.keys())
+                if len(both) >= 15:
+                    geometry = pycolmap.TwoViewGeometry()
+                    geometry.config = pycolmap.TwoViewGeometryConfiguration.CALIBRATED
+                    geometry.inlier_matches = np.array([[a[p], b[p]] for p in both], dtype=np.uint32)
+                    database.write_two_view_geometry(first, second, geometry)
+
+
+def colmap(folder):
+    (folder / "given/sparse").mkdir(parents=True)
+    write_model(folder / "given/sparse", FLIGHT.views)
+    return folder / "given"
+
+
+def nerfstudio(folder):
+    frames = []
+    for view in FLIGHT.views:
+        pose = view.world_from_cam @ np.diag([1.0, -1, -1, 1])
+        frames.append({"file_path": f"photos/{view.name}", "transform_matrix": pose.tolist()})
+    lens = {"w": WIDTH, "h": HEIGHT, "fl_x": FOCAL, "fl_y": FOCAL, "cx": WIDTH / 2, "cy": HEIGHT / 2}
+    (folder / "transforms.json").write_text(json.dumps(lens | {"frames": frames}))
+    return folder / "transforms.json"
+
+
+def opensfm(folder, kind="perspective"):
+    lens = {"projection_type": kind, "width": 2 * WIDTH, "height": 2 * HEIGHT, "k1": 0.0, "k2": 0.0}
+    lens |= {"focal": FOCAL / WIDTH, "focal_x": FOCAL / WIDTH, "focal_y": FOCAL / WIDTH, "c_x": 0.0, "c_y": 0.0}
+    lens |= {"p1": 0.0, "p2": 0.0, "k3": 0.0}
+    shots = {}
+    for view in FLIGHT.views:
+        turn = Rotation.from_matrix(view.cam_from_world[:3, :3]).as_rotvec().tolist()
+        shots[view.name] = {"rotation": turn, "translation": view.cam_from_world[:3, 3].tolist(), "camera": "c"}
+    (folder / "opensfm").mkdir(exist_ok=True)
+    (folder / "opensfm/reconstruction.json").write_text(json.dumps([{"cameras": {"c": lens}, "shots": shots}]))
+    return folder
+
+
+def mapped(folder, cameras):
+    map_photos(
+        folder=folder / "photos",
+        photos=folder / "photos.json",
+        database=folder / "database.db",
+        sparse=folder / "sparse",
+        report=folder / "sparse.json",
+        cameras=cameras,
+        settings=MappingSettings(),
+        seed=0,
+    )
+    return read_json(folder / "sparse.json"), pycolmap.Reconstruction(folder / "sparse")
+
+
+@pytest.mark.parametrize("write", [colmap, nerfstudio, opensfm, lambda folder: opensfm(folder, "brown")])
+def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
+    with_database(tmp_path)
+    report, model = mapped(tmp_path, write(tmp_path))
+    names, _, centres = camera_poses(model)
+    assert names == FLIGHT.names
+    np.testing.assert_allclose(centres, FLIGHT.centres, atol=1e-6)
+    camera = next(iter(model.cameras.values()))
+    assert (camera.width, camera.height) == (WIDTH, HEIGHT) and camera.mean_focal_length() == pytest.approx(FOCAL)
+    assert value(report, "registered") == 9 and value(report, "lens") == "known"
+    assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
+    # Every point lies on one that the photos show.
+    places = np.array([model.points3D[p].xyz for p in sorted(model.point3D_ids())])
+    nearest = np.linalg.norm(places[:, None] - FLIGHT.ground[None], axis=2).min(1)
+    assert nearest.max() < 1e-3
+
+
+def test_wrong_cameras_are_named(tmp_path):
+    with_database(tmp_path)
+    with pytest.raises(StageError, match="do not exist"):
+        mapped(tmp_path, tmp_path / "none")
+    path = nerfstudio(tmp_path)
+    content = json.loads(path.read_text())
+    for frame, other in zip(content["frames"], json.loads(path.read_text())["frames"][::-1]):
+        frame["transform_matrix"] = other["transform_matrix"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(StageError, match="do not fit the photos"):
+        mapped(tmp_path, path)
+    opensfm(tmp_path, "fisheye")
+    with pytest.raises(StageError, match="of the kind fisheye"):
+        read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+    (tmp_path / "opensfm/reconstruction.json").write_text("{}")
+    with pytest.raises(StageError, match="no reconstruction of OpenSfM"):
+        read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
