@@ -101,7 +101,8 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
 
 
 def test_with_recipe_paper_the_papers_registration_is_the_one_that_is_fused(project):
-    shipped, paper = (project(object={"recipe": name}).variants for name in ("scenefuse", "paper"))
+    both = {"variants": ["full", "paper"]}
+    shipped, paper = (project(object={"recipe": r}, registration=both).variants for r in ("scenefuse", "paper"))
     assert paper["full"] == shipped["paper"] != shipped["full"]
 
 
