@@ -267,11 +267,17 @@ def paper_preset(
         columns["null"] = of_chance(of, out / name / poses[0], known, chosen)
         ours_first = [cells for name, cells in columns.items() if name in COLUMNS.values()]
         measures = dict.fromkeys(key for cells in [*ours_first[::-1], *columns.values()] for key in cells)
-        rows += [{"object": name, "measure": m} | {c: cells.get(m) for c, cells in columns.items()} for m in measures]
+        for measure in measures:
+            rows.append({"object": name, "measure": measure})
+            rows[-1] |= {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}
     table = pd.DataFrame(rows)
     out.mkdir(parents=True, exist_ok=True)
-    table.to_csv(out / "paper_preset.tsv", sep="\t", index=False, float_format="%.5g")
+    table.to_csv(out / "paper_preset.tsv", sep="\t", index=False)
     print_table(table)
+
+
+def _five_digits(cell: Any) -> Any:
+    return float(f"{cell:.5g}") if isinstance(cell, float) else cell
 
 
 def print_table(table: pd.DataFrame) -> None:
