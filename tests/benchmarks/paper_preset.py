@@ -268,8 +268,8 @@ def paper_preset(
         ours_first = [cells for name, cells in columns.items() if name in COLUMNS.values()]
         measures = dict.fromkeys(key for cells in [*ours_first[::-1], *columns.values()] for key in cells)
         for measure in measures:
-            rows.append({"object": name, "measure": measure})
-            rows[-1] |= {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}
+            row = {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}
+            rows.append({"object": name, "measure": measure} | row)
     table = pd.DataFrame(rows)
     out.mkdir(parents=True, exist_ok=True)
     table.to_csv(out / "paper_preset.tsv", sep="\t", index=False)
