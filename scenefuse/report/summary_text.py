@@ -26,8 +26,7 @@ WIDTH = 100
 _COLUMNS = ("value", *BESIDE)
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
-_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "mode", "workspace", "kept", "kernels")
-_CHOICES += ("pose_source",)
+_CHOICES = frozenset("backend device method pairs_choice up_cue mode workspace pose_source kept kernels".split())
 
 
 def summary_text(
