@@ -119,7 +119,7 @@ def reconstruct(folder: Path, of: Path, settings: dict[str, Any], source: PoseSo
 
 
 def join(folder: Path, of: Path, scene: Path, fiducials: Path, settings: dict[str, Any]) -> None:
-    """Crop, registration, fusion and metrics of the paper, at the thresholds of the demo's own run; its ablation too."""
+    """Crop, registration, fusion and metrics of the paper, at the thresholds of the demo's own run; its ablation."""
     marked = CropInputs(scene / "dense.ply", scene / "georeferenced", scene / "georeference.json", fiducials)
     box, reference = build(CropSettings, settings["registration"]["crop"]), of / "registration/full"
     measured: dict[str, Any] = {
