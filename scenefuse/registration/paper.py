@@ -62,7 +62,7 @@ def register_as_paper(
     coarse_report: Path,
     report: Path,
     picture: Path | None = None,
-    scale: Literal["rms", "ransac_svd"] = "rms",
+    scale: Literal["rms", "ransac_svd", "none"] = "rms",
     seed: int,
 ) -> None:
     """Register an object by the paper's recipe: scale, coarse and fine registration, nothing rejected.
@@ -73,7 +73,8 @@ def register_as_paper(
         coarse_report: output JSON as of the coarse stage.
         report: output JSON as of the fine stage; its `status` is `ungated`, what has no gate is null.
         picture: output PNG, the object on the scene crop from three sides.
-        scale: `rms` over whole clouds, the paper's formula, or `ransac_svd` over matches, its text.
+        scale: `rms` over whole clouds, the paper's formula, or `ransac_svd` over matches, its text; `none` takes the
+            object as large as it is, the paper's ablation.
         seed: of RANSAC.
 
     Raises:
@@ -90,7 +91,8 @@ def register_as_paper(
             scale = "rms"
         else:
             ledger = [Estimate(scale, matched, True), *ledger]
-    problem = Problem(obj, scene, ScaleRange(ledger[0].scale, 0.0), Evidence(ups), seed)
+    held = 1.0 if scale == "none" else ledger[0].scale
+    problem = Problem(obj, scene, ScaleRange(held, 0.0), Evidence(ups), seed)
     pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
     between = time.perf_counter()

@@ -27,8 +27,8 @@ WIDTH = 100
 _COLUMNS = ("value", *BESIDE)
 _NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
 _TOLD = ("fine.reason", "fusion.reason", "alignment.reason")
-_CHOICES = ("backend", "device", "method", "pairs_choice", "up_cue", "mode", "workspace", "kept", "kernels")
-_CHOICES += ("pose_source",)
+_PLACES = ("workspace", "pose_source", "device", "backend", "kernels")
+_CHOICES = (*_PLACES, "method", "pairs_choice", "up_cue", "mode", "kept")
 
 
 def summary_text(

@@ -101,10 +101,6 @@ def test_fused_depth_refines_the_depth_and_the_pose_network(tmp_path):
     depth = predict(networks.depth, frames, supervision)
     assert torch.median((depth - 1.4).abs()) < 0.05 and losses[-1]["target"] < 0.5 * losses[0]["target"]
     assert losses[-1]["pose"] < 0.3 * losses[0]["pose"]
-    alone, _, _ = _trained(frames, tmp_path / "alone.pt")
-    small = small_photos(frames)
-    ours, theirs = (n.pose(small[:-1], small[1:]).detach() for n in (networks, alone))
-    assert not torch.allclose(ours, theirs, atol=1e-2)
 
 
 @pytest.mark.parametrize("name", ["depth", "pose"])
