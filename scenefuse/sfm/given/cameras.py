@@ -1,4 +1,4 @@
-"""A sparse model from cameras that another program found: its poses and lenses, and points triangulated from matches."""
+"""A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
 
 import shutil
 from pathlib import Path
