@@ -24,7 +24,7 @@ from scenefuse.metrics.truth import (
     read_posed,
     sample_surface,
 )
-from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.sfm.geodesy import LocalFrame, scene_frame
 from scenefuse.stage import quantity, read_json, setting, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -115,12 +115,12 @@ def _covered(ground: Array, cloud: TiledCloud, truth_from_cloud: Sim3, reach: fl
 
 def _georeference_error(report: dict[str, Any], truth: dict[str, Any], posed: Posed, cameras: Cameras) -> float | None:
     """Median distance of the georeferenced cameras from the true ones, nothing fitted; None without an origin."""
-    keys = ("origin_latitude_deg", "origin_longitude_deg", "origin_altitude_m")
-    if not all(key in report and value(report, key) is not None for key in keys):
+    frame = scene_frame(report)
+    if not isinstance(frame, LocalFrame) or value(report, "origin_altitude_m") is None:
         return None
-    true_frame = LocalFrame(*(float(v) for v in value(truth, "origin")))
-    scene_frame = LocalFrame(*(float(value(report, key)) for key in keys))
-    expected = scene_frame.apply(true_frame.inverse(cameras.centres[[true for _, true in posed]]))
+    latitude, longitude, altitude = value(truth, "origin")
+    true_frame = LocalFrame(latitude, longitude, altitude)
+    expected = frame.apply(true_frame.inverse(cameras.centres[[true for _, true in posed]]))
     centres = np.array([view.centre for view, _ in posed])
     return float(np.median(np.linalg.norm(centres - expected, axis=1)))
 
