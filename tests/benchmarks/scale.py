@@ -104,7 +104,7 @@ class Cost:
         result: what it gave.
         seconds: by the clock.
         cpu_seconds: of all its threads.
-        peak_gb: largest memory of the process, with the libraries that it loads (0.5 GB).
+        peak_gb: largest memory of the process with its libraries; no less than that of the one that started it.
     """
 
     result: Any
@@ -238,7 +238,7 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
         by_laspy = timed(laspy_reads, folder / "yard.laz", low, high)
         row |= by_laspy.row("laspy") | {"laspy_points": by_laspy.result}
         (folder / "yard.laz").unlink()
-        make_copc(folder / "yard.copc.laz", count)
+        timed(make_copc, folder / "yard.copc.laz", count)
         by_copc = timed(copc_reads, folder / "yard.copc.laz", low, high)
         row |= by_copc.row("copc") | {"copc_points": by_copc.result}
         (folder / "yard.copc.laz").unlink()
