@@ -14,9 +14,10 @@ settings, and kept.
 import contextlib
 import copy
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -136,7 +137,7 @@ def leave_one_out(photos: Path, control: Path, work: Path, sd_m: float | None = 
         left.append([error[0] for error in solved(capture, others, [sightings[row]], NO_GPS)])
         point = whole.sightings[row].point
         print(f"{point.name}\t{len(point.clicks)}\t{_words(left[-1][0])}\t{_words(left[-1][1])}", flush=True)
-    _print("left out", np.array(left).transpose(1, 0, 2))
+    _print("left out", list(np.array(left).transpose(1, 0, 2)))
 
 
 def simulated(scene: Path, truth: Path, seeds: int = 3) -> None:
@@ -249,6 +250,15 @@ def _print(label: str, found: Sequence[Array]) -> None:
         )
 
 
-if __name__ == "__main__":
-    commands = {"leave-one-out": leave_one_out, "simulated": simulated, "positions": positions}
+def control_points() -> None:
+    """One of the three, as the command line says."""
+    commands: dict[str, Callable[..., Any]] = {
+        "leave-one-out": leave_one_out,
+        "simulated": simulated,
+        "positions": positions,
+    }
     tyro.extras.subcommand_cli_from_dict(commands)
+
+
+if __name__ == "__main__":
+    control_points()
