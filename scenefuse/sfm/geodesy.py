@@ -1,7 +1,7 @@
 """From GPS to a local metric frame: east, north, up about an origin, and its place in a UTM zone."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ class LocalFrame:
     latitude_deg: float
     longitude_deg: float
     altitude_m: float
-    grid: str = ""
+    grid: str = field(default="", kw_only=True)
 
     def apply(self, positions: Array) -> Array:
         """(N, 3) latitude (deg), longitude (deg), altitude (m) to (N, 3) east, north, up in metres.
@@ -154,4 +154,4 @@ def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | Non
         value(georeference, f"origin_{name}") for name in ("latitude_deg", "longitude_deg", "altitude_m")
     )
     grid = value(georeference, "crs") if "crs" in georeference else ""
-    return LocalFrame(float(latitude), float(longitude), float(altitude or 0.0), grid)
+    return LocalFrame(float(latitude), float(longitude), float(altitude or 0.0), grid=grid)

@@ -13,36 +13,22 @@ def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
     A handler for SIGTERM only runs in the main thread, and only between two Python instructions.
     """
     token = pycolmap.CancellationToken()
-
-    def cancel(worker: threading.Thread) -> None:
-        token.cancel()
-        worker.join()
-
-    return _beside(lambda: function(*args, cancellation_token=token, **kwargs), cancel)
-
-
-def interruptible(function: Callable[[], Any]) -> Any:
-    """The same for one that takes no token: a signal leaves it behind, and it ends with the process."""
-    return _beside(function, lambda worker: None)
-
-
-def _beside(function: Callable[[], Any], leave: Callable[[threading.Thread], None]) -> Any:
-    """What a function returns or raises beside the main thread; `leave` is called when a signal comes."""
     outcome: dict[str, Any] = {}
 
     def work() -> None:
         try:
-            outcome["result"] = function()
+            outcome["result"] = function(*args, cancellation_token=token, **kwargs)
         except BaseException as error:
             outcome["error"] = error
 
-    worker = threading.Thread(target=work, daemon=True)
+    worker = threading.Thread(target=work)
     worker.start()
     try:
         while worker.is_alive():
             worker.join(0.2)
     except BaseException:
-        leave(worker)
+        token.cancel()
+        worker.join()
         raise
     if "error" in outcome:
         raise outcome["error"]

@@ -17,6 +17,7 @@ import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -136,14 +137,13 @@ def leave_one_out(photos: Path, control: Path, work: Path, sd_m: float | None = 
         left.append([error[0] for error in solved(capture, others, [sightings[row]], NO_GPS)])
         point = whole.sightings[row].point
         print(f"{point.name}\t{len(point.clicks)}\t{_words(left[-1][0])}\t{_words(left[-1][1])}", flush=True)
-    _print("left out", [np.array(errors) for errors in zip(*left)])
+    _print("left out", list(np.array(left).transpose(1, 0, 2)))
 
 
 def simulated(scene: Path, truth: Path, seeds: int = 3) -> None:
     """Control points, check points and positions of the demo, simulated from its truth."""
     capture, cameras = read_capture(scene), read_cameras(truth / "cameras.json")
-    latitude, longitude, altitude = value(read_json(truth / "cameras.json"), "origin")
-    origin = LocalFrame(latitude, longitude, altitude)
+    origin = LocalFrame(*(float(v) for v in value(read_json(truth / "cameras.json"), "origin")))
     places = _ground(truth, cameras)
     for noise_m in (0.02, 3.0):
         for counted in (0, CONTROL):
@@ -250,12 +250,15 @@ def _print(label: str, found: Sequence[Array]) -> None:
         )
 
 
-COMMANDS: dict[str, Callable[..., None]] = {
-    "leave-one-out": leave_one_out,
-    "simulated": simulated,
-    "positions": positions,
-}
+def control_points() -> None:
+    """One of the three, as the command line says."""
+    commands: dict[str, Callable[..., Any]] = {
+        "leave-one-out": leave_one_out,
+        "simulated": simulated,
+        "positions": positions,
+    }
+    tyro.extras.subcommand_cli_from_dict(commands)
 
 
 if __name__ == "__main__":
-    tyro.extras.subcommand_cli_from_dict(COMMANDS)
+    control_points()

@@ -13,9 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from support.changed_scene import write_changes
 
-from scenefuse.fusion.evidence import unchecked
-from scenefuse.fusion.fuse_object import FROM_OBJECT, with_source
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import quantity, write_json
 
@@ -33,10 +32,10 @@ def sheet(low, high):
     return Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
 
 
-def added_by(name):
+def added_of(name):
     """What an object adds, each beside the scene."""
     low = {"shed": 5, "barn": 8}.get(name, 5)
-    return with_source(unchecked(sheet(low, low + 2)), FROM_OBJECT)
+    return sheet(low, low + 2)
 
 
 def write_stages(folder: Path, files: list[str], date: float) -> None:
@@ -47,16 +46,18 @@ def write_stages(folder: Path, files: list[str], date: float) -> None:
     content["fusion.json"] = {"status": quantity("fused", ""), "checked_points": quantity(0, "points")}
     for path in (folder / file for file in files):
         path.parent.mkdir(parents=True, exist_ok=True)
-        if path.suffix == ".ply":
-            clouds = {"object.ply": sheet(5, 7), "fused.ply": added_by(path.parent.name)}
-            write_cloud(path, clouds.get(path.name, sheet(0, 5)))
+        if path.name in ("fused.ply", "checked.ply"):
+            write_changes(path.parent, sheet(0, 5), added_of(path.parent.name))
+        elif path.suffix == ".ply":
+            write_cloud(path, sheet(5, 7) if path.name == "object.ply" else sheet(0, 5))
         elif path.suffix == ".png":
             cv2.imwrite(str(path), np.zeros((4, 4), dtype=np.uint8))
         elif path.suffix:
             write_json(path, content.get(path.name, {}))
         else:
             path.mkdir(exist_ok=True)
-        os.utime(path, (date, date))
+    for file in files:
+        os.utime(folder / file, (date, date))
 
 
 @pytest.fixture

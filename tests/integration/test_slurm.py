@@ -93,7 +93,8 @@ def test_jobs_of_the_workflow_are_submitted_with_what_they_need(ran, jobs):
     assert len(read_cloud(ran / "clouds/results/objects/house/object.ply")) == 500
     done = [job for job in jobs if job["JobState"] == "COMPLETED" and job["TimeLimit"] == "00:30:00"]
     assert len(done) == 2 and {job["Partition"] for job in done} == {"main"}
-    assert {job["MinMemoryNode"] for job in done} == {"4000M"}
+    # The object's cloud, which is read whole, asks for a little more.
+    assert sorted(job["MinMemoryNode"] for job in done) == ["4000M", "4001M"]
 
 
 def test_a_job_that_fails_is_tried_again_with_more_and_then_named_and_the_others_go_on(ran, jobs):
