@@ -128,7 +128,7 @@ def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
     """What the settings file of a row changes."""
     where = f"{table}, {kind} '{name}', config {path}"
     try:
-        found = read_differences(Path(path) if Path(path).is_file() else ROOT / path)
+        found = read_differences(Path(path) if Path(path).is_file() or not (ROOT / path).is_file() else ROOT / path)
     except StageError as error:
         raise StageError(f"{table}, {kind} '{name}': {error}") from None
     other = next((key for key in found if key not in OWN[kind]), None)

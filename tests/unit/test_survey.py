@@ -172,6 +172,12 @@ def test_a_point_with_wrong_coordinates_is_left_out_and_named(tmp_path, model):
     assert value(report, "control_points") == 5 and off(report, found).max() < 0.4
 
 
+def test_points_that_are_too_far_off_for_what_is_stated_are_named_the_worst_first(tmp_path, model, capsys):
+    lines = changed(gcp_lines(FLIGHT, PLACES, NAMES), "e", 2, lambda z: z + 2)
+    (note,) = value(georeferenced(tmp_path, model, without_gps(), lines)[0], "control_notes")
+    assert "stated standard deviations off, in metres: e (" in note and note in capsys.readouterr().out
+
+
 def test_heights_may_be_unknown_and_the_crs_may_have_a_vertical_part(tmp_path, model):
     lines = gcp_lines(FLIGHT, PLACES, NAMES, crs="EPSG:25832")
     lines = ["EPSG:25832+7837", *changed(lines[1:], "e", 2, lambda z: np.nan)]

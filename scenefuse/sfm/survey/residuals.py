@@ -21,6 +21,7 @@ COLUMNS += ["photos", "reprojection_px"]
 
 # Control points that miss their coordinates by so many standard deviations deserve a note.
 MISFIT = 5.0
+MOST_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -164,10 +165,11 @@ def _of_lengths(lengths: Lengths, status: str) -> dict[str, Any]:
 
 def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[str, Any]:
     """Errors at control and at check points, as quantities."""
-    for note in control.notes:
+    notes = [*control.notes, *_misfits(found, control, left)]
+    for note in notes:
         print(f"note: {note}", flush=True)
     check = np.array([s.point.check and not s.problem for s in control.sightings])
-    content: dict[str, Any] = {"control_notes": quantity(control.notes, "")}
+    content: dict[str, Any] = {"control_notes": quantity(notes, "")}
     for kind, rows in (("control", found.placement.used), ("check", check)):
         horizontal, vertical = rms(left.points[rows, :2]), rms(left.points[rows, 2:])
         content |= {
@@ -178,15 +180,26 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
         if rows.any():
             height = "heights unknown" if vertical is None else f"vertically {vertical:.3f} m"
             print(f"{rows.sum()} {kind} points: RMS horizontally {horizontal:.3f} m, {height}", flush=True)
-    used = [s.point.sd_m[0] for s, u in zip(control.sightings, found.placement.used) if u]
-    miss_m, sd_m = content["control_rms_horizontal_m"]["value"], float(np.median(used))
-    if miss_m > MISFIT * sd_m:
-        print(
-            f"note: the control points miss their coordinates by {miss_m:.2f} m, but {sd_m:g} m is stated for them;"
-            " give their standard deviations in columns 8 and 9, or correct coordinates and clicks",
-            flush=True,
-        )
     return content
+
+
+def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str]:
+    """A note that names the control points, the worst first, whose errors are too large for what is stated of them."""
+    used = found.placement.used
+    sd_m = np.array([s.point.sd_m for s in control.sightings]).reshape(-1, 2)
+    horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
+    ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
+    worst = [k for k in np.argsort(-ratio) if ratio[k] > MISFIT]
+    if not worst:
+        return []
+    named = [
+        "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.sightings[k].point.name, *left.points[k])
+        for k in worst[:MOST_NAMED]
+    ]
+    return [
+        f"{len(worst)} of {used.sum()} control points are more than {MISFIT:g} stated standard deviations off, in"
+        f" metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
+    ]
 
 
 def _of_cameras(found: Georeference, left: Residuals) -> dict[str, Any]:
