@@ -104,11 +104,20 @@ def register(
     written = [out / "transform.json"]
     write_json(written[0], content)
     print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
+    if not found.registered:
+        print(f"next       {_advice(known)}", flush=True)
     written += _write(out, format, given, found, scene, seed)
     if fuse:
         written += _fuse(out, given, found, content, known, config)
     print(f"written    {', '.join(map(str, written))}", flush=True)
     return REGISTERED if found.registered else UNREGISTERED
+
+
+def _advice(known: Known) -> str:
+    """What a user can do about a refusal."""
+    if known.fiducials is None and known.crop_box is None:
+        return "mark the object in the scene by --fiducials or --crop-box; docs/register.md lists further causes"
+    return "docs/register.md lists causes and what to do about each"
 
 
 def _clear(out: Path, inputs: list[Path]) -> None:

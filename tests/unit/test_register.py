@@ -94,6 +94,7 @@ def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_pa
     done = subprocess.run(list(map(str, command)), cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 3, done.stderr
     assert done.stdout.startswith("unregistered: ")
+    assert "mark the object in the scene by --fiducials or --crop-box" in done.stdout
     content = read_json(out / "transform.json")
     assert value(content, "status") == "unregistered" and value(content, "reason") in done.stdout
     assert sorted(p.name for p in out.iterdir()) == ["picture.png", "transform.json"]
