@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, together, with_source
-from scenefuse.fusion.evidence import unchecked, with_normals
+from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, write_cloud
@@ -24,6 +24,8 @@ from scenefuse.version import VERSION
 
 CHUNK = 1_000_000
 """Points of a LAS file that are copied at a time."""
+OWN = {*FIELDS, "source"}
+"""Fields of a completed scene; one that is completed again keeps them, and its numbers in `source` go on."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +34,9 @@ class Completed:
 
     Attributes:
         kept: (N,) of the scene's points that stay.
-        scene: these points, with `source` and the fields of evidence (method F4), all of them not checked.
+        scene: these points, with `source` and the fields of evidence (method F4), not checked unless they were before.
         added: the object's points that come in, in the scene's coordinates, likewise.
+        source: their `source`; 1, or the next number of a scene that was completed before.
         fill_distance: distance within which both show the same place.
         mode: `fill`, or the mode for comparison that the settings name.
         notes: what a user should know.
@@ -43,6 +46,7 @@ class Completed:
     kept: NDArray[np.bool_]
     scene: Cloud
     added: Cloud
+    source: int
     fill_distance: float
     mode: str
     notes: list[str]
@@ -74,16 +78,21 @@ def complete(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, set
     if scene.normals is not None:
         obj = with_normals(obj)
     fusion = fuse_clouds(obj, scene, part, scene_from_object, settings)
-    added = with_source(unchecked(fusion.added), FROM_OBJECT)
+    again = set(scene.fields) >= OWN
+    source = int(scene.fields["source"].max()) + 1 if again else FROM_OBJECT
+    added = with_source(unchecked(fusion.added), source)
     if scene.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
-    left_out = sorted({*scene.fields, *obj.fields})
+    left_out = sorted({*scene.fields, *obj.fields} - (OWN if again else set()))
     if left_out:
         notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
     kept = with_source(unchecked(scene[fusion.kept]), FROM_SCENE)
+    if again:
+        known = {name: scene.fields[name][fusion.kept].astype(of.dtype) for name, of in kept.fields.items()}
+        kept = replace(kept, fields=known)
     seconds = time.perf_counter() - start
-    return Completed(fusion.kept, kept, added, fusion.fill_distance, settings.mode, notes, seconds)
+    return Completed(fusion.kept, kept, added, source, fusion.fill_distance, settings.mode, notes, seconds)
 
 
 def write_completed(out: Path, done: Completed, object: Path, scene: Path) -> list[Path]:
@@ -96,8 +105,9 @@ def write_completed(out: Path, done: Completed, object: Path, scene: Path) -> li
     for note in notes:
         print(f"note       {note}", flush=True)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
+    earlier = {str(number): f"{number} in {scene.name}" for number in range(FROM_OBJECT, done.source)}
     content = {
-        "sources": quantity({str(FROM_SCENE): "scene", str(FROM_OBJECT): object.stem}, ""),
+        "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
         "points": quantity(len(done.scene) + len(done.added), "points"),
         "scene_points": quantity(len(done.scene), "points"),
         "removed_points": quantity(int((~done.kept).sum()), "points"),
@@ -134,10 +144,10 @@ def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
         further = type(header.vlrs)(_but_copc(header.evlrs or []))
         own = set(header.point_format.dimension_names)
-        names = {name: _free(name, own) for name in done.added.fields}
-        header.add_extra_dims(
-            [laspy.ExtraBytesParams(names[name], values.dtype.str[1:]) for name, values in done.added.fields.items()]
-        )
+        again = own >= OWN
+        names = {name: name if again else _free(name, own) for name in done.added.fields}
+        types = {} if again else {name: values.dtype.str[1:] for name, values in done.added.fields.items()}
+        header.add_extra_dims([laspy.ExtraBytesParams(names[name], kind) for name, kind in types.items()])
         with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
             brightest = 0
             for chunk, fields in _kept_chunks(reader, done):

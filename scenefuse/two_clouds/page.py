@@ -89,7 +89,8 @@ def view_of(name: str, scene: Cloud, done: Completed, up: Array | None) -> View:
     points.fields["near"][:] = within(points.points, low, high)
     thinned = thin(points, VIEW_POINTS)
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
-    sources = {0: "scene"} | {code: f"added from {name}" for code in found}
+    told = {done.source: f"added from {name}"}
+    sources = {0: "scene"} | {code: told.get(code, f"{code} in the scene") for code in found}
     return View(thinned, sources, "scene units", low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
 
 

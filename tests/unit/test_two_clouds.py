@@ -157,7 +157,7 @@ def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     assert after.red.max() <= 255 and after.red[-1] > 100
 
 
-def test_a_completed_scene_takes_further_objects(tmp_path):
+def test_a_completed_scene_takes_further_objects_and_keeps_what_is_known(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
     scene = tmp_path / "yard.laz"
     for number, (low, high) in enumerate([(2, 8), (6, 12), (10, 16)], 1):
@@ -166,12 +166,31 @@ def test_a_completed_scene_takes_further_objects(tmp_path):
         done = complete(own(sheet(low, high)), read, read, POSE, FILL)
         write_completed(out, done, tmp_path / "shed.ply", scene)
         scene = out / "completed.laz"
-    last = laspy.read(scene)
-    sources = zip(last.source.tolist(), last.source_after.tolist(), last.source_after_after.tolist())
-    assert set(sources) == {(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)}
-    assert any(
-        "'source' is 'source_after'" in note for note in value(read_json(tmp_path / "2/completed.json"), "notes")
-    )
+        if number == 1:
+            first = laspy.read(scene)
+            first.deviation[:100] = 0.5
+            first.write(scene)
+    last, cloud = laspy.read(scene), read_cloud(tmp_path / "3/completed.ply")
+    assert set(last.source.tolist()) == set(cloud.fields["source"].tolist()) == {0, 1, 2, 3}
+    assert (last.deviation[:100] == 0.5).all() and np.isnan(last.deviation[100:]).all()
+    assert not any("after" in name for name in last.point_format.dimension_names)
+    named = value(read_json(tmp_path / "3/completed.json"), "sources")
+    assert named == {"0": "scene", "1": "1 in completed.laz", "2": "2 in completed.laz", "3": "shed"}
+
+
+def test_a_scene_with_some_field_of_the_same_name_keeps_it(tmp_path):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
+    survey = laspy.read(tmp_path / "yard.laz")
+    survey.add_extra_dim(laspy.ExtraBytesParams("source", "u1"))
+    survey.source[:] = 7
+    survey.write(tmp_path / "yard.laz")
+    read = read_cloud(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), read, read, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    after = laspy.read(tmp_path / "completed.laz")
+    assert set(after.source[: len(survey.points)].tolist()) == {7}
+    assert set(after.source_after.tolist()) == {0, 1}
+    assert any("'source' is 'source_after'" in n for n in value(read_json(tmp_path / "completed.json"), "notes"))
 
 
 def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be(tmp_path, capsys):
