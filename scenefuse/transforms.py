@@ -73,10 +73,14 @@ class Sim3:
         )
 
 
+def box_corners(low: Array, high: Array) -> Array:
+    """The eight corners (8, 3) of the axis-aligned box from `low` (3,) to `high` (3,), x slowest."""
+    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+
+
 def box_around(low: Array, high: Array, b_from_a: Sim3) -> tuple[Array, Array]:
     """Corners (3,) of the axis-aligned box in frame b around a box of frame a from `low` (3,) to `high` (3,)."""
-    corners = [[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])]
-    moved = b_from_a.apply(corners)
+    moved = b_from_a.apply(box_corners(low, high))
     return moved.min(0), moved.max(0)
 
 

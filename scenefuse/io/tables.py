@@ -39,6 +39,16 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
     return rows
 
 
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Lines of a text file with their numbers from 1, without those that are empty or begin with #.
+
+    Raises:
+        StageError: the file is missing, or is no text.
+    """
+    lines = enumerate(read_text(path).splitlines(), 1)
+    return [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
+
+
 def read_text(path: Path) -> str:
     """A text file in UTF-8, or in UTF-16 with a byte order mark, as spreadsheets write it.
 

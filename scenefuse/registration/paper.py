@@ -142,29 +142,9 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
     distances of the matches that agree to their centroids. Matched edges have to be about as long as each other:
     otherwise the similarity shrinks the object into a spot where all matches agree.
     """
-    import open3d as o3d
-
-    registration = o3d.pipelines.registration
     unit = [Cloud(c.points / c.diagonal) for c in (cloud, scene)]
     (source, of_source), (target, of_target) = (_features(c.points, VOXEL_FRACTION) for c in unit)
-    distance = RANSAC_DISTANCE * VOXEL_FRACTION
-    o3d.utility.random.seed(seed)
-    with _one_thread():
-        result = registration.registration_ransac_based_on_feature_matching(
-            source,
-            target,
-            of_source,
-            of_target,
-            True,
-            distance,
-            registration.TransformationEstimationPointToPoint(True),
-            RANSAC_POINTS,
-            [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_LENGTH),
-                registration.CorrespondenceCheckerBasedOnDistance(distance),
-            ],
-            registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),
-        )
+    result = _ransac((source, target), (of_source, of_target), RANSAC_DISTANCE * VOXEL_FRACTION, True, seed)
     pairs = np.asarray(result.correspondence_set)
     matched = np.asarray(source.points)[pairs[:, 0]], np.asarray(target.points)[pairs[:, 1]]
     ratio = rms(matched[1]) / rms(matched[0]) if len(pairs) >= LEAST_MATCHES else 0.0
@@ -186,13 +166,12 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
     """
     import open3d as o3d
 
-    registration = o3d.pipelines.registration
     voxel = VOXEL_FRACTION * problem.scene.diagonal
     scaled = Sim3(problem.scales.centre, np.eye(3), np.zeros(3))
     source, source_features = _features(scaled.apply(problem.object.points), voxel)
     target, target_features = _features(problem.scene.points, voxel)
     # A ratio of 0: this call counts the mutual matches and takes no others in their place, as RANSAC does below.
-    matches = registration.correspondences_from_features(source_features, target_features, True, 0.0)
+    matches = o3d.pipelines.registration.correspondences_from_features(source_features, target_features, True, 0.0)
     notes = []
     if len(matches) < MUTUAL_SHARE * len(source.points):
         notes.append(
@@ -200,24 +179,32 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
             " Open3D falls back to one-way matches"
         )
         print(notes[-1], flush=True)
-    o3d.utility.random.seed(problem.seed)
+    features = source_features, target_features
+    result = _ransac((source, target), features, RANSAC_DISTANCE * voxel, False, problem.seed)
+    return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled, notes
+
+
+def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float, with_scale: bool, seed: int) -> Any:
+    """Open3D's RANSAC over mutual matches of two clouds by their features, seeded and on one thread."""
+    import open3d as o3d
+
+    registration = o3d.pipelines.registration
+    checks = [
+        registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_LENGTH),
+        registration.CorrespondenceCheckerBasedOnDistance(distance),
+    ]
+    o3d.utility.random.seed(seed)
     with _one_thread():
-        result = registration.registration_ransac_based_on_feature_matching(
-            source,
-            target,
-            source_features,
-            target_features,
+        return registration.registration_ransac_based_on_feature_matching(
+            *clouds,
+            *features,
             True,
-            RANSAC_DISTANCE * voxel,
-            registration.TransformationEstimationPointToPoint(False),
+            distance,
+            registration.TransformationEstimationPointToPoint(with_scale),
             RANSAC_POINTS,
-            [
-                registration.CorrespondenceCheckerBasedOnEdgeLength(EDGE_LENGTH),
-                registration.CorrespondenceCheckerBasedOnDistance(RANSAC_DISTANCE * voxel),
-            ],
+            checks,
             registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),
         )
-    return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled, notes
 
 
 def _features(points: Array, voxel: float) -> tuple[Any, Any]:

@@ -16,7 +16,7 @@ from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surro
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import atomic_directory
-from scenefuse.transforms import Array
+from scenefuse.transforms import Array, box_corners
 from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
@@ -135,8 +135,7 @@ def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict
 
 def _box_corners(points: Array) -> Array:
     """The eight corners of the points' bounding box, x slowest."""
-    low, high = points.min(0), points.max(0)
-    return np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    return box_corners(points.min(0), points.max(0))
 
 
 def _added(cloud: Cloud) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ import re
 import subprocess
 import sys
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import cv2
@@ -140,10 +140,22 @@ class Page:
         ActionChains(self.browser.window).send_keys(keys).perform()
 
     def button(self, text):
-        for button in self.browser.window.find_elements("css selector", "button"):
-            if text in button.text:
-                button.click()
-                return
+        """Press the button of this text, once it can be pressed: a dialogue takes a moment to appear."""
+        from selenium.common.exceptions import (
+            ElementClickInterceptedException,
+            ElementNotInteractableException,
+            StaleElementReferenceException,
+        )
+
+        not_yet = ElementClickInterceptedException, ElementNotInteractableException, StaleElementReferenceException
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            for button in self.browser.window.find_elements("css selector", "button"):
+                with suppress(*not_yet):
+                    if text in button.text:
+                        button.click()
+                        return
+            time.sleep(0.05)
         raise AssertionError(f"no button {text}: {self.text()}")
 
     def marks(self, count):

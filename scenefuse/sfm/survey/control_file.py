@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
+from scenefuse.io.tables import read_lines
 from scenefuse.sfm.survey.crs import read_crs, to_wgs84
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -64,13 +65,7 @@ def read_control(path: Path) -> ControlFile:
         StageError: no such file, no CRS, a line that is not well formed, a name with two positions, a photo clicked
             twice for one point, coordinates outside the CRS.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (FileNotFoundError, IsADirectoryError):
-        raise StageError(f"the file of control points {path} does not exist; write it, or correct its path") from None
-    except UnicodeDecodeError:
-        raise StageError(f"{path} is no text; save the control points as text (UTF-8)") from None
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = read_lines(path)
     crs = read_crs(lines[0][1] if lines else "", str(path))
     rows: dict[str, list[Row]] = {}
     for number, line in lines[1:]:

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scenefuse.io.tables import read_lines
 from scenefuse.sfm.fiducials import Clicks, triangulate
 from scenefuse.sfm.photos import Photo
 from scenefuse.sfm.survey.control import CLICK_LIMIT
@@ -65,14 +66,7 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]
 
 def _read(path: Path) -> tuple[dict[str, float], dict[str, list[str]], Clicks]:
     """Lengths and ends by name, and the clicks on `name end`."""
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (FileNotFoundError, IsADirectoryError):
-        raise StageError(f"the file of lengths {path} does not exist; write it, or correct its path") from None
-    except UnicodeDecodeError:
-        raise StageError(f"{path} is no text; save the lengths as tab-separated text (UTF-8)") from None
-    rows = [(n, [c.strip() for c in line.split("\t")]) for n, line in enumerate(lines, 1) if line.strip()]
-    rows = [(n, cells) for n, cells in rows if not cells[0].startswith("#")]
+    rows = [(number, [cell.strip() for cell in line.split("\t")]) for number, line in read_lines(path)]
     if not rows or rows[0][1] != COLUMNS or len(rows) == 1:
         raise StageError(
             f"{path} has to begin with the tab-separated header '{' '.join(COLUMNS)}', and to go on with clicks"

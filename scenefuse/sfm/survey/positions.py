@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.io.tables import read_lines
 from scenefuse.sfm.survey.crs import read_crs, to_wgs84
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -65,11 +66,7 @@ def read_geo(path: Path) -> dict[str, Position]:
     Raises:
         StageError: no CRS, a line that is not well formed, a photo given twice, positions outside the CRS.
     """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise StageError(f"{path} is no text; save the positions as text (UTF-8)") from None
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = read_lines(path)
     crs = read_crs(lines[0][1] if lines else "", str(path))
     names: list[str] = []
     rows: list[list[float]] = []
