@@ -1,4 +1,4 @@
-"""Which files of a folder are photos. Standard library only: the workflow lists them whenever it is read."""
+"""Which files of a folder are photos, and which hold cameras. Standard library only: the workflow lists them often."""
 
 import os
 from pathlib import Path
@@ -13,6 +13,28 @@ UNREADABLE = frozenset(
     (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")
 )
 UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
+
+# Where in a folder other programs keep cameras, and under which names.
+CAMERA_PLACES = (".", "sparse", "sparse/0", "opensfm")
+CAMERA_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images", "frames", "rigs") for kind in ("bin", "txt"))
+CAMERA_FILES += ("transforms.json", "transforms_train.json", "reconstruction.json")
+BUNDLER = ".out"
+
+
+def camera_files(given: Path) -> list[Path]:
+    """The files that hold cameras of another program: in a folder, or a file itself with what belongs to it."""
+    if given.is_file():
+        listed = bundler_list(given)
+        return [given, *([listed] if listed else [])]
+    places = [given / place / name for place in CAMERA_PLACES for name in CAMERA_FILES]
+    return [file for file in places if file.is_file()] or [given]
+
+
+def bundler_list(file: Path) -> Path | None:
+    """The list of photos beside a Bundler file, by its usual names; None where there is none."""
+    names = (f"{file.stem}.list.txt", f"{file.stem}.lst", f"{file.stem}.txt", "list.txt", "images.list")
+    beside = (file.with_name(name) for name in names)
+    return next((path for path in beside if path.is_file()), None) if file.suffix == BUNDLER else None
 
 
 def photo_files(folder: Path) -> list[Path]:

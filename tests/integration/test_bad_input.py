@@ -79,3 +79,35 @@ def test_a_failed_object_does_not_block_the_other_and_is_named(project, refused)
     assert json.loads((project.path / targets[0]).read_text())["photos"]
     summary = (project.path / "results/summary/summary.txt").read_text()
     assert "barn" in summary and "2.jpg" in summary
+
+
+@pytest.mark.parametrize(
+    ("table", "column", "target"),
+    [
+        ("scenes", "calibration", "results/scenes/yard/features.db"),
+        ("scenes", "cameras", "results/scenes/yard/sparse.json"),
+        ("scenes", "control", "results/scenes/yard/georeference.json"),
+        ("scenes", "lengths", "results/scenes/yard/georeference.json"),
+        ("objects", "prompts", "results/objects/shed/masks.json"),
+        ("objects", "fiducials", "results/objects/shed/registration/full/crop.json"),
+    ],
+)
+def test_a_file_in_a_table_that_is_not_there_is_one_sentence(project, refused, table, column, target):
+    project.photos("flight")
+    project.photos("close")
+    (project.path / "prompts.tsv").write_text("")
+    cells = {"scene": "yard", "photos": "close", "prompts": "prompts.tsv"} | {column: "mine.x"}
+    if table == "scenes":
+        project.scenes = f"scene\tphotos\t{column}\nyard\tflight\tmine.x\n"
+    else:
+        project.objects = "\t".join(["object", *cells]) + "\n" + "\t".join(["shed", *cells.values()]) + "\n"
+    name = "scene 'yard'" if table == "scenes" else "object 'shed'"
+    assert f"{table}.tsv, {name}: mine.x in the column {column} does not exist" in refused("-n", target)
+
+
+def test_control_points_in_unknown_photos_stop_before_anything_runs(project, refused):
+    project.photos("flight")
+    project.scenes = "scene\tphotos\tcontrol\nyard\tflight\tgcp.txt\n"
+    (project.path / "gcp.txt").write_text("EPSG:32632\n1 2 3 10 10 0.jpg A\n1 2 3 10 10 7.jpg A\n")
+    output = refused("-n", "results/scenes/yard/georeference.json")
+    assert "scene 'yard': gcp.txt: point A is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)" in output

@@ -113,4 +113,4 @@ def test_a_cloud_that_is_not_there_is_one_sentence(project, tmp_path, snakemake)
     (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\tyrad.laz\n")
     refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
     assert refused.returncode != 0
-    assert "scenes.tsv, scene 'yard': the cloud yrad.laz does not exist" in refused.stdout
+    assert "scenes.tsv, scene 'yard': yrad.laz in the column cloud does not exist" in refused.stdout

@@ -2,6 +2,7 @@
 
 import json
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -78,6 +79,41 @@ def opensfm(folder, kind="perspective"):
     return folder
 
 
+LENS = {"f": FOCAL, "cx": 0.0, "cy": 0.0}
+
+
+def metashape(folder, lens=LENS):
+    """As Metashape exports it: labels without ending, a group, a photo that was not aligned."""
+    inside = "".join(f"<{name}>{number}</{name}>" for name, number in lens.items())
+    cameras = "".join(
+        f'<camera id="{k}" sensor_id="0" label="{view.name.rsplit(".", 1)[0]}">'
+        f"<transform>{' '.join(map(repr, view.world_from_cam.ravel().tolist()))}</transform></camera>"
+        for k, view in enumerate(FLIGHT.views)
+    )
+    size = f'<resolution width="{WIDTH}" height="{HEIGHT}"/>'
+    calibration = f'<calibration type="frame" class="adjusted">{size}{inside}</calibration>'
+    (folder / "cameras.xml").write_text(
+        f'<document><chunk><sensors><sensor id="0" type="frame">{size}{calibration}</sensor></sensors>'
+        f'<cameras><group id="0">{cameras}</group><camera id="99" sensor_id="0" label="lost"/></cameras>'
+        "<transform><scale>3</scale></transform></chunk></document>"
+    )
+    return folder / "cameras.xml"
+
+
+def bundler(folder):
+    """As RealityCapture exports it: full paths of another machine, and a photo without a camera."""
+    lines = ["# Bundle file v0.3", f"{len(FLIGHT.views) + 1} 0", *["0 0 0"] * 5]
+    for view in FLIGHT.views:
+        cv2.imwrite(str(folder / "photos" / view.name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+        flipped = np.diag([1.0, -1, -1]) @ view.cam_from_world[:3]
+        rows = [[FOCAL, 0.0, 0.0], *flipped[:, :3], flipped[:, 3]]
+        lines += [" ".join(repr(float(number)) for number in row) for row in rows]
+    (folder / "bundle.out").write_text("\n".join(lines))
+    names = ["lost.jpg", *(f"C:\\my photos\\{view.name} 0 500.0" for view in FLIGHT.views)]
+    (folder / "list.txt").write_text("\n".join(names))
+    return folder / "bundle.out"
+
+
 def mapped(folder, cameras):
     map_photos(
         folder=folder / "photos",
@@ -92,7 +128,9 @@ def mapped(folder, cameras):
     return read_json(folder / "sparse.json"), pycolmap.Reconstruction(folder / "sparse")
 
 
-@pytest.mark.parametrize("write", [colmap, nerfstudio, opensfm, lambda folder: opensfm(folder, "brown")])
+@pytest.mark.parametrize(
+    "write", [colmap, nerfstudio, opensfm, lambda folder: opensfm(folder, "brown"), metashape, bundler]
+)
 def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     with_database(tmp_path)
     report, model = mapped(tmp_path, write(tmp_path))
@@ -126,3 +164,49 @@ def test_wrong_cameras_are_named(tmp_path):
     (tmp_path / "opensfm/reconstruction.json").write_text("{}")
     with pytest.raises(StageError, match="no reconstruction of OpenSfM"):
         read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+
+
+def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):
+    """A real camera's: swapped decentring, affinity, a fourth radial coefficient and skew."""
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "photos/a.jpg").write_bytes(b"")
+    rays = np.random.default_rng(0).uniform(-0.45, 0.45, (200, 2)) * np.array([WIDTH, HEIGHT]) / FOCAL
+    exact = {"f": FOCAL, "cx": 4.0, "cy": -7.0, "b1": 0.5, "k1": -0.09, "k2": -0.07, "k3": 0.1, "p1": 3e-3, "p2": -1e-3}
+    x, y = rays.T
+    r2 = x**2 + y**2
+    for lens, most in ((exact, 1e-6), (exact | {"k4": -0.07, "b2": -0.3}, 0.3)):
+        camera = read_given(metashape(tmp_path, lens), tmp_path / "photos")[0].camera
+        radial = 1 - 0.09 * r2 - 0.07 * r2**2 + 0.1 * r2**3 + lens.get("k4", 0) * r2**4
+        u = x * radial + 3e-3 * (r2 + 2 * x**2) - 2 * 1e-3 * x * y
+        v = y * radial - 1e-3 * (r2 + 2 * y**2) + 2 * 3e-3 * x * y
+        there = [WIDTH / 2 + 4 + u * (FOCAL + 0.5) + v * lens.get("b2", 0), HEIGHT / 2 - 7 + v * FOCAL]
+        off = camera.img_from_cam(np.column_stack([rays, np.ones(200)])) - np.stack(there, 1)
+        assert np.linalg.norm(off, axis=1).max() < most
+
+
+def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    path = bundler(tmp_path)
+    (tmp_path / "list.txt").write_text("a.jpg\n")
+    with pytest.raises(StageError, match="10 cameras, its list names 1 photos"):
+        read_given(path, photos)
+    (tmp_path / "list.txt").unlink()
+    with pytest.raises(StageError, match=r"put it beside it as list\.txt"):
+        read_given(path, photos)
+    (tmp_path / "list.txt").write_text("a.jpg\n" * 10)
+    path.write_text("# Bundle file v0.3\n2 0\n500 0 0\n1 0\n")
+    with pytest.raises(StageError, match="no file of Bundler"):
+        read_given(path, photos)
+    with pytest.raises(StageError, match=r"COLMAP's full OpenCV lens is up to .* px off"):
+        read_given(metashape(tmp_path, LENS | {"b2": -40.0}), photos)
+    path = metashape(tmp_path)
+    for text, message in (
+        (path.read_text().replace('sensor id="0" type="frame"', 'sensor id="0" type="spherical"'), "kind spherical"),
+        (path.read_text().replace("adjusted", "none"), "has no calibration"),
+        (path.read_text()[:200], "holds no cameras of Metashape"),
+        ("<document/>", "it has no chunk"),
+    ):
+        path.write_text(text)
+        with pytest.raises(StageError, match=message):
+            read_given(path, photos)

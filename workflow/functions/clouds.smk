@@ -6,22 +6,11 @@ def one_of(names):
     return "|".join(map(re.escape, names)) or "(?!)"
 
 
-def cloud_of(row, kind):
+def cloud_of(kind):
     """Input function: the cloud of a scene or an object."""
-
-    def files(wildcards):
-        name = wildcards[kind]
-        path = row(name)["cloud"]
-        if not (made_here(path) or Path(path).is_file()):
-            raise WorkflowError(
-                f"{config[f'{kind}s']}, {kind} '{name}': the cloud {path} does not exist"
-                f" (relative paths begin at {os.getcwd()})"
-            )
-        return [path]
-
-    return files
+    return lambda wildcards: own_file(kind, wildcards[kind], "cloud")
 
 
-def cloud_path(row, kind):
+def cloud_path(kind):
     """The same, for a command line."""
-    return lambda wildcards: shlex.quote(row(wildcards[kind])["cloud"])
+    return lambda wildcards: shlex.quote(*cloud_of(kind)(wildcards))

@@ -31,12 +31,7 @@ def mask_inputs(wildcards):
         files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
     elif settings["method"] == "sam2":
         files += [settings["sam2_encoder"], settings["sam2_decoder"]]
-    if not made_here(row["prompts"]) and not Path(row["prompts"]).is_file():
-        raise WorkflowError(
-            f"{config['objects']}: the prompts {row['prompts']} of '{wildcards.object}' do not exist; click them with"
-            f" scenefuse pick --object {wildcards.object} (docs/clicking.md), or correct the path"
-        )
-    return files + [row["prompts"]]
+    return files + own_file("object", wildcards.object, "prompts")
 
 
 def mask_options(wildcards):

@@ -24,8 +24,9 @@ def crop_mode(wildcards):
 def crop_marks(wildcards):
     """The files that mark an object in its scene: option of the crop -> path. Fiducials check the masks, or take their
     place where shared features give no alignment."""
-    mode, row = crop_mode(wildcards), object_row(wildcards.object)
-    own = {"fiducials": row["fiducials"]} if mode and row.get("fiducials") else {}
+    mode = crop_mode(wildcards)
+    clicked = own_file("object", wildcards.object, "fiducials") if mode else []
+    own = dict(zip(["fiducials"], clicked))
     if mode == "masks":
         folder = f"results/objects/{wildcards.object}"
         own |= {

@@ -36,78 +36,70 @@ def object_source(wildcards):
     return shlex.quote(object_row(wildcards.object).get("photos", ""))
 
 
-def calibration_of(row, kind):
+def calibration_of(kind):
     """Input function: the known calibration of a scene's or an object's camera, where the table has one."""
-
-    def files(wildcards):
-        given = row(wildcards[kind]).get("calibration")
-        return [given] if given else []
-
-    return files
+    return lambda wildcards: own_file(kind, wildcards[kind], "calibration")
 
 
-def calibration_flag(row, kind):
+def calibration_flag(kind):
     """The same as a command-line option."""
     return lambda wildcards: flags(
-        dict(zip(["calibration"], calibration_of(row, kind)(wildcards)))
+        dict(zip(["calibration"], calibration_of(kind)(wildcards)))
     )
 
 
-def cameras_of(row, kind):
+def calibrated(kind):
+    """Params function: whether there is one."""
+    return lambda wildcards: bool(calibration_of(kind)(wildcards))
+
+
+def cameras_of(kind):
     """Input function: the files of cameras that another program found for a scene or an object, where the table has them."""
 
     def files(wildcards):
-        given = row(wildcards[kind]).get("cameras")
-        if not given:
-            return []
-        if not Path(given).is_dir():
-            return [given]
-        names = (
-            f"{n}.{e}"
-            for n in ("cameras", "images", "frames", "rigs")
-            for e in ("bin", "txt")
-        )
-        names = [
-            *names,
-            "transforms.json",
-            "transforms_train.json",
-            "reconstruction.json",
-        ]
-        places = [
-            Path(given, place) for place in (".", "sparse", "sparse/0", "opensfm")
-        ]
-        found = [str(p / n) for p in places for n in names if (p / n).is_file()]
-        return found or [given]
+        given = own_file(kind, wildcards[kind], "cameras")
+        return [str(file) for path in given for file in camera_files(Path(path))]
 
     return files
 
 
-def cameras_flag(row, kind):
+def cameras_flag(kind):
     """The same as a command-line option."""
-
-    def words(wildcards):
-        given = row(wildcards[kind]).get("cameras")
-        return flags({"cameras": given} if given else {})
-
-    return words
+    return lambda wildcards: flags(
+        dict(zip(["cameras"], own_file(kind, wildcards[kind], "cameras")))
+    )
 
 
 def surveyed(scene):
     """Control points and known lengths of a scene, where the table has them: column -> file."""
-    row = scene_row(scene)
-    return {column: row[column] for column in ("control", "lengths") if row.get(column)}
+    found = {
+        column: own_file("scene", scene, column) for column in ("control", "lengths")
+    }
+    return {column: files[0] for column, files in found.items() if files}
+
+
+@cache
+def check_survey(scene):
+    """Stop before hours of mapping where a survey's file cannot be read or names photos that the scene lacks."""
+    from scenefuse.sfm.survey.check import check_files
+
+    row, files = scene_row(scene), surveyed(scene)
+    own = {column: Path(f) for column, f in files.items() if not made_here(f)}
+    if own and not made_here(row["photos"]):
+        try:
+            check_files(Path(row["photos"]), **own)
+        except StageError as error:
+            raise WorkflowError(
+                f"{config['scenes']}, scene '{scene}': {error}"
+            ) from None
 
 
 def survey_of(wildcards):
     """Input function: their files."""
+    check_survey(wildcards.scene)
     return list(surveyed(wildcards.scene).values())
 
 
 def survey_flags(wildcards):
     """The same as command-line options."""
     return flags(surveyed(wildcards.scene))
-
-
-def calibrated(row, kind):
-    """Params function: whether there is one."""
-    return lambda wildcards: bool(calibration_of(row, kind)(wildcards))

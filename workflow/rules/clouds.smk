@@ -14,7 +14,7 @@ include: "../functions/clouds.smk"
 rule import_scene_cloud:
     """Take a cloud or mesh for a scene."""
     input:
-        as_inputs(cloud_of(scene_row, "scene")),
+        as_inputs(cloud_of("scene")),
     output:
         cloud="results/scenes/{scene}/dense.ply",
         report="results/scenes/{scene}/dense.json",
@@ -31,8 +31,8 @@ rule import_scene_cloud:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=by_size(30, all=0.1),
     params:
-        source=cloud_path(scene_row, "scene"),
-        files=state_of(cloud_of(scene_row, "scene")),
+        source=cloud_path("scene"),
+        files=state_of(cloud_of("scene")),
         script=script("io/import_scene_cloud.py"),
         code=code("io/import_scene_cloud.py"),
     message:
@@ -45,7 +45,7 @@ rule import_scene_cloud:
 rule import_object_cloud:
     """Take a cloud or mesh for an object."""
     input:
-        as_inputs(cloud_of(object_row, "object")),
+        as_inputs(cloud_of("object")),
     output:
         cloud="results/objects/{object}/object.ply",
         report="results/objects/{object}/object.json",
@@ -61,8 +61,8 @@ rule import_object_cloud:
         mem_mb=by_size(4000, all=50),
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        source=cloud_path(object_row, "object"),
-        files=state_of(cloud_of(object_row, "object")),
+        source=cloud_path("object"),
+        files=state_of(cloud_of("object")),
         script=script("io/import_object_cloud.py"),
         code=code("io/import_object_cloud.py"),
     message:

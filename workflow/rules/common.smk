@@ -13,7 +13,7 @@ from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
 from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.machine import has_gpu, memory_mb
-from scenefuse.sfm.photo_files import GEO_FILE, photo_files
+from scenefuse.sfm.photo_files import GEO_FILE, camera_files, photo_files
 from scenefuse.stage import StageError
 
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
@@ -90,6 +90,21 @@ def scene_row(name):
 
 def object_row(name):
     return row_of(name, OBJECTS, "objects")
+
+
+def own_file(kind, name, column):
+    """The file or folder that the user names in a cell, in a list; none where the cell is empty."""
+    path = (scene_row if kind == "scene" else object_row)(name).get(column)
+    if path and not (made_here(path) or Path(path).exists()):
+        advice = {
+            "prompts": f"; click them with scenefuse pick --object {name} (docs/clicking.md), or correct the path",
+            "fiducials": f"; click them with scenefuse pick --object {name} (docs/clicking.md), or leave the cell empty",
+        }
+        raise WorkflowError(
+            f"{config[f'{kind}s']}, {kind} '{name}': {path} in the column {column} does not exist (relative paths"
+            f" begin at {os.getcwd()}){advice.get(column, '')}"
+        )
+    return [path] if path else []
 
 
 def settings_of(wildcards):

@@ -73,7 +73,7 @@ rule extract_frames:
 rule extract_scene_features:
     """SIFT features (paper 3.1)."""
     input:
-        calibration_of(scene_row, "scene"),
+        calibration_of("scene"),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
@@ -91,8 +91,8 @@ rule extract_scene_features:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=settings("scene.features"),
-        calibration=calibration_flag(scene_row, "scene"),
-        files=state_of(calibration_of(scene_row, "scene")),
+        calibration=calibration_flag("scene"),
+        files=state_of(calibration_of("scene")),
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
@@ -104,7 +104,7 @@ rule extract_scene_features:
 
 use rule extract_scene_features as extract_object_features with:
     input:
-        calibration_of(object_row, "object"),
+        calibration_of("object"),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
@@ -120,8 +120,8 @@ use rule extract_scene_features as extract_object_features with:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=settings("object.features"),
-        calibration=calibration_flag(object_row, "object"),
-        files=state_of(calibration_of(object_row, "object")),
+        calibration=calibration_flag("object"),
+        files=state_of(calibration_of("object")),
         script=script("sfm/extract_features.py"),
         code=code("sfm/extract_features.py"),
     message:
@@ -187,7 +187,7 @@ use rule match_scene_features as match_object_features with:
 rule map_scene_photos:
     """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
-        cameras_of(scene_row, "scene"),
+        cameras_of("scene"),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
@@ -207,9 +207,9 @@ rule map_scene_photos:
         runtime=lambda wildcards, attempt: 480 * attempt,
     params:
         options=settings("scene.sparse"),
-        calibrated=calibrated(scene_row, "scene"),
-        cameras=cameras_flag(scene_row, "scene"),
-        files=state_of(cameras_of(scene_row, "scene")),
+        calibrated=calibrated("scene"),
+        cameras=cameras_flag("scene"),
+        files=state_of(cameras_of("scene")),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),
@@ -222,7 +222,7 @@ rule map_scene_photos:
 
 use rule map_scene_photos as map_object_photos with:
     input:
-        cameras_of(object_row, "object"),
+        cameras_of("object"),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
@@ -240,9 +240,9 @@ use rule map_scene_photos as map_object_photos with:
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=settings("object.sparse"),
-        calibrated=calibrated(object_row, "object"),
-        cameras=cameras_flag(object_row, "object"),
-        files=state_of(cameras_of(object_row, "object")),
+        calibrated=calibrated("object"),
+        cameras=cameras_flag("object"),
+        files=state_of(cameras_of("object")),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),

@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scenefuse.sfm.given.bundler import read_bundler
+from scenefuse.sfm.given.metashape import read_metashape
 from scenefuse.sfm.given.opensfm import find_opensfm, read_opensfm
 from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.photo_files import BUNDLER
 from scenefuse.sfm.photos import SHAPE_TOLERANCE
 from scenefuse.sfm.posed_photos import PosedPhoto, find_posed_photos
 from scenefuse.stage import StageError, scratch_directory
@@ -24,7 +27,8 @@ def triangulated(
     """The model of given cameras: poses and lenses as they are, points from the photos' own matches.
 
     Args:
-        cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json; or a folder with one.
+        cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
+            Metashape's XML; Bundler's .out with its list.
         folder: of the photos.
         database: COLMAP database with verified matches.
         work: folder for files in between; it is removed again.
@@ -75,6 +79,10 @@ def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
     """The posed photos of any format that is read."""
     if not cameras.exists():
         raise StageError(f"the cameras {cameras} do not exist; correct the path")
+    if cameras.suffix.lower() == ".xml":
+        return read_metashape(cameras, folder)
+    if cameras.suffix == BUNDLER:
+        return read_bundler(cameras, folder)
     file = find_opensfm(cameras)
     if file is not None:
         return read_opensfm(file, folder)

@@ -10,7 +10,7 @@ import pycolmap
 
 from scenefuse.sfm.fiducials import intersect, model_pixel
 from scenefuse.sfm.photos import Photo
-from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint, read_control
+from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
 from scenefuse.sfm.survey.crs import grid_name
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
@@ -97,10 +97,7 @@ def sight(
         seen, lost = [], []
         for photo, pixel in point.clicks:
             if photo not in sizes:
-                raise StageError(
-                    f"{control.path}: point {point.name} is clicked in {photo}, which is none of the"
-                    f" {len(sizes)} photos ({next(iter(sizes), '')}, ...); correct the name"
-                )
+                raise unknown_photo(control.path, point.name, photo, sizes)
             if photo in images:
                 seen.append((photo, model_pixel(control.path, point.name, photo, pixel, images[photo], sizes)))
             else:

@@ -1,5 +1,6 @@
 """Control and check points in OpenDroneMap's gcp_list.txt."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -77,6 +78,14 @@ def read_control(path: Path) -> ControlFile:
     positions = to_wgs84(crs, np.array([clicks[0][0] for clicks in rows.values()]), str(path))
     points = [_point(name, clicks, place, path) for (name, clicks), place in zip(rows.items(), positions)]
     return ControlFile(path, crs, points)
+
+
+def unknown_photo(path: Path, point: str, photo: str, names: Collection[str]) -> StageError:
+    """The error that a click lies in a photo that is none of the scene's `names`."""
+    return StageError(
+        f"{path}: point {point} is clicked in {photo}, which is none of the {len(names)} photos"
+        f" ({next(iter(names), '')}, ...); correct the name"
+    )
 
 
 def _row(cells: list[str], where: str) -> tuple[str, Row]:

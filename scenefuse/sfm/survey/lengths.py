@@ -46,7 +46,7 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]
         StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
             different values, an end that is missing, clicks that contradict each other, lengths that do.
     """
-    metres, ends, clicks = _read(path)
+    metres, ends, clicks = read_ends(path)
     sizes = {p.name: (p.width, p.height) for p in photos}
     limit_px = CLICK_LIMIT * max(max(camera.width, camera.height) for camera in model.cameras.values())
     names, places, _ = triangulate(clicks, model, limit_px, sizes)
@@ -64,8 +64,13 @@ def read_lengths(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]
     return found
 
 
-def _read(path: Path) -> tuple[dict[str, float], dict[str, list[str]], Clicks]:
-    """Lengths and ends by name, and the clicks on `name end`."""
+def read_ends(path: Path) -> tuple[dict[str, float], dict[str, list[str]], Clicks]:
+    """Lengths in metres and their two ends by name, and the clicks on `name end`.
+
+    Raises:
+        StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
+            different values, an end that is missing.
+    """
     rows = [(number, [cell.strip() for cell in line.split("\t")]) for number, line in read_lines(path)]
     if not rows or rows[0][1] != COLUMNS or len(rows) == 1:
         raise StageError(

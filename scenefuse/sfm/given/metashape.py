@@ -1,0 +1,108 @@
+"""Cameras of Agisoft Metashape: the XML that "Export Cameras" writes."""
+
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from scipy.optimize import least_squares
+
+from scenefuse.sfm.given.names import find_photo
+from scenefuse.sfm.photo_files import photo_files
+from scenefuse.sfm.posed_photos import PosedPhoto
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+
+# Parameters of its lens; those that are zero are left out of the file.
+PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+# COLMAP's fullest lens has neither a fourth radial coefficient nor skew: one that is as good as this takes their place.
+MOST_OFF_PX = 0.5
+# Rays that it is fitted to, in each direction over the photo.
+GRID = 33
+
+
+def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
+    """The photos that were aligned; lenses of the kind frame.
+
+    Args:
+        file: the XML.
+        folder: of the photos; the XML names them without their ending.
+
+    Raises:
+        StageError: the file is no such XML, or has a lens of another kind.
+    """
+    try:
+        chunk = ET.parse(file).getroot().find(".//chunk")
+        if chunk is None:
+            raise ValueError("it has no chunk")
+        sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
+        files, lenses, found = photo_files(folder), {}, []
+        for camera in chunk.iterfind("cameras//camera"):
+            placed, number = camera.find("transform"), camera.attrib["sensor_id"]
+            if placed is None or not placed.text:
+                continue
+            if number not in lenses:
+                lenses[number] = _camera(sensors[number], f"{file}, sensor {number}")
+            label = camera.attrib["label"]
+            pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
+            found.append(PosedPhoto(label, find_photo(label, files, folder), lenses[number], pose, None, False))
+    except (OSError, ET.ParseError, KeyError, ValueError) as error:
+        raise StageError(f"{file} holds no cameras of Metashape ({error!r}); export them as Agisoft XML") from None
+    return found
+
+
+def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:
+    kind = sensor.attrib.get("type", "frame")
+    if kind != "frame":
+        raise StageError(f"{where} is of the kind {kind}; frame is read")
+    of_class = {calibration.attrib.get("class", ""): calibration for calibration in sensor.iterfind("calibration")}
+    calibration = of_class.get("adjusted", of_class.get("initial"))
+    if calibration is None or calibration.find("f") is None:
+        raise StageError(f"{where} has no calibration; align the photos, and export the cameras again")
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise StageError(f"{where} has no resolution; export the cameras again")
+    width, height = int(size.attrib["width"]), int(size.attrib["height"])
+    lens = {name: float(calibration.findtext(name, "0")) for name in PARAMETERS}
+    focal, middle = [lens["f"] + lens["b1"], lens["f"]], [width / 2 + lens["cx"], height / 2 + lens["cy"]]
+    # What Metashape calls P1 is P2 to OpenCV.
+    params = [*focal, *middle, lens["k1"], lens["k2"], lens["p2"], lens["p1"], lens["k3"], 0.0, 0.0, 0.0]
+    camera = pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    if any(lens[name] for name in ("b2", "k4", "p3", "p4")):
+        _fit(camera, lens, where)
+    return camera
+
+
+def project(rays: Array, lens: dict[str, float], width: int, height: int) -> Array:
+    """Pixels (N, 2) of rays (N, 2), x / z and y / z, by Metashape's frame camera (its manual, appendix D)."""
+    x, y = rays.T
+    r2 = x**2 + y**2
+    radial = 1 + r2 * (lens["k1"] + r2 * (lens["k2"] + r2 * (lens["k3"] + r2 * lens["k4"])))
+    decentred = 1 + r2 * (lens["p3"] + r2 * lens["p4"])
+    u = x * radial + (lens["p1"] * (r2 + 2 * x**2) + 2 * lens["p2"] * x * y) * decentred
+    v = y * radial + (lens["p2"] * (r2 + 2 * y**2) + 2 * lens["p1"] * x * y) * decentred
+    columns = width / 2 + lens["cx"] + u * (lens["f"] + lens["b1"]) + v * lens["b2"]
+    return np.stack([columns, height / 2 + lens["cy"] + v * lens["f"]], axis=1)
+
+
+def _fit(camera: pycolmap.Camera, lens: dict[str, float], where: str) -> None:
+    """The parameters of COLMAP's lens that come nearest to Metashape's, over the whole photo."""
+    half = np.array([camera.width, camera.height]) / 2 / lens["f"]
+    axes = [np.linspace(-side, side, GRID) for side in half]
+    rays = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
+    pixels = project(rays, lens, camera.width, camera.height)
+    points = np.column_stack([rays, np.ones(len(rays))])
+
+    def off(params: Array) -> Array:
+        camera.params = params.tolist()
+        return (camera.img_from_cam(points) - pixels).ravel()
+
+    found = least_squares(off, camera.params, x_scale="jac")
+    camera.params = found.x.tolist()
+    worst = float(np.linalg.norm(found.fun.reshape(-1, 2), axis=1).max())
+    if worst > MOST_OFF_PX:
+        raise StageError(
+            f"{where}: COLMAP's full OpenCV lens is up to {worst:.1f} px off this one; optimize the cameras in"
+            " Metashape without b2, k4, p3 and p4, and export them again"
+        )

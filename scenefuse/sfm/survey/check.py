@@ -1,0 +1,25 @@
+"""What can be said of a survey's files before any photo is matched."""
+
+from pathlib import Path
+
+from scenefuse.sfm.photos import photo_names
+from scenefuse.sfm.survey.control_file import read_control, unknown_photo
+from scenefuse.sfm.survey.lengths import read_ends
+
+
+def check_files(folder: Path, control: Path | None = None, lengths: Path | None = None) -> None:
+    """Check that the files of a survey can be read, and that their clicks are in photos of the folder.
+
+    Raises:
+        StageError: what `read_control` and `read_ends` say; a click in a photo that does not exist.
+    """
+    names = photo_names(folder)
+    clicked: list[tuple[Path, str, str]] = []
+    if control is not None:
+        clicked += [(control, point.name, photo) for point in read_control(control).points for photo, _ in point.clicks]
+    if lengths is not None:
+        ends = read_ends(lengths)[2]
+        clicked += [(lengths, point, photo) for point, photo in zip(ends.points, ends.photos)]
+    for path, point, photo in clicked:
+        if photo not in names:
+            raise unknown_photo(path, point, photo, names)
