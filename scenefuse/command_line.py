@@ -10,7 +10,7 @@ from pathlib import Path
 from scenefuse.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
-OWN_SETTINGS = Path("config/config.yaml")
+OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
 
 
 def main() -> None:
@@ -72,6 +72,13 @@ def _run() -> None:
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")
     words = sys.argv[1:]
+    # Options of Snakemake that say where the project is, or that none is needed.
+    elsewhere = ("--config", "--directory", "-d", "-h", "--help", "--version")
+    if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in words)):
+        sys.exit(
+            f"error: there is no {SCENES} here ({Path.cwd()}); make a project with scenefuse init FOLDER and run this in"
+            " it, or give --configfile"
+        )
     if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
         words = ["--configfile", str(OWN_SETTINGS), *words]
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), *words]

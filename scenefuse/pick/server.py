@@ -66,7 +66,7 @@ async def _refuse(scope: Any, send: Any) -> None:
     if scope["type"] == "websocket":
         await send({"type": "websocket.close", "code": 1008})
         return
-    text = b"Open the address that scripts/pick.py printed: it ends with the token."
+    text = b"Open the address that scenefuse pick printed: it ends with the token."
     await send({"type": "http.response.start", "status": 403, "headers": [(b"content-type", b"text/plain")]})
     await send({"type": "http.response.body", "body": text})
 

@@ -175,6 +175,11 @@ def test_an_empty_project_says_what_is_missing(installed, tmp_path):
     assert status == 1 and "config/scenes.tsv has no rows; add one for each scene" in output
 
 
+def test_a_run_in_a_folder_without_a_project_does_not_plan_the_demo(tmp_path):
+    status, output = scenefuse("run", "-n", cwd=tmp_path)
+    assert status == 1 and "there is no config/scenes.tsv here" in output and "scenefuse init" in output
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
