@@ -75,10 +75,8 @@ def _run() -> None:
     # Options of Snakemake that say where the project is, or that none is needed.
     elsewhere = ("--config", "--directory", "-d", "-h", "--help", "--version")
     if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in words)):
-        sys.exit(
-            f"error: there is no {SCENES} here ({Path.cwd()}); make a project with scenefuse init FOLDER and run this in"
-            " it, or give --configfile"
-        )
+        where = f"there is no {SCENES} here ({Path.cwd()})"
+        sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
     if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
         words = ["--configfile", str(OWN_SETTINGS), *words]
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), *words]
