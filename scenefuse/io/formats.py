@@ -325,7 +325,7 @@ def _text(path: Path) -> Columns:
 
     A line above the rows that names the columns (`//X Y Z R G B`) is believed. Without one, the first three columns are
     x, y, z and each three that follow are normals if they have unit length, else colours; PTS may have an intensity
-    between.
+    between. A first column that counts the rows is left out.
     """
     with open(path, encoding="utf-8-sig") as file:
         head = list(islice(file, 50))
@@ -339,6 +339,11 @@ def _text(path: Path) -> Columns:
     names = [cell.strip() for cell in head[above - 1].strip(" \t\r\n/#").split(separator)] if above else []
     if len(names) == rows.shape[1] and set(POSITION) <= {_common_name(name) for name in names}:
         return dict(zip(names, rows.T))
+    degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
+    if degrees is not None:
+        raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
+    if rows.shape[1] > 3 and len(rows) > 3 and (rows[:, 0] == rows[0, 0] + np.arange(len(rows))).all():
+        rows = rows[:, 1:]
     columns, start = dict(zip(POSITION, rows.T)), 3
     if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
         columns["intensity"], start = rows[:, 3], 4

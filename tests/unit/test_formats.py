@@ -205,3 +205,17 @@ def test_truncated_files_are_refused(tmp_path, cloud):
 def test_an_unknown_ending_lists_the_known_ones(tmp_path):
     with pytest.raises(StageError, match=r"\.abc.*\.ply, \.obj, \.glb, \.las, \.laz, \.e57, \.pcd, \.xyz"):
         read_cloud(tmp_path / "a.abc")
+
+
+def test_a_column_that_counts_the_rows_is_no_coordinate(tmp_path):
+    points = np.random.default_rng(0).uniform(-5, 5, (20, 3)).round(3)
+    np.savetxt(tmp_path / "list.txt", np.column_stack([np.arange(1, 21), points]), fmt="%.3f")
+    np.testing.assert_allclose(read_cloud(tmp_path / "list.txt").points, points)
+    np.savetxt(tmp_path / "grid.xyz", np.column_stack([np.arange(20) % 10, points]), fmt="%.3f")
+    np.testing.assert_allclose(read_cloud(tmp_path / "grid.xyz").points[:, 0], np.arange(20) % 10)
+
+
+def test_a_table_in_degrees_is_refused(tmp_path):
+    (tmp_path / "a.csv").write_text("Longitude,Latitude,Height\n8.1,47.2,400\n8.2,47.1,401\n8.3,47.3,402\n")
+    with pytest.raises(StageError, match=r"is in degrees \(column Longitude\)"):
+        read_cloud(tmp_path / "a.csv")
