@@ -12,7 +12,7 @@ demo: .venv/ready
 test: .venv/ready
 	envs/browser.sh
 	pip install --quiet --disable-pip-version-check -r tests/requirements.txt
-	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder
+	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder --durations 20
 
 lint: .venv/ready
 	ruff check .

@@ -1,12 +1,13 @@
 """Masks of all photos from a few clicks in one: the sparse points inside and outside its mask prompt the next photo."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.masks.clicks import PhotoClicks
@@ -32,6 +33,14 @@ EDGE = 0.003
 """Half width of the band along a mask's outline in which no point votes, as a share of the photo's longer side."""
 QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
+
+PART_GAP = 0.05
+"""Pixels that a mask lacks are of one part if they are this near each other, as a share of the photo's longer side."""
+
+PART_AGREEMENT = 0.5
+"""A mask that agrees less with what prompts it does not lack parts: it is another thing."""
+NEAR_MISS = 0.015
+"""A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part."""
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
@@ -81,7 +90,7 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     The photo with most clicks comes first. Then always the photo that sees most points known to be the object's, so
     that the masks go round the object both ways; a photo with clicks of its own is prompted by these too. A mask of
     low quality, or one that contradicts what prompted it, does not vote. All that do not, or that the others
-    contradict in the end, are made once more from the votes of all others.
+    contradict in the end, are made once more from the votes of all others; all get the parts that they lack by these.
 
     Args:
         ask: the method: SAM 2 or GrabCut.
@@ -97,25 +106,27 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     left = list(range(len(photos.views)))
     while left:
         shares = _shares(photos, made)
-        known = [int((shares[photos.seen[k]] >= SURE).sum()) for k in left]
-        k = left[int(np.argmax(known))]
-        if max(known) < LEAST_KNOWN:
+        known = {k: int((shares[photos.seen[k]] >= SURE).sum()) for k in left}
+        # A photo with clicks comes as soon as enough is known of it: what it says is certain.
+        k = max(left, key=lambda row: (row in clicked and known[row] >= LEAST_KNOWN, known[row]))
+        if known[k] < LEAST_KNOWN:
             own = [row for row in left if row in clicked and clicked[row].prompt]
             if not own:
                 break
             k = max(own, key=lambda row: len(clicked[row].pixels))
         left.remove(k)
         made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px)
-        print(f"{photos.views[k].name}: quality {made[k].quality:.2f}, agreement {made[k].agreement:.2f}", flush=True)
+        _tell(photos.views[k].name, made[k])
     if not any(voter.votes for voter in made.values()):
         _refuse(photos, made, left_out)
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
-        if k in made and made[k].votes and _agreement(photos, k, made[k].mask, others) >= LEAST_AGREEMENT:
-            continue
-        made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px)
-        voter = made[k]
-        print(f"{photos.views[k].name} again: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
+        if k not in made or not made[k].votes or _agreement(photos, k, made[k].mask, others) < LEAST_AGREEMENT:
+            made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px)
+            _tell(f"{photos.views[k].name} again", made[k])
+    for k in [k for k in range(len(photos.views)) if made[k].votes]:
+        others = {row: voter for row, voter in made.items() if row != k}
+        made[k] = _extended(ask, photos, k, made[k], others, tolerance_px)
     return _carried(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
 
 
@@ -125,6 +136,10 @@ def one_photo(ask: Ask, view: View, clicks: PhotoClicks, tolerance_px: float) ->
     nothing = np.zeros((0, 3)), [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2))]
     voter, left_out = _make(ask, Workspace(Path(), [view], *nothing), 0, clicks, {}, tolerance_px)
     return voter.mask, voter.quality, voter.agreement, left_out
+
+
+def _tell(name: str, voter: _Voter) -> None:
+    print(f"{name}: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
 
 
 def _make(
@@ -155,6 +170,19 @@ def _make(
     return voter, notes
 
 
+def _extended(
+    ask: Ask, photos: Workspace, k: int, voter: _Voter, others: dict[int, _Voter], tolerance_px: float
+) -> _Voter:
+    """A photo's mask with the parts that it lacks by the votes of all others."""
+    known_on, known_off = _known(photos, k, others)
+    inside, outside = (voter.clicks.on, known_on), (voter.clicks.off, known_off)
+    mask = _with_parts(ask, photos.views[k], voter.mask, inside, outside, tolerance_px)
+    if (mask == voter.mask).all():
+        return voter
+    print(f"{photos.views[k].name}: {mask.sum() / voter.mask.sum() - 1:.1%} added", flush=True)
+    return _voter(photos, k, mask, voter.quality, _agrees(mask, inside, outside, tolerance_px), voter.clicks)
+
+
 def _asked(
     ask: Ask,
     view: View,
@@ -167,13 +195,58 @@ def _asked(
     masks, quality = ask(view, inside, outside, box)
     on, off = np.concatenate(inside), np.concatenate(outside)
     masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
-    agreement = []
-    for mask in masks:
-        held = np.concatenate([_held(mask, inside[0], tolerance_px), _held(mask, inside[1], 0)])
-        spared = np.concatenate([_held(~mask, outside[0], tolerance_px), _held(~mask, outside[1], 0)])
-        agreement.append((held.mean() if len(held) else 1.0) - ((~spared).mean() if len(spared) else 0.0))
+    agreement = [_agrees(mask, inside, outside, tolerance_px) for mask in masks]
     best = int(np.argmax([a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]))
-    return masks[best], float(quality[best]) * bool(masks[best].any()), float(agreement[best])
+    mask = _with_parts(ask, view, masks[best], inside, outside, tolerance_px)
+    return mask, float(quality[best]) * bool(mask.any()), _agrees(mask, inside, outside, tolerance_px)
+
+
+def _agrees(mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float) -> float:
+    """Share of the pixels inside that a mask holds, less the share of those outside that it holds."""
+    held = np.concatenate([_held(mask, inside[0], tolerance_px), _held(mask, inside[1], 0)])
+    spared = np.concatenate([_held(~mask, outside[0], tolerance_px), _held(~mask, outside[1], 0)])
+    return float((held.mean() if len(held) else 1.0) - ((~spared).mean() if len(spared) else 0.0))
+
+
+def _with_parts(
+    ask: Ask, view: View, mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float
+) -> Mask:
+    """A mask with the parts that it lacks: of several things that prompt it, a network takes the clearest.
+
+    Each group of pixels inside that the mask does not hold, near each other, prompts alone. What it gives is a part of
+    the object if it holds them, few pixels known to be outside beside those known to be inside, and is no larger than
+    the mask.
+    """
+    whole = mask
+    if _agrees(mask, inside, outside, tolerance_px) < PART_AGREEMENT:
+        return whole
+    missed_px = max(tolerance_px, NEAR_MISS * max(mask.shape))
+    lacking = inside[0][~_held(mask, inside[0], missed_px)], inside[1][~_held(mask, inside[1], 0)]
+    for group in _groups(*lacking, PART_GAP * max(mask.shape)):
+        masks, quality = ask(view, group, outside, None)
+        on = np.concatenate(group)
+        # What is clicked in a photo beats what other photos say of it.
+        off = outside[0] if len(group[0]) else np.concatenate(outside)
+        for row in np.argsort(-quality):
+            part = prompted_parts(cleaned(masks[row]), on, off)
+            own, foreign = (_held(part, pixels, 0).sum() for pixels in (np.concatenate(inside), off))
+            holds = part.any() and _share(part, on, 1.0) >= SURE
+            if quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign) and part.sum() <= mask.sum():
+                whole = whole | part
+                break
+    return whole
+
+
+def _groups(clicked: Array, carried: Array, gap_px: float) -> Iterator[tuple[Array, Array]]:
+    """Pixels (N, 2) clicked and (M, 2) carried on, those near each other together; a few carried ones say nothing."""
+    pixels = np.concatenate([clicked, carried])
+    if len(pixels):
+        tree = cKDTree(pixels)
+        _, group = connected_components(tree.sparse_distance_matrix(tree, gap_px))
+        for number in range(group.max() + 1):
+            of_group = np.split(group == number, [len(clicked)])
+            if of_group[0].any() or of_group[1].sum() >= LEAST_KNOWN:
+                yield clicked[of_group[0]], carried[of_group[1]]
 
 
 def _held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:

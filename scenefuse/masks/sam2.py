@@ -65,12 +65,15 @@ class Sam2Onnx:
         ]
         self._encoder = onnxruntime.InferenceSession(str(encoder), options, providers=providers)
         self._decoder = onnxruntime.InferenceSession(str(decoder), options, providers=providers)
+        self._last: tuple[NDArray[np.uint8], dict[str, NDArray[np.float32]]] | None = None
 
     def encode(self, image: NDArray[np.uint8]) -> dict[str, NDArray[np.float32]]:
-        """See Sam2; 17 MB."""
-        names = [o.name for o in self._encoder.get_outputs()]
-        outputs = self._encoder.run(None, {self._encoder.get_inputs()[0].name: _blob(image)})
-        return dict(zip(names, outputs))
+        """See Sam2; 17 MB. The last photo's are kept."""
+        if self._last is None or self._last[0] is not image:
+            names = [o.name for o in self._encoder.get_outputs()]
+            outputs = self._encoder.run(None, {self._encoder.get_inputs()[0].name: _blob(image)})
+            self._last = image, dict(zip(names, outputs))
+        return self._last[1]
 
     def masks(
         self,

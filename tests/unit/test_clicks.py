@@ -9,7 +9,7 @@ import pycolmap
 import pytest
 from support.photographed_plane import photographs
 
-from scenefuse.masks.carry import carry
+from scenefuse.masks.carry import carry, one_photo
 from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.grabcut import along_edges, grow_seeds
@@ -160,6 +160,50 @@ def test_clicks_in_a_further_photo_prompt_that_photo(photos):
     carry(ask, photos, {3: clicks([MIDDLE, (70, 45)]), 8: clicks([(55, 40)], [(10, 10)])}, 2)
     assert told["f08.png"][0].tolist() == [[55, 40]] and told["f08.png"][1].tolist() == [[10, 10]]
     assert len(told["f03.png"][0]) == 2 and not len(told["f07.png"][0])
+
+
+def hat(view):
+    """A disc beside the ball."""
+    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    return np.hypot(u - 100, v - 20) < 8
+
+
+def ask_for_the_clearest(view, inside, outside, box):
+    """The ball if anything on it prompts, else the disc, else everything around both."""
+    mask, part, at = true_mask(view), hat(view), np.concatenate(inside).astype(int)
+    there = mask if mask[at[:, 1], at[:, 0]].any() else part if part[at[:, 1], at[:, 0]].any() else ~(mask | part)
+    return [there], np.array([0.9])
+
+
+def test_a_part_that_the_network_prefers_to_leave_out_is_asked_for_alone(photos):
+    view = photos.views[0]
+    whole = true_mask(view) | hat(view)
+    mask, _, agreement, notes = one_photo(ask_for_the_clearest, view, clicks([MIDDLE, (100, 20)]), 2)
+    assert (mask == whole).all() and agreement == 1 and not notes
+    # Not what a click outside says, and nothing that is larger than the object.
+    for inside, outside in (([MIDDLE, (100, 20)], [(101, 21), (99, 19)]), ([MIDDLE, (5, 5)], [])):
+        mask, _, _, notes = one_photo(ask_for_the_clearest, view, clicks(inside, outside), 2)
+        assert (mask == true_mask(view)).all() and "click inside" in notes[0]
+
+
+def test_a_click_that_missed_the_outline_is_no_part(photos):
+    view = photos.views[0]
+    edge = int(np.flatnonzero(true_mask(view)[45]).max())
+
+    def ask(view, inside, outside, box):
+        at = np.concatenate(inside).astype(int)
+        beside = np.zeros_like(true_mask(view))
+        beside[43:48, edge + 1 : edge + 6] = True
+        return [true_mask(view) if true_mask(view)[at[:, 1], at[:, 0]].any() else beside], np.array([0.9])
+
+    assert (one_photo(ask, view, clicks([MIDDLE, (edge + 3, 45)]), 4)[0] == true_mask(view)).all()
+    assert one_photo(ask, view, clicks([MIDDLE, (edge + 3, 45)]), 1)[0][45, edge + 3]
+
+
+def test_a_photo_with_clicks_comes_as_soon_as_enough_is_known_of_it(photos):
+    network = PlantedNetwork()
+    carry(network, photos, {3: clicks([MIDDLE, (70, 45)]), 6: clicks([MIDDLE])}, 2)
+    assert network.asked.index("f06.png") <= 2
 
 
 @pytest.mark.parametrize(
