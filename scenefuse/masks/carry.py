@@ -39,6 +39,8 @@ PART_GAP = 0.05
 
 PART_AGREEMENT = 0.5
 """A mask that agrees less with what prompts it does not lack parts: it is another thing."""
+PART_REACH = 0.1
+"""Pixels outside prompt a part if they are this near it, likewise."""
 NEAR_MISS = 0.015
 """A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part."""
 
@@ -223,10 +225,13 @@ def _with_parts(
     missed_px = max(tolerance_px, NEAR_MISS * max(mask.shape))
     lacking = inside[0][~_held(mask, inside[0], missed_px)], inside[1][~_held(mask, inside[1], 0)]
     for group in _groups(*lacking, PART_GAP * max(mask.shape)):
-        masks, quality = ask(view, group, outside, None)
         on = np.concatenate(group)
         # What is clicked in a photo beats what other photos say of it.
-        off = outside[0] if len(group[0]) else np.concatenate(outside)
+        certain, voted = outside if not len(group[0]) else (outside[0], outside[1][:0])
+        off = np.concatenate([certain, voted])
+        # Far from a part, they say nothing of it and mislead the network.
+        reach = cKDTree(on), PART_REACH * max(mask.shape)
+        masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None)
         for row in np.argsort(-quality):
             part = prompted_parts(cleaned(masks[row]), on, off)
             own, foreign = (_held(part, pixels, 0).sum() for pixels in (np.concatenate(inside), off))
@@ -235,6 +240,11 @@ def _with_parts(
                 whole = whole | part
                 break
     return whole
+
+
+def _near(pixels: Array, others: cKDTree, reach_px: float) -> Array:
+    """Those of (N, 2) pixels that are near one of the others."""
+    return pixels[others.query(pixels)[0] < reach_px] if len(pixels) else pixels
 
 
 def _groups(clicked: Array, carried: Array, gap_px: float) -> Iterator[tuple[Array, Array]]:
