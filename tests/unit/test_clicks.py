@@ -200,6 +200,27 @@ def test_a_click_that_missed_the_outline_is_no_part(photos):
     assert one_photo(ask, view, clicks([MIDDLE, (edge + 3, 45)]), 1)[0][45, edge + 3]
 
 
+def test_a_click_on_a_part_beats_what_other_photos_say_of_it(photos):
+    """The points behind the disc are no object's for all other photos."""
+    carried = carry(ask_for_the_clearest, photos, {0: clicks([MIDDLE]), 1: clicks([MIDDLE, (100, 20)])}, 2)
+    assert (carried.masks[1] == (true_mask(photos.views[1]) | hat(photos.views[1]))).all() and not carried.left_out
+    assert all((carried.masks[k] == true_mask(photos.views[k])).all() for k in range(PHOTOS) if k != 1)
+
+
+def test_the_first_photo_gets_the_part_that_only_the_others_know(photos):
+    cap = (np.arange(HEIGHT) < 31)[:, None]
+
+    def ask(view, inside, outside, box):
+        at = np.concatenate(inside).astype(int)
+        if view.name != "f03.png":
+            return [true_mask(view)], np.array([0.9])
+        alone = cap[at[:, 1], 0].all()
+        return [true_mask(view) & (cap if alone else ~cap)], np.array([0.9])
+
+    carried = carry(ask, photos, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert (carried.masks[3] == true_mask(photos.views[3])).all()
+
+
 def test_a_photo_with_clicks_comes_as_soon_as_enough_is_known_of_it(photos):
     network = PlantedNetwork()
     carry(network, photos, {3: clicks([MIDDLE, (70, 45)]), 6: clicks([MIDDLE])}, 2)
