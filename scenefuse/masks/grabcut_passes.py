@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from scenefuse.masks.clicks import PhotoClicks
+from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.grabcut import (
     Trimap,
     cleaned,

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefuse.masks.carry import Ask, carry, prompted_parts
-from scenefuse.masks.click_depth import with_depth
-from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.carry import carry
+from scenefuse.masks.clicked.click_depth import with_depth
+from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.parts import Ask, prompted_parts
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2

@@ -10,7 +10,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicks import PhotoClicks
+from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
 from scenefuse.masks.target import Target, far_apart

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from scenefuse.masks.clicks import PhotoClicks
+from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.grabcut import along_edges, cleaned
 from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
 from scenefuse.masks.sam2 import LOGITS_PX, Sam2, segment

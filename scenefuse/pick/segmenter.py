@@ -16,7 +16,7 @@ from scenefuse.pick.pictures import Picture, at_most, read_upright
 from scenefuse.stage import StageError, threads
 
 if TYPE_CHECKING:
-    from scenefuse.masks.clicks import PhotoClicks
+    from scenefuse.masks.clicked.clicks import PhotoClicks
 
 Mask = NDArray[np.bool_]
 KEPT = 24
@@ -127,7 +127,8 @@ class Segmenter:
         Raises:
             StageError: the photo cannot be read.
         """
-        from scenefuse.masks.carry import LEAST_AGREEMENT, LEAST_QUALITY, one_photo
+        from scenefuse.masks.clicked.carry import one_photo
+        from scenefuse.masks.clicked.votes import LEAST_AGREEMENT, LEAST_QUALITY
         from scenefuse.workspace import View
 
         self.load()
@@ -166,7 +167,7 @@ class Segmenter:
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":
     """The clicks of one photo, in pixels of a copy of it of another size."""
-    from scenefuse.masks.clicks import PhotoClicks
+    from scenefuse.masks.clicked.clicks import PhotoClicks
 
     own = [row for row in rows if row.photo == picture.name]
     scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3

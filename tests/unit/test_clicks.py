@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 from support.photographed_plane import photographs
 
-from scenefuse.masks.carry import carry, one_photo
-from scenefuse.masks.click_depth import with_depth
-from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.carry import carry, one_photo
+from scenefuse.masks.clicked.click_depth import with_depth
+from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.prompted import masks_from_prompts

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud
 from scenefuse.io.tiles.tiled_cloud import Rows, TiledCloud
-from scenefuse.masks.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud
 from scenefuse.sfm.fiducials import Labels
 from scenefuse.stage import StageError, threads

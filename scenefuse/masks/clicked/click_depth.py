@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicks import PhotoClicks
+from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
 

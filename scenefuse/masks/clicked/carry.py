@@ -1,0 +1,197 @@
+"""Masks of all photos from a few clicks in one: the sparse points inside and outside its mask prompt the next photo."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
+from scenefuse.masks.clicked.pixels import distance_to, pixel_of
+from scenefuse.masks.clicked.votes import (
+    LEAST_AGREEMENT,
+    LEAST_QUALITY,
+    SURE,
+    Voter,
+    agreement_of,
+    known_pixels,
+    shares_of,
+    voter_of,
+)
+from scenefuse.masks.grabcut import cleaned
+from scenefuse.mvs.visual_hull import Mask
+from scenefuse.stage import StageError
+from scenefuse.transforms import Array
+from scenefuse.workspace import View, Workspace
+
+QUALITY_WEIGHT = 0.3
+"""Of a mask's quality beside its agreement, when one of several is chosen."""
+
+NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
+
+
+@dataclass(frozen=True)
+class Carried:
+    """What became of the clicks.
+
+    Attributes:
+        masks: (H, W) per photo, empty where none was good enough.
+        reasons: why a photo's mask is not good enough, by the photo's name.
+        kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
+        left_out: the clicks that contradict their mask, a sentence each.
+        clicked: the others, by row of the photo.
+    """
+
+    masks: list[Mask]
+    reasons: dict[str, str]
+    kind: NDArray[np.int8]
+    left_out: list[str]
+    clicked: dict[int, PhotoClicks]
+
+
+def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], tolerance_px: float) -> Carried:
+    """Masks of all photos from clicks in one or more of them (method K1).
+
+    The photo with most clicks comes first. Then always the photo that sees most points known to be the object's, so
+    that the masks go round the object both ways; a photo with clicks of its own is prompted by these too. A mask of
+    low quality, or one that contradicts what prompted it, does not vote. All that do not, or that the others
+    contradict in the end, are made once more from the votes of all others; all get the parts that they lack by these.
+
+    Args:
+        ask: the method: SAM 2 or GrabCut.
+        photos: views with RGB pixels, sparse points and who observes them.
+        clicked: clicks by row of the photo.
+        tolerance_px: a click this far on the wrong side of its mask's outline is no contradiction.
+
+    Raises:
+        StageError: no photo has a good mask from its own clicks.
+    """
+    made: dict[int, Voter] = {}
+    left_out: dict[int, list[str]] = {}
+    left = list(range(len(photos.views)))
+    while left:
+        shares = shares_of(photos, made)
+        known = {k: int((shares[photos.seen[k]] >= SURE).sum()) for k in left}
+        # A photo with clicks comes as soon as enough is known of it: what it says is certain.
+        k = max(left, key=lambda row: (row in clicked and known[row] >= LEAST_KNOWN, known[row]))
+        if known[k] < LEAST_KNOWN:
+            own = [row for row in left if row in clicked and clicked[row].prompt]
+            if not own:
+                break
+            k = max(own, key=lambda row: len(clicked[row].pixels))
+        left.remove(k)
+        made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px)
+        _tell(photos.views[k].name, made[k])
+    if not any(voter.votes for voter in made.values()):
+        _refuse(photos, made, left_out)
+    for k in range(len(photos.views)):
+        others = {row: voter for row, voter in made.items() if row != k}
+        if k not in made or not made[k].votes or agreement_of(photos, k, made[k].mask, others) < LEAST_AGREEMENT:
+            made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px)
+            _tell(f"{photos.views[k].name} again", made[k])
+    for k in [k for k in range(len(photos.views)) if made[k].votes]:
+        others = {row: voter for row, voter in made.items() if row != k}
+        made[k] = _extended(ask, photos, k, made[k], others, tolerance_px)
+    return _carried(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
+
+
+def one_photo(ask: Ask, view: View, clicks: PhotoClicks, tolerance_px: float) -> tuple[Mask, float, float, list[str]]:
+    """The mask (H, W) of a photo from its own clicks alone, with which `carry` begins; its quality, its agreement with
+    the clicks, and the clicks that contradict it, a sentence each. Arguments as of `carry`; the view has RGB pixels."""
+    nothing = np.zeros((0, 3)), [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2))]
+    voter, left_out = _make(ask, Workspace(Path(), [view], *nothing), 0, clicks, {}, tolerance_px)
+    return voter.mask, voter.quality, voter.agreement, left_out
+
+
+def _tell(name: str, voter: Voter) -> None:
+    print(f"{name}: quality {voter.quality:.2f}, agreement {voter.agreement:.2f}", flush=True)
+
+
+def _make(
+    ask: Ask, photos: Workspace, k: int, clicks: PhotoClicks, others: dict[int, Voter], tolerance_px: float
+) -> tuple[Voter, list[str]]:
+    """A photo's mask from its clicks and the others' votes, and the clicks left out as they contradict it."""
+    inside, outside = known_pixels(photos, k, others)
+    keep, view = np.ones(len(clicks.pixels), dtype=bool), photos.views[k]
+    notes: list[str] = []
+    voter = voter_of(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0, NO_CLICKS)
+    for _ in range(2):
+        kept = clicks.only(keep)
+        if len(inside) < LEAST_KNOWN and not kept.prompt:
+            break
+        found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px)
+        voter = voter_of(photos, k, *found, kept)
+        x, y = pixel_of(clicks.pixels, voter.mask)
+        miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
+        wrong = keep & (miss > tolerance_px)
+        if not wrong.any():
+            break
+        notes += [
+            f"the click {'inside' if clicks.inside[row] else 'outside'} at ({x[row]}, {y[row]}) of the undistorted"
+            f" {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
+            for row in np.flatnonzero(wrong)
+        ]
+        keep &= ~wrong
+    return voter, notes
+
+
+def _extended(
+    ask: Ask, photos: Workspace, k: int, voter: Voter, others: dict[int, Voter], tolerance_px: float
+) -> Voter:
+    """A photo's mask with the parts that it lacks by the votes of all others."""
+    known_on, known_off = known_pixels(photos, k, others)
+    inside, outside = (voter.clicks.on, known_on), (voter.clicks.off, known_off)
+    mask = with_parts(ask, photos.views[k], voter.mask, inside, outside, tolerance_px)
+    if (mask == voter.mask).all():
+        return voter
+    print(f"{photos.views[k].name}: {mask.sum() / voter.mask.sum() - 1:.1%} added", flush=True)
+    return voter_of(photos, k, mask, voter.quality, agrees(mask, inside, outside, tolerance_px), voter.clicks)
+
+
+def _asked(
+    ask: Ask,
+    view: View,
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    box: Array | None,
+    tolerance_px: float,
+) -> tuple[Mask, float, float]:
+    """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement."""
+    masks, quality = ask(view, inside, outside, box)
+    on, off = np.concatenate(inside), np.concatenate(outside)
+    masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
+    agreement = [agrees(mask, inside, outside, tolerance_px) for mask in masks]
+    best = int(np.argmax([a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]))
+    mask = with_parts(ask, view, masks[best], inside, outside, tolerance_px)
+    return mask, float(quality[best]) * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
+
+
+def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[str]]) -> None:
+    """Say why no photo has a mask to begin with."""
+    about = "; ".join(
+        f"{photos.views[k].name}: quality {voter.quality:.2f} (least {LEAST_QUALITY}), agreement with the clicks"
+        f" {voter.agreement:.2f} (least {LEAST_AGREEMENT})"
+        for k, voter in made.items()
+    )
+    wrong = "".join(f"; {note}" for notes in left_out.values() for note in notes)
+    raise StageError(f"no clicked photo has a good mask from its clicks ({about}{wrong}); correct or add clicks")
+
+
+def _carried(photos: Workspace, made: dict[int, Voter], left_out: list[str]) -> Carried:
+    """Masks that vote, empty ones for the other photos, and what they say of each point seen in three photos."""
+    reasons, masks = {}, []
+    for k, view in enumerate(photos.views):
+        masks.append(made[k].mask if made[k].votes else np.zeros((view.height, view.width), dtype=bool))
+        if not made[k].votes:
+            reasons[view.name] = (
+                f"the mask from the clicks has quality {made[k].quality:.2f} (least {LEAST_QUALITY}) and agrees with"
+                f" {made[k].agreement:.2f} of its prompts (least {LEAST_AGREEMENT})"
+            )
+    shares = shares_of(photos, made)
+    counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
+    kind = np.where(shares >= SURE, 1, np.where(shares <= 1 - SURE, -1, 0)).astype(np.int8)
+    kind[counts < 3] = 0
+    return Carried(
+        masks, reasons, kind, left_out, {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
+    )
