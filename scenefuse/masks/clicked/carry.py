@@ -73,9 +73,12 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     while left:
         shares = shares_of(photos, made)
         known = {k: int((shares[photos.seen[k]] >= SURE).sum()) for k in left}
-        # A photo with clicks comes as soon as enough is known of it: what it says is certain.
+        # Enough clicks make a mask by themselves; fewer, as soon as enough is known of their photo.
+        alone = [row for row in left if row in clicked and clicked[row].enough]
         k = max(left, key=lambda row: (row in clicked and known[row] >= LEAST_KNOWN, known[row]))
-        if known[k] < LEAST_KNOWN:
+        if alone:
+            k = max(alone, key=lambda row: len(clicked[row].pixels))
+        elif known[k] < LEAST_KNOWN:
             own = [row for row in left if row in clicked and clicked[row].prompt]
             if not own:
                 break

@@ -12,6 +12,9 @@ from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, posed_images, read_model
 
+ENOUGH = 3
+"""Clicks inside that make a mask by themselves: fewer may be on one part of the object only."""
+
 
 @dataclass(frozen=True)
 class PhotoClicks:
@@ -50,6 +53,11 @@ class PhotoClicks:
     def prompt(self) -> bool:
         """Whether they say where the object is: one inside, or a box."""
         return bool(self.inside.any()) or self.box is not None
+
+    @property
+    def enough(self) -> bool:
+        """Whether they say what the object is without any other photo: a box, or three inside."""
+        return int(self.inside.sum()) >= ENOUGH or self.box is not None
 
     def only(self, keep: NDArray[np.bool_]) -> "PhotoClicks":
         """The clicks of the rows (N,) to keep, and the box."""
