@@ -27,6 +27,9 @@ BOX_GROWTH = 0.05
 """Growth of the box around the prompts, as a share of its longer side."""
 MOST_INSIDE, MOST_OUTSIDE = 10, 6
 """Points carried on from other photos that prompt a photo at most: far apart, they say as much as hundreds."""
+FEW_INSIDE = 4
+"""In the middle of the object, so many prompt it as well, with the box around all: by points on all its ends and off
+it, the network is sure of nothing."""
 NEAR = 0.3
 """Points off the object prompt only this near the box around those on it, as a share of its longer side."""
 NONE = np.zeros((0, 2))
@@ -213,7 +216,8 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
 def ask_sam2(
     network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
 ) -> tuple[list[Mask], Array]:
-    """SAM 2's three masks (H, W) of a photo and its own opinion of them (3,).
+    """SAM 2's masks (H, W) of a photo and its own opinion of them (M,): three from pixels all over the object, and
+    where there are more than a few of these, three from some in its middle and the box around all.
 
     Args:
         network: SAM 2.
@@ -222,13 +226,25 @@ def ask_sam2(
         outside: the same off the object; of those carried on, the near ones.
         box_px: (2, 2) corners of a box around it, upper left first, or None.
     """
+    features, size = network.encode(view.pixels), (view.height, view.width)
     around = np.concatenate(inside) if box_px is None else box_px
     low, high = around.min(0), around.max(0)
     reach = NEAR * (high - low).max()
     near = outside[1][((outside[1] > low - reach) & (outside[1] < high + reach)).all(1)]
-    on = far_apart(inside[0], inside[1], MOST_INSIDE)
     off = far_apart(outside[0], near if len(near) else outside[1], MOST_OUTSIDE)
-    return network.masks(network.encode(view.pixels), (view.height, view.width), on, box_px, off)
+    masks, quality = network.masks(features, size, far_apart(inside[0], inside[1], MOST_INSIDE), box_px, off)
+    if len(np.concatenate(inside)) > MOST_INSIDE:
+        grow = BOX_GROWTH * (high - low).max()
+        around_px = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1]) if box_px is None else box_px
+        more, their_quality = network.masks(features, size, _middle(np.concatenate(inside)), around_px)
+        masks, quality = [*masks, *more], np.concatenate([quality, their_quality])
+    return masks, quality
+
+
+def _middle(pixels: Array) -> Array:
+    """A few of (N, 2) pixels: the middle one, and of the half nearest to it those far apart."""
+    order = np.argsort(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1), kind="stable")
+    return far_apart(pixels[order[:1]], pixels[order[: (len(order) + 1) // 2]], FEW_INSIDE)
 
 
 def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:

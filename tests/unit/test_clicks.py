@@ -237,21 +237,29 @@ def test_grabcut_goes_round_from_clicks_or_a_box(photos, prompts):
 
 def test_sam2_is_told_every_click_and_a_few_carried_points_near_the_object(photos):
     class Network:
+        told = []
+
         def encode(self, image):
             return None
 
-        def masks(self, features, size, points_px, box_px, outside_px):
-            self.told = points_px, box_px, outside_px
-            return [], np.zeros(0)
+        def masks(self, features, size, points_px, box_px, outside_px=NONE):
+            self.told.append((points_px, box_px, outside_px))
+            return [len(points_px)], np.ones(1)
 
     network, generator = Network(), np.random.default_rng(0)
     clicked, carried = generator.uniform(40, 60, (12, 2)), generator.uniform(40, 60, (50, 2))
     off = np.concatenate([generator.uniform(62, 64, (20, 2)), [[119.0, 89.0]]])
-    ask_sam2(network, photos.views[0], (clicked, carried), (NONE, off), None)
-    assert np.array_equal(network.told[0], clicked) and network.told[1] is None
-    assert len(network.told[2]) == 6 and network.told[2].max() < 65
+    answers, qualities = ask_sam2(network, photos.views[0], (clicked, carried), (NONE, off), None)
+    assert np.array_equal(network.told[0][0], clicked) and network.told[0][1] is None
+    assert len(network.told[0][2]) == 6 and network.told[0][2].max() < 65
+    # Once more from a few in the middle and the box: on all ends of an object the network is sure of nothing.
+    everywhere = np.concatenate([clicked, carried])
+    assert (network.told[1][1][0] < everywhere.min(0)).all() and (network.told[1][1][1] > everywhere.max(0)).all()
+    assert answers == [12, 4] and len(qualities) == 2
+    assert np.abs(network.told[1][0] - 50).max() < np.abs(network.told[0][0] - 50).max()
     ask_sam2(network, photos.views[0], (clicked[:3], carried), (NONE, off), None)
-    assert len(network.told[0]) == 10 and np.array_equal(network.told[0][:3], clicked[:3])
+    assert len(network.told[2][0]) == 10 and np.array_equal(network.told[2][0][:3], clicked[:3])
+    assert ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), None)[0] == [3]
 
 
 def test_far_apart_points_stop_when_all_are_chosen():
@@ -286,7 +294,7 @@ class Told:
     def encode(self, image):
         return next(view for view in self.known if view.pixels is image)
 
-    def masks(self, view, size, points_px, box_px, outside_px):
+    def masks(self, view, size, points_px, box_px, outside_px=NONE):
         self.told.append((view.name, points_px, box_px, outside_px))
         mask = true_mask(view)
         if view.name == "f06.png":
@@ -311,8 +319,8 @@ def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, pho
     marked = read(tmp_path, [("inside", "f03.png", *MIDDLE), ("inside", "f03.png", 70, 45)])
     up = np.array([0, 0, 1.0])
     found = masks_from_prompts(marked, model, SIZES, photos, up, network, MaskSettings(), 0)
-    # Its quality is low, so it is segmented again in the end; the second answer has the same part in the corner.
-    assert [name for name, *_ in network.told].count("f06.png") == 3
+    # Its quality is low, so it is segmented again in the end; the last answer has the same part in the corner.
+    assert [name for name, *_ in network.told].count("f06.png") == 5
     assert not found.masks[6][:8, :8].any() and mask_iou(found.masks[6], true_mask(photos.views[6])) > 0.95
 
 
