@@ -176,7 +176,8 @@ def _alignment(fields: Fields) -> str:
     if not found:
         return "" if found is None else f"not found: {reason}"
     deviation = 100 * find(fields, "alignment.scale_sd_log")
-    return f"scale {number(find(fields, 'alignment.scale'))} (standard deviation {number(deviation)} %), {reason}"
+    scale = number(find(fields, "alignment.scale"))
+    return f"scale {scale} (standard deviation {number(deviation)} %, bending apart), {reason}"
 
 
 def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
@@ -200,12 +201,12 @@ def _variant_lines(item: Collected, variants: list[str]) -> list[str]:
     if not used:
         return []
     words = {"registered": "ok", "unregistered": "refused"}
-    above, below = ("".join(f"{shown[k][row]:>8}" for k in used) for row in (0, 1))
-    lines = [f"{'registration':<20}{above}".rstrip(), f"{'':<20}{below}"]
+    above, below = ("".join(f"{shown[k][row]:>9}" for k in used) for row in (0, 1))
+    lines = [f"{'registration':<22}{above}".rstrip(), f"{'':<22}{below}"]
     for variant, row in rows.items():
         status = status_of(item, variant)
         lines.append(
-            f"  {variant[:10]:<10}{words.get(status, status):>8}" + "".join(f"{_three(row[k]):>8}" for k in used)
+            f"  {variant[:12]:<12}{words.get(status, status):>8}" + "".join(f"{_three(row[k]):>9}" for k in used)
         )
     found = item.variants[variants[0]]
     if number_in(found, REGISTRATION["inlier_rmse"]) is not None:
@@ -277,8 +278,8 @@ def _cell(item: Any) -> str:
 
 
 def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
-    """What fusion added and took away, and the points of the object that no photo confirms."""
-    counts = {"points added": "added", "taken from the scene": "removed", "confirmed by no photo": "nerf_only"}
+    """What fusion added and took away, and the points of the object that no three photos confirm."""
+    counts = {"points added": "added", "taken from the scene": "removed", "of the object unconfirmed": "nerf_only"}
     return [(label, find(fusion, f"fusion.{key}_points"), "") for label, key in counts.items()]
 
 

@@ -14,7 +14,7 @@ from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, together, with_sou
 from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, write_cloud
 from scenefuse.io.formats import COLOR, las_crs
 from scenefuse.io.import_cloud import unit_and_name
 from scenefuse.io.settings import build, read_settings
@@ -147,7 +147,8 @@ def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
         again = own >= OWN
         names = {name: name if again else _free(name, own) for name in done.added.fields}
         types = {} if again else {name: values.dtype.str[1:] for name, values in done.added.fields.items()}
-        header.add_extra_dims([laspy.ExtraBytesParams(names[name], kind) for name, kind in types.items()])
+        described = {name: LAS_DESCRIPTIONS.get(name, "") for name in types}
+        header.add_extra_dims([laspy.ExtraBytesParams(names[n], kind, described[n]) for n, kind in types.items()])
         with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
             brightest = 0
             for chunk, fields in _kept_chunks(reader, done):

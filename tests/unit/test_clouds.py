@@ -38,6 +38,8 @@ def test_laz_round_trip_at_utm_coordinates_is_a_millimetre(tmp_path):
     assert np.abs(np.stack([las.x, las.y, las.z], axis=1) - cloud().points).max() <= 1e-3
     assert las.header.parse_crs().to_epsg() == 32632
     assert np.array_equal(las["source"], cloud().fields["source"])
+    described = las.header.point_format.dimension_by_name("source").description
+    assert described == "0 scene, n the n-th object"
 
 
 def test_columns_of_any_name_are_written_and_the_new_names_told(tmp_path, capsys):

@@ -163,7 +163,7 @@ def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
     for mode, words in {
         "Photo": "Colours of the photos",
         "Source": "added",
-        "Class": "no photo confirms it: from the NeRF, or a given cloud",
+        "Class": "not measured: of the NeRF, or a given cloud",
         "Std. deviation": "0.049 m",
     }.items():
         choose(opened, mode)

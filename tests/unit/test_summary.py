@@ -181,7 +181,7 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
     assert "dense.fallback: CPU used" in text
     assert "0.4 -> 0.9" in text
-    assert "points added 30, taken from the scene 4, confirmed by no photo 7" in " ".join(text.split())
+    assert "points added 30, taken from the scene 4, of the object unconfirmed 7" in " ".join(text.split())
     assert "fusion.notes: judged by the scene's photos" in " ".join(text.split())
     assert "1 of 3 objects registered" in text
 
@@ -221,7 +221,7 @@ def test_the_text_says_where_shared_features_put_the_object(results):
     not_found = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
     write_json(results / "objects/balloon/alignment.json", not_found)
     text = (summarise(results) / "summary.txt").read_text()
-    assert re.search(r"alignment +scale 2.5 \(standard deviation 1.23 %\), 9 of 12", text)
+    assert re.search(r"alignment +scale 2.5 \(standard deviation 1.23 %, bending apart\), 9 of 12", text)
     assert re.search(r"alignment +not found: 3 of 12", text)
     assert "alignment.reason" not in text
 

@@ -23,9 +23,9 @@ REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
 # Told apart by every kind of colour vision (after Okabe and Ito 2008).
 CLASSES = {
     0: ("#a9b1b9", "not checked"),
-    1: ("#0f8a66", "measured: photos confirm it"),
-    2: ("#d55e00", "no photo confirms it: from the NeRF, or a given cloud"),
-    3: ("#b869a0", "stereo only: no photo confirms it"),
+    1: ("#0f8a66", "measured: three photos confirm it, and its surroundings"),
+    2: ("#d55e00", "not measured: of the NeRF, or a given cloud"),
+    3: ("#b869a0", "not measured: of the scene's stereo"),
 }
 
 
