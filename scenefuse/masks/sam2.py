@@ -217,7 +217,7 @@ def ask_sam2(
     network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
 ) -> tuple[list[Mask], Array]:
     """SAM 2's masks (H, W) of a photo and its own opinion of them (M,): three from pixels all over the object, and
-    where there are more than a few of these, three from some in its middle and the box around all.
+    where there are more than ten of these, three from four in its middle and the box around all.
 
     Args:
         network: SAM 2.

@@ -53,8 +53,9 @@ class Carried:
 def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], tolerance_px: float) -> Carried:
     """Masks of all photos from clicks in one or more of them (method K1).
 
-    The photo with most clicks comes first. Then always the photo that sees most points known to be the object's, so
-    that the masks go round the object both ways; a photo with clicks of its own is prompted by these too. A mask of
+    Photos with three clicks or a box come first, those with most clicks before. Then always the photo that sees most
+    points known to be the object's, so that the masks go round the object both ways; one with clicks is prompted by
+    these too. A mask of
     low quality, or one that contradicts what prompted it, does not vote. All that do not, or that the others
     contradict in the end, are made once more from the votes of all others; all get the parts that they lack by these.
 
@@ -70,19 +71,7 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     made: dict[int, Voter] = {}
     left_out: dict[int, list[str]] = {}
     left = list(range(len(photos.views)))
-    while left:
-        shares = shares_of(photos, made)
-        known = {k: int((shares[photos.seen[k]] >= SURE).sum()) for k in left}
-        # Enough clicks make a mask by themselves; fewer, as soon as enough is known of their photo.
-        alone = [row for row in left if row in clicked and clicked[row].enough]
-        k = max(left, key=lambda row: (row in clicked and known[row] >= LEAST_KNOWN, known[row]))
-        if alone:
-            k = max(alone, key=lambda row: len(clicked[row].pixels))
-        elif known[k] < LEAST_KNOWN:
-            own = [row for row in left if row in clicked and clicked[row].prompt]
-            if not own:
-                break
-            k = max(own, key=lambda row: len(clicked[row].pixels))
+    while (k := _next(photos, made, left, clicked)) is not None:
         left.remove(k)
         made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px)
         _tell(photos.views[k].name, made[k])
@@ -97,6 +86,19 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
         others = {row: voter for row, voter in made.items() if row != k}
         made[k] = _extended(ask, photos, k, made[k], others, tolerance_px)
     return _carried(photos, made, [note for _, notes in sorted(left_out.items()) for note in notes])
+
+
+def _next(photos: Workspace, made: dict[int, Voter], left: list[int], clicked: dict[int, PhotoClicks]) -> int | None:
+    """Whose turn it is: a photo with clicks enough for a mask of its own; else the one of which most is known, one with
+    clicks before the others; else one with fewer clicks; None where nothing says what the object is."""
+    shares = shares_of(photos, made)
+    known = {k: int((shares[photos.seen[k]] >= SURE).sum()) for k in left}
+    told = [k for k in left if known[k] >= LEAST_KNOWN]
+    alone = [k for k in left if k in clicked and clicked[k].enough]
+    if told and not alone:
+        return max(told, key=lambda k: (k in clicked, known[k]))
+    some = [k for k in left if k in clicked and clicked[k].prompt]
+    return max(alone or some, key=lambda k: len(clicked[k].pixels), default=None)
 
 
 def one_photo(ask: Ask, view: View, clicks: PhotoClicks, tolerance_px: float) -> tuple[Mask, float, float, list[str]]:
