@@ -94,9 +94,9 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
-    that hides and is seen. What photos see through is not there (a measured point of the scene where as many see
-    through as confirm it), nor what no photo can see. Where both sides measured a place, the object's points stay
-    unless the scene's standard deviation is clearly smaller.
+    that hides and is seen. What photos see through is not there (a measured point of the scene where a larger share of
+    the photos that it is open to see through it than of those asked confirm it), nor what no photo can see. Where both
+    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller.
 
     Args:
         obj: the object in the scene's frame, registered.
@@ -116,14 +116,13 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
     obj = Side(obj.cloud.transformed(settled), moved_photos(obj.photos, settled))
     across = match_in(scene.cloud.points, scene.cloud.normals, obj.photos)
     on_scene = _supported(scene.cloud.points, of_scene.measured | across.measured, diagonal)
-    sure = replace(of_scene, photos=np.maximum(of_scene.photos, across.photos),
-                   match=np.maximum(of_scene.match, across.match),
-                   deviation=np.minimum(of_scene.deviation, across.deviation))  # fmt: skip
+    sure = _surer(of_scene, across)
     surface = obj.cloud[on_obj]
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
-    reason[seen.through >= np.maximum(LEAST_THROUGH, np.where(on_scene, sure.photos, 0))] = SEEN_THROUGH
+    through = seen.through >= np.where(on_scene, _confirming(sure) * (seen.in_view - seen.hidden), 0)
+    reason[through & (seen.through >= LEAST_THROUGH)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
@@ -225,6 +224,19 @@ def _own(side: Side, other: Side) -> Matches:
     """A side's points in its own photos, or in the other's where it has none."""
     photos = side.photos if len(side.photos.views) >= LEAST_PHOTOS else other.photos
     return match_in(side.cloud.points, side.cloud.normals, photos)
+
+
+def _surer(one: Matches, two: Matches) -> Matches:
+    """What the photos of that side say which confirms a point more often, and the least deviation of both."""
+    more = two.photos > one.photos
+    return Matches(**{
+        name: np.where(more, getattr(two, name), values) for name, values in vars(one).items()
+    } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
+
+
+def _confirming(matches: Matches) -> Array:
+    """(N,) share of the photos asked that confirm a point, the reference among both."""
+    return np.asarray(matches.photos / (matches.tested + 1.0))
 
 
 def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float) -> Visibility:

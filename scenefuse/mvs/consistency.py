@@ -20,7 +20,7 @@ class DepthAgreement:
         agree: (N,) views whose depth at the point is the point's own, within the tolerance.
         through: (N,) views that see past the point: it floats in front of their surface.
         hidden: (N,) views for which the point is behind their surface.
-        off_mask: (N,) views in whose picture the point lies off the mask.
+        off_mask: (N,) views in whose picture the point lies off the mask, with nothing before it.
         mean: (N, 3) mean of the point and the points that agree with it.
         compared: number of other views.
     """
@@ -87,6 +87,7 @@ def compare(
     intrinsics: Array,
     frame_from_cam: Array,
     tolerance: float,
+    covered: NDArray[np.float32] | None = None,
 ) -> DepthAgreement:
     """Project points of one view into the others (of many, `others`) and compare depths.
 
@@ -98,6 +99,7 @@ def compare(
         intrinsics: (V, 3, 3) in pixels.
         frame_from_cam: (V, 4, 4).
         tolerance: largest difference of depth that agrees, unit of the frame.
+        covered: (V, H, W) depth along z from which on a view sees nothing off its mask, where it is known.
     """
     count = len(points)
     agree, through, hidden, off_mask = (np.zeros(count, np.int32) for _ in range(4))
@@ -112,7 +114,8 @@ def compare(
         x, y = in_camera[:, 0] / safe * k[0, 0] + k[0, 2], in_camera[:, 1] / safe * k[1, 1] + k[1, 2]
         index = np.flatnonzero((z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
         column, row = x[index].astype(np.int64), y[index].astype(np.int64)
-        off_mask[index] += ~masks[other, row, column]
+        beside = ~masks[other, row, column]
+        off_mask[index] += beside if covered is None else beside & (z[index] < covered[other, row, column])
         measured = depths[other, row, column].astype(np.float64)
         index, column, row = (a[measured > 0] for a in (index, column, row))
         measured = measured[measured > 0]

@@ -5,7 +5,7 @@ Source: Laurentini 1994 (visual hull), with voting instead of a strict intersect
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -69,25 +69,38 @@ class Hull:
     volume: float
 
 
-def count_silhouettes(points: NDArray[Any], views: Iterable[View]) -> tuple[Counts, Counts]:
-    """In how many photos each point lies in the frame, (N,), and in how many of these it lies off the mask, (N,).
+class Outline(NamedTuple):
+    """A photo of the hull: a view with `pixels` (H, W) bool, True on the object, and the depth (H, W) along z of what
+    it shows beside the object, infinite where that is unknown; None where it is unknown everywhere."""
 
-    Source: Laurentini 1994. With the two counts a caller decides how many photos may err.
+    view: View
+    covered_from: NDArray[np.float32] | None = None
+
+
+def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline]) -> tuple[Counts, Counts, Counts]:
+    """In how many photos each point lies in the frame and may be seen, (N,); in how many of these it lies off the
+    mask, (N,); and in how many others something stands before it, (N,), which say nothing.
+
+    Source: Laurentini 1994. With the counts a caller decides how many photos may err.
 
     Args:
         points: (N, 3) in the views' world, float32 or float64; projections are computed in their precision.
-        views: photos with `pixels` (H, W) bool, True on the object.
+        outlines: the photos.
     """
-    shown, missed = (np.zeros(len(points), dtype=np.int32) for _ in range(2))
-    for view in views:
+    shown, missed, hidden = (np.zeros(len(points), dtype=np.int32) for _ in range(3))
+    for view, covered_from in outlines:
         projection = view.projection.astype(points.dtype)
         x, y, depth = (points @ projection[:, :3].T + projection[:, 3]).T
         safe = np.maximum(depth, 1e-6)
         u, v = (np.clip(c / safe, -1, 1e6).astype(np.int32) for c in (x, y))
         rows = np.flatnonzero((depth > 0) & (x >= 0) & (u < view.width) & (y >= 0) & (v < view.height))
+        if covered_from is not None:
+            covered = depth[rows] > covered_from[v[rows], u[rows]]
+            hidden[rows[covered]] += 1
+            rows = rows[~covered]
         shown[rows] += 1
         missed[rows] += ~view.pixels[v[rows], u[rows]]
-    return shown, missed
+    return shown, missed, hidden
 
 
 def carve(
@@ -111,7 +124,7 @@ def carve(
     alive = np.flatnonzero(height_of(x_in_box) > 0)
     shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
     for start in range(0, len(silhouettes), BATCH):
-        counts = count_silhouettes(centres[alive], silhouettes[start : start + BATCH])
+        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + BATCH]))
         shown[alive] += counts[0]
         missed[alive] += counts[1]
         # A voxel outside more masks than all photos together could excuse is decided.

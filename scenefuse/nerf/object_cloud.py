@@ -16,6 +16,7 @@ from scenefuse.cores import use_threads
 from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
+from scenefuse.mvs.covered import covered_from
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import without_appearance
@@ -156,17 +157,19 @@ def fuse_depths(
     size = 2 * MASK_REACH_PX + 1
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for m in views.masks])
     tolerance = settings.gates.point_agreement * diagonal
-    parts = [_confirmed(views, poses, maps, grown, tolerance, index, settings) for index in range(len(poses))]
+    seen = grown, covered_from(views)
+    parts = [_confirmed(views, poses, maps, seen, tolerance, index, settings) for index in range(len(poses))]
     return concatenate(parts), diagonal
 
 
 def _confirmed(
-    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, grown: NDArray[np.bool_], tolerance: float,
-    index: int, settings: CloudSettings,
+    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, seen: tuple[NDArray[np.bool_], Maps],
+    tolerance: float, index: int, settings: CloudSettings,
 ) -> Cloud:  # fmt: skip
-    """The points of one view that pass the gates; `grown` (V, H, W) are the masks that points may lie in."""
+    """The points of one view that pass the gates; `seen` (V, H, W) are the masks that points may lie in, and from
+    which depth on they may lie beside them."""
     points, rows, columns = surface_points(maps.depths[index], views.intrinsics[index], poses[index])
-    found = compare(points, index, maps.depths, grown, views.intrinsics, poses, tolerance)
+    found = compare(points, index, maps.depths, seen[0], views.intrinsics, poses, tolerance, seen[1])
     gates = settings.gates
     keep = found.agree + 1 >= settings.min_views
     keep &= found.through <= gates.through_share * (found.agree + found.through)

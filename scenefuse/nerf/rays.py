@@ -35,6 +35,8 @@ class PhotoTensors:
         confidence: (V, H, W) float32 in 0..1, weight of the prior.
         order: (V, H, W) float32 depth along z in nerf units whose order alone is learned, 0 where there is none; None
             to learn that of the prior, where it is confident.
+        hidden: (V, H, W) bool, pixels beside the object that do not say that nothing is there, since something stands
+            before it; None for none.
     """
 
     images: Tensor
@@ -46,6 +48,7 @@ class PhotoTensors:
     depths: Tensor
     confidence: Tensor
     order: Tensor | None = None
+    hidden: Tensor | None = None
 
     def __len__(self) -> int:
         return self.images.shape[0]
@@ -134,6 +137,8 @@ def pixel_pool(photos: PhotoTensors, band_px: int) -> PixelPool:
     inner[thin] = whole[thin]
     outer = dilate(whole, band_px)
     ring = dilate(outer, RING_PX) & ~outer
+    if photos.hidden is not None:
+        ring &= ~photos.hidden
     border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
     edges = dilate(border | depth_jumps(photos.depths), EDGE_PX)
     return PixelPool(*_flatten(inner), *_flatten(ring), edges.float())

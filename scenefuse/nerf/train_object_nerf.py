@@ -14,6 +14,7 @@ from torch import Tensor
 from scenefuse.checkpoints import State, key_of
 from scenefuse.cores import use_threads
 from scenefuse.depth.prior import DepthPrior, read_prior
+from scenefuse.mvs.covered import covered_from
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
@@ -32,7 +33,7 @@ from scenefuse.nerf.rendered_maps import (
     write_nerf,
 )
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, go_on_from, keep_memory, new_nerf, train
-from scenefuse.nerf.volume import Volume, find_volume, silhouettes
+from scenefuse.nerf.volume import Volume, find_volume, hidden_pixels, silhouettes
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -187,13 +188,15 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
         if earlier["names"] == views.names:
             views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     trained = np.flatnonzero(~views.held_out)
-    outlines = silhouettes(views.masks[trained], views.intrinsics[trained], views.object_from_cam[trained])
-    volume = find_volume(outlines, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
+    outlines = silhouettes(views.masks, covered_from(views), views.intrinsics, views.object_from_cam)
+    seen = [outlines[row] for row in trained]
+    volume = find_volume(seen, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
     prior = None
     if inputs.prior is not None:
         all_ranked = settings.recipe.order_of_all
         prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement, all_ranked)
     photos = photo_tensors(views, volume.nerf_from_object, prior, exact=settings.recipe.mask_band_px == 0)
+    photos = replace(photos, hidden=torch.from_numpy(hidden_pixels(volume, outlines)))
     return _Given(views, trained, volume, prior, photos, earlier)
 
 

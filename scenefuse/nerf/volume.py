@@ -2,11 +2,12 @@
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.mvs.visual_hull import count_silhouettes
+from scenefuse.mvs.visual_hull import Outline, count_silhouettes
 from scenefuse.nerf.rays import dilate
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
@@ -34,11 +35,11 @@ class Volume:
     hull: NDArray[np.bool_]
 
 
-def find_volume(outlines: list[View], cells: int, tolerance: float, cube: Sim3 | None = None) -> Volume:
+def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim3 | None = None) -> Volume:
     """The unit cube and the visual hull in it.
 
     Args:
-        outlines: views of the training photos, with their mask as pixels.
+        outlines: of the training photos.
         cells: per side of the hull, a multiple of 4 times a power of 2.
         tolerance: share of the photos that may have a cell of the hull outside their mask.
         cube: nerf_from_object of an earlier stage, which is kept, or None.
@@ -48,7 +49,7 @@ def find_volume(outlines: list[View], cells: int, tolerance: float, cube: Sim3 |
     """
     try:
         if cube is None:
-            rough = cube_from_cameras(outlines)
+            rough = cube_from_cameras([outline.view for outline in outlines])
             cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance), rough, MARGIN)
         hull = visual_hull(outlines, cube, cells, tolerance)
     except ValueError as error:
@@ -58,13 +59,37 @@ def find_volume(outlines: list[View], cells: int, tolerance: float, cube: Sim3 |
     return Volume(cube, hull)
 
 
-def silhouettes(masks: NDArray[np.bool_], intrinsics: Array, object_from_cam: Array) -> list[View]:
-    """V views with their mask as pixels, from (V, H, W) masks, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
+def silhouettes(
+    masks: NDArray[np.bool_], covered: NDArray[np.float32] | None, intrinsics: Array, object_from_cam: Array
+) -> list[Outline]:
+    """V outlines from (V, H, W) masks and `covered_from` depths, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
     height, width = masks.shape[1:]
     cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
     cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
     cam_from_object[:, :3, 3] = -np.einsum("vij,vi->vj", object_from_cam[:, :3, :3], object_from_cam[:, :3, 3])
-    return [View("", k, pose, width, height, mask) for k, pose, mask in zip(intrinsics, cam_from_object, masks)]
+    views = [View("", k, pose, width, height, mask) for k, pose, mask in zip(intrinsics, cam_from_object, masks)]
+    return [Outline(view, None if covered is None else covered[k]) for k, view in enumerate(views)]
+
+
+def hidden_pixels(volume: Volume, outlines: list[Outline]) -> NDArray[np.bool_]:
+    """(V, H, W), pixels off the mask where something stands before a part of the hull: it need not be empty there."""
+    object_from_unit = volume.nerf_from_object.inverse()
+    centres = object_from_unit.apply((np.argwhere(volume.hull) + 0.5) / len(volume.hull))
+    reach = object_from_unit.scale * HALF_DIAGONAL / len(volume.hull)
+    return np.stack([_hides(outline, centres, reach) for outline in outlines])
+
+
+def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
+    """`hidden_pixels` (H, W) of one photo for cells with these centres (N, 3), `reach` half their diagonal."""
+    view, covered = outline
+    if covered is None:
+        return np.zeros((view.height, view.width), dtype=bool)
+    rows, pixels, depth = view.visible(centres)
+    farthest = np.zeros((view.height, view.width), np.float32)
+    np.maximum.at(farthest, (pixels[:, 1], pixels[:, 0]), depth)
+    radius = int(np.ceil(reach * view.intrinsics[0, 0] / np.median(depth))) if len(rows) else 0
+    grown = cv2.dilate(farthest, np.ones((2 * radius + 1, 2 * radius + 1)))
+    return np.asarray(~view.pixels & (covered < grown))
 
 
 def cube_from_cameras(views: list[View]) -> Sim3:
@@ -113,13 +138,13 @@ def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -
     return Sim3(scale, np.eye(3), 0.5 - scale * center)
 
 
-def visual_hull(views: list[View], unit_from_object: Sim3, size: int, tolerance: float) -> NDArray[np.bool_]:
-    """Cells (size, size, size) of the unit cube that project into (nearly) every mask that has them in the frame.
+def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tolerance: float) -> NDArray[np.bool_]:
+    """Cells (size, size, size) of the unit cube that project into (nearly) every mask of the photos that may see them.
 
     From coarse to fine: a coarse cell is kept where it touches the masks, and split into eight.
 
     Args:
-        views: with their mask as pixels.
+        outlines: of the photos.
         unit_from_object: the cube.
         size: cells per side, a multiple of 4 times a power of 2.
         tolerance: share of the photos that may have a cell outside their mask.
@@ -130,8 +155,10 @@ def visual_hull(views: list[View], unit_from_object: Sim3, size: int, tolerance:
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
         reach = object_from_unit.scale * HALF_DIAGONAL / count
-        shown, missed = count_silhouettes(points, (_grown(view, points, reach) for view in views))
-        cells = cells[(missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(views)))]
+        shown, missed, hidden = count_silhouettes(points, (_grown(outline, points, reach) for outline in outlines))
+        if count < size:  # of a coarse cell that is hidden one part may be in sight
+            shown += hidden
+        cells = cells[(missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(outlines)))]
         if count == size or len(cells) == 0:
             hull = np.zeros((size, size, size), dtype=bool)
             hull[tuple(cells.T)] = True
@@ -144,9 +171,13 @@ def _corners(count: int) -> NDArray[np.int64]:
     return np.stack(np.meshgrid(*[np.arange(count)] * 3, indexing="ij"), -1).reshape(-1, 3)
 
 
-def _grown(view: View, points: Array, reach: float) -> View:
-    """The view with its mask grown by a length `reach` at the points' median depth."""
+def _grown(outline: Outline, points: Array, reach: float) -> Outline:
+    """The photo with its mask grown by a length `reach` at the points' median depth, and what covers them likewise."""
+    view, covered = outline
     depth = np.maximum(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3], 1e-9)
     wanted = int(np.ceil(reach * view.intrinsics[0, 0] / max(float(np.median(depth)), 1e-9)))
     radius = min(wanted, max(view.pixels.shape))  # a camera of a wrong pose may stand in the cube, or look away
-    return replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy())
+    if covered is not None:
+        least = cv2.erode(cv2.erode(covered, np.ones((2 * radius + 1, 1))), np.ones((1, 2 * radius + 1)))
+        covered = (least - reach).astype(np.float32)
+    return Outline(replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy()), covered)

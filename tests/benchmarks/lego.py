@@ -81,7 +81,7 @@ def lego(
         views = load_views(places["workspace"], places["mattes"], chosen.width_px, 0)
     start = time.perf_counter()
     trained, tested = np.flatnonzero(~views.held_out), np.flatnonzero(views.held_out)
-    outlines = silhouettes(views.masks[trained], views.intrinsics[trained], views.object_from_cam[trained])
+    outlines = silhouettes(views.masks[trained], None, views.intrinsics[trained], views.object_from_cam[trained])
     volume = find_volume(outlines, chosen.recipe.occupancy_cells, chosen.hull_tolerance)
     photos = photo_tensors(views, volume.nerf_from_object, None, exact=True)
     nerf = new_nerf(chosen.field, torch.from_numpy(volume.hull), len(trained), seed, device)

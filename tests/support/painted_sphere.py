@@ -40,10 +40,10 @@ def sphere_views(count=12, size=48, arc=2 * np.pi, waves=5.0):
 def sphere_volume(sphere, cells=32):
     """The cube around the sphere and its visual hull, (cells, cells, cells)."""
     _, masks, k, poses, _ = sphere
-    views = silhouettes(masks, k, poses)
-    first = cube_from_cameras(views)
-    cube = tight_cube(visual_hull(views, first, 32, 0.0), first, 0.05)
-    return cube, visual_hull(views, cube, cells, 0.0)
+    outlines = silhouettes(masks, None, k, poses)
+    first = cube_from_cameras([outline.view for outline in outlines])
+    cube = tight_cube(visual_hull(outlines, first, 32, 0.0), first, 0.05)
+    return cube, visual_hull(outlines, cube, cells, 0.0)
 
 
 def photos_of(sphere, cube, prior=0.0):

@@ -69,10 +69,10 @@ def test_hull_holds_the_sphere_and_little_more(sphere):
 
 def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
     _, masks, k, poses, _ = sphere
-    empty = silhouettes(masks & False, k, poses)
+    empty = silhouettes(masks & False, None, k, poses)
     assert not visual_hull(empty, Sim3.identity(), 32, 0.0).any()
     with pytest.raises(ValueError, match="fewer than two photos"):
-        cube_from_cameras(empty)
+        cube_from_cameras([outline.view for outline in empty])
 
 
 def test_batches_repeat_and_keep_off_the_band(sphere):

@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.mvs.view_selection import select_views
 from scenefuse.mvs.views import load_views
-from scenefuse.mvs.visual_hull import count_silhouettes
+from scenefuse.mvs.visual_hull import Outline, count_silhouettes
 from scenefuse.stage import StageError
 from scenefuse.workspace import View, read_workspace
 
@@ -92,8 +92,15 @@ def test_silhouettes_count_the_photos_that_frame_a_point_and_those_that_have_it_
     views = [View("a", k, np.eye(4), WIDTH, HEIGHT, right), View("b", k, np.eye(4), WIDTH, HEIGHT, ~right)]
     views += [View("c", k, behind, WIDTH, HEIGHT, right)]
     points = np.array([[0.5, 0, 5], [-0.5, 0, 5], [9, 0, 5], [0.5, 0, -5], [0, 0, 5]], precision)
-    shown, missed = count_silhouettes(points, iter(views))
-    assert shown.tolist() == [2, 2, 0, 1, 2] and missed.tolist() == [1, 1, 0, 1, 1]
+    shown, missed, hidden = count_silhouettes(points, map(Outline, views))
+    assert shown.tolist() == [2, 2, 0, 1, 2] and missed.tolist() == [1, 1, 0, 1, 1] and not hidden.any()
+    # Something stands before the left half of the first photo, four away; the third point is in no picture.
+    before = np.where(right, np.inf, np.float32(4))
+    shown, missed, hidden = count_silhouettes(points, [Outline(views[0], before)])
+    assert shown.tolist() == [1, 0, 0, 0, 1] and missed.tolist() == [0] * 5 and hidden.tolist() == [0, 1, 0, 0, 0]
+    nearer = points * np.array([0.7, 1, 0.7], precision)
+    shown, missed, hidden = count_silhouettes(nearer, [Outline(views[0], before)])
+    assert shown.tolist() == [1, 1, 0, 0, 1] and missed.tolist() == [0, 1, 0, 0, 0] and not hidden.any()
 
 
 def test_sources_are_views_of_good_angles_the_best_first(folder):
