@@ -121,8 +121,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
-    through = seen.through >= np.where(on_scene, _confirming(sure) * (seen.in_view - seen.hidden), 0)
-    reason[through & (seen.through >= LEAST_THROUGH)] = SEEN_THROUGH
+    reason[is_seen_through(seen, sure, on_scene)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
@@ -234,9 +233,14 @@ def _surer(one: Matches, two: Matches) -> Matches:
     } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
 
 
-def _confirming(matches: Matches) -> Array:
-    """(N,) share of the photos asked that confirm a point, the reference among both."""
-    return np.asarray(matches.photos / (matches.tested + 1.0))
+def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) points where photos see a surface behind them; of measured ones, shares of photos speak against each other.
+
+    All photos are held against a surface, only the best are matched: their numbers cannot be compared.
+    """
+    confirming = matches.photos / (matches.tested + 1.0)  # the reference is among both
+    least = np.where(measured, confirming * (seen.in_view - seen.hidden), 0)
+    return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
 
 
 def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float) -> Visibility:

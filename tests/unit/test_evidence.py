@@ -17,13 +17,15 @@ from scenefuse.fusion.evidence import (
     SEEN_THROUGH,
     STEREO_ONLY,
     Side,
+    is_seen_through,
     weigh,
     with_pose_uncertainty,
 )
 from scenefuse.fusion.fuse_object import evidence_report, fuse_by_evidence
 from scenefuse.fusion.modes import FusionSettings
-from scenefuse.fusion.photo_check import moved_photos, pack
+from scenefuse.fusion.photo_check import Matches, moved_photos, pack
 from scenefuse.fusion.settle import settle
+from scenefuse.fusion.visibility import Visibility
 from scenefuse.io.clouds import Cloud, concatenate
 from scenefuse.stage import value
 from scenefuse.transforms import Sim3
@@ -219,3 +221,12 @@ def test_every_point_says_what_is_known_of_it(near, far):
     report = evidence_report(fused, "m")
     kept = value(report, "scene_measured") + value(report, "scene_stereo_only")
     assert kept + sum(value(report, "scene_removed").values()) == value(report, "scene_checked") == len(fused.rows)
+
+
+def test_a_measured_point_goes_where_a_larger_share_of_photos_sees_through_than_confirms():
+    # All 40 photos that it is open to are held against the surface behind, four of the best ten are matched.
+    count, nothing = 3, np.zeros(3)
+    seen = Visibility(np.full(count, 50), np.full(count, 10), np.array([12, 20, 12]))
+    matches = Matches(nothing, nothing, np.full(count, 4), np.full(count, 9), nothing, nothing, nothing)
+    measured = np.array([True, True, False])
+    assert is_seen_through(seen, matches, measured).tolist() == [False, True, True]

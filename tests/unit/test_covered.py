@@ -1,0 +1,100 @@
+"""A figure on a plinth, seen from below by half of the photos, which do not see its feet."""
+
+import numpy as np
+import pytest
+
+from scenefuse.mvs.covered import covered_from
+from scenefuse.mvs.views import Views
+from scenefuse.nerf.volume import find_volume, hidden_pixels, silhouettes
+
+WIDTH, HEIGHT, FOCAL = 200, 160, 220.0
+FIGURE = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 1.0]])
+PLINTH = np.array([[-0.7, -0.7, -0.8], [0.7, 0.7, 0.0]])
+CELLS = 64
+
+
+def enter(box, centre, rays):
+    """Distance (N,) along rays (N, 3) from a centre to a box, infinite for those that miss it."""
+    with np.errstate(divide="ignore"):
+        first, second = (box[0] - centre) / rays, (box[1] - centre) / rays
+    near, far = np.minimum(first, second).max(1), np.maximum(first, second).min(1)
+    return np.where((near < far) & (near > 0), near, np.inf)
+
+
+def looking(centre, target=(0, 0, 0.2)):
+    """Camera-to-world pose (4, 4)."""
+    ahead = np.array(target) - centre
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, [0, 0, 1])
+    right /= np.linalg.norm(right)
+    return np.vstack([np.column_stack([right, np.cross(ahead, right), ahead, centre]), [0, 0, 0, 1]])
+
+
+@pytest.fixture(scope="module")
+def figure():
+    """The photos, and the true depth (V, H, W) of the plinth where it is seen."""
+    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    heights = np.where(np.arange(16) % 2, 1.2, -0.6)
+    poses = np.stack([looking(np.array([3 * np.cos(a), 3 * np.sin(a), h])) for a, h in zip(around, heights)])
+    v, u = np.indices((HEIGHT, WIDTH)) + 0.5
+    ahead = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1).reshape(-1, 3)
+    mattes, plinths, points, tracks, rng = [], [], [], [], np.random.default_rng(0)
+    for pose in poses:
+        rays = ahead @ pose[:3, :3].T
+        of_figure, of_plinth = (enter(box, pose[:3, 3], rays) for box in (FIGURE, PLINTH))
+        mattes.append(np.where((of_figure < of_plinth) & (of_figure < np.inf), 255, 0).reshape(HEIGHT, WIDTH))
+        plinth = np.where(of_plinth <= of_figure, of_plinth, np.inf)
+        plinths.append(plinth.reshape(HEIGHT, WIDTH))
+        seen = np.minimum(of_figure, of_plinth)
+        chosen = rng.choice(np.flatnonzero(np.isfinite(seen)), 600, replace=False)
+        tracks.append(np.arange(600) + 600 * len(tracks))
+        points.append(pose[:3, 3] + seen[chosen, None] * rays[chosen])
+    count = len(poses)
+    images = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
+    names, intrinsics = [f"{i}.png" for i in range(count)], np.repeat(k[None], count, 0)
+    mattes = np.array(mattes, np.uint8)
+    views = Views(names, images, mattes, intrinsics, poses, np.zeros(count, bool), np.concatenate(points), tracks)
+    return views, np.stack(plinths)
+
+
+def hull_of(views, covered):
+    """The hull's volume, and the centres of its cells."""
+    outlines = silhouettes(views.masks, covered, views.intrinsics, views.object_from_cam)
+    volume = find_volume(outlines, CELLS, 0.04)
+    cells = volume.nerf_from_object.inverse().apply((np.argwhere(volume.hull) + 0.5) / CELLS)
+    return volume, outlines, cells
+
+
+def test_what_stands_beside_the_object_has_its_depth(figure):
+    views, plinths = figure
+    covered = covered_from(views)
+    assert np.isinf(covered[views.masks]).all()
+    known = np.isfinite(covered) & np.isfinite(plinths)
+    assert known.sum() > 0.6 * np.isfinite(plinths).sum()
+    assert np.median(np.abs(covered - plinths)[known] / plinths[known]) < 1e-3
+    assert (np.abs(covered - plinths)[known] < 0.02 * plinths[known]).mean() > 0.95
+
+
+def test_feet_that_some_photos_cannot_see_stay_in_the_hull_and_the_plinth_does_not_join_it(figure):
+    views, plinths = figure
+    cut = hull_of(views, None)[2]
+    assert cut[:, 2].min() > 0.06
+    volume, outlines, cells = hull_of(views, covered_from(views))
+    side = 1 / volume.nerf_from_object.scale / CELLS
+    corners = (np.abs(cells[:, :2]) > 0.2).all(1)
+    assert cells[corners, 2].min() < side
+    assert np.abs(cells[cells[:, 2] > 2 * side, :2]).max() < 0.3 + 6 * side
+    # Of the plinth only what lies behind the figure in the photos from above, which no mask can tell.
+    assert (cells[:, 2] < -2 * side).mean() < 0.1
+    hidden = hidden_pixels(volume, outlines)
+    assert hidden[::2].any((1, 2)).all() and not (hidden & views.masks).any()
+    assert np.isfinite(plinths[hidden]).mean() > 0.95
+
+
+def test_too_few_points_beside_the_object_say_nothing(figure):
+    views, _ = figure
+    alone = Views(**{
+        name: getattr(views, name) for name in ("names", "images", "mattes", "intrinsics", "object_from_cam")
+    }, held_out=views.held_out, sparse=views.sparse[:2], tracks=[np.arange(2)] * len(views.names))  # fmt: skip
+    assert np.isinf(covered_from(alone)).all()
