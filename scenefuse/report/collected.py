@@ -87,8 +87,8 @@ def collect(
     per_variant, gaps = ({variant: {} for variant in variants}, {}) if gap else _collect_variants(folder, variants)
     fusion: Fields = {}
     if "fine.status" in per_variant[variants[0]]:
-        there, gap = unbroken(folder, ("fusion.json", "metrics.json"))
-        fusion = read_fields(folder, [name for name in there if name == "fusion.json"])
+        there, gap = unbroken(folder, ("evidence.json", "fusion.json", "metrics.json"))
+        fusion = {key: item for key, item in read_fields(folder, there[:2]).items() if key != "evidence.notes"}
         found, without = unbroken(folder, ("fusion.json", "missing.json"))
         gap, fusion = gap or without, fusion | read_fields(folder, found[1:])
         per_variant[variants[0]] |= read_fields(folder, [name for name in there if name == "metrics.json"])

@@ -157,6 +157,8 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
         _line("cloud", _pairs(cloud)) + _line("alignment", _alignment(item.stages)) + _variant_lines(item, variants)
     )
     lines += _line("fusion", _pairs([("mode", find(item.fusion, "fusion.mode"), ""), *_counts(item.fusion)]))
+    removed = find(item.fusion, "evidence.scene_removed") or {}
+    lines += _line("taken away", _pairs([(f"{why}:", count, "points") for why, count in removed.items() if count]))
     lines += _line("still missing", _still_missing(item.fusion))
     lines += _truth_table(item.stages)
     lines += _completion_lines([r for r in records(completion_table([item], variants[0])) if _is_measure(r)])
@@ -278,8 +280,8 @@ def _cell(item: Any) -> str:
 
 
 def _counts(fusion: Fields) -> list[tuple[str, Any, str]]:
-    """What fusion added and took away, and the points of the object that no three photos confirm."""
-    counts = {"points added": "added", "taken from the scene": "removed", "of the object unconfirmed": "nerf_only"}
+    """What fusion added, and the points of the object that no three photos confirm."""
+    counts = {"points added": "added", "of the object unconfirmed": "nerf_only"}
     return [(label, find(fusion, f"fusion.{key}_points"), "") for label, key in counts.items()]
 
 

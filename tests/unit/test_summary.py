@@ -51,9 +51,12 @@ def results(tmp_path):
             f"surface_variation{e}": quantity(v, "1") for e, v in (("", 0.1), ("_before", 0.3), ("_after", 0.2))
         }
         write_json(folder / "metrics.json", {"completion": completion})
-        fused = {"added": 30, "removed": 4, "nerf_only": 7}
+        removed = {"photos see a surface behind it": 4, "no photo can see it": 0, "the object measured it better": 12}
+        notes = {"notes": quantity(["judged by the scene's photos"], "")}
+        write_json(folder / "evidence.json", {"scene_removed": quantity(removed, "points")} | notes)
+        fused = {"added": 30, "removed": 16, "nerf_only": 7}
         counts = {f"{kind}_points": quantity(count, "points") for kind, count in fused.items()}
-        write_json(folder / "fusion.json", counts | {"notes": quantity(["judged by the scene's photos"], "")})
+        write_json(folder / "fusion.json", counts | notes)
         variants = {variant: {"scale_error_pct": quantity(0.5 + k, "%")} for k, variant in enumerate(("full", "paper"))}
         scene_scores = {f"scene_f_score_{w}_05pct": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
         scene_scores |= {f"cloud_f_score_{e}pct": quantity(v, "1") for e, v in (("025", 0.71), ("2", 0.98))}
@@ -181,8 +184,11 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
     assert "dense.fallback: CPU used" in text
     assert "0.4 -> 0.9" in text
-    assert "points added 30, taken from the scene 4, of the object unconfirmed 7" in " ".join(text.split())
-    assert "fusion.notes: judged by the scene's photos" in " ".join(text.split())
+    words = " ".join(text.split())
+    assert "points added 30, of the object unconfirmed 7" in words
+    away = "photos see a surface behind it: 4 points, the object measured it better: 12 points"
+    assert f"taken away {away}" in words
+    assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
     assert "1 of 3 objects registered" in text
 
 
