@@ -284,6 +284,10 @@ def _compare(
     worse = same(distance, mine[partner], theirs, SAME_SPACINGS * np.where(on_scene, fine, coarse)) & (
         mine[partner] <= CLEARLY * theirs
     )
+    # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
+    assert first.normals is not None
+    along = ((scene.points - first.points[partner]) * first.normals[partner]).sum(1)
+    worse &= ~on_scene | (distance**2 - along**2 <= coarse**2)
     if len(second):
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
         better[on_obj] = same(distance, mine, other[partner], SAME_SPACINGS * coarse) & (
