@@ -21,6 +21,7 @@ README = """\
 
 1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud.
 2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
+   Without a scene, an object's photos become a cloud by themselves.
    In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.
 3. `scenefuse pick --configfile config/config.yaml --object NAME`: click on an object in its photos; not for a cloud.
 4. `scenefuse run -n` says what would run, `scenefuse run --cores 2` runs it; options are Snakemake's.
@@ -44,11 +45,8 @@ def init(
         preset: what config.yaml holds: settings for a first look, the shipped ones, or larger ones for a GPU.
 
     Raises:
-        StageError: the folder is a file or holds a project, a path does not exist, two names are the same, or there are
-            objects without a scene.
+        StageError: the folder is a file or holds a project, a path does not exist, or two names are the same.
     """
-    if objects and scene is None:
-        raise StageError("--objects needs --scene as well: an object lies in a scene")
     names = [_name(path) for path in objects]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

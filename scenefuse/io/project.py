@@ -16,6 +16,8 @@ from scenefuse.stage import StageError
 
 # Columns that say something about a row's photos.
 OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
+# Columns of an object that are about its scene.
+OF_SCENE = ("fiducials", "truth")
 # Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
 OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
 OF_THE_RUN = ("scene.chunks", "object.recipe", "object.stage1.pose_source", "registration.variants")
@@ -60,24 +62,19 @@ def read_project(config: Mapping[str, Any]) -> Project:
         raise StageError(f"config, {wrong}")
     settings = with_defaults(config, schema)
     scenes, objects = (_checked_table(settings[f"{kind}s"], kind) for kind in ("scene", "object"))
-    if not scenes:
-        raise StageError(f"{settings['scenes']} has no rows; add one for each scene")
+    if not scenes and not objects:
+        raise StageError(
+            f"{settings['scenes']} and {settings['objects']} have no rows; add one for each scene and object"
+        )
     for kind, rows in (("scene", scenes), ("object", objects)):
         for name, row in rows.items():
             wrong = _cloud_problem(row)
             if wrong:
                 raise StageError(f"{settings[f'{kind}s']}: {kind} '{name}' {wrong}")
     for name, row in objects.items():
-        if row["scene"] not in scenes:
-            raise StageError(
-                f"{settings['objects']}: object '{name}' lies in scene '{row['scene']}',"
-                f" which {settings['scenes']} does not list"
-            )
-        if row.get("truth") and scenes[row["scene"]].get("cloud"):
-            raise StageError(
-                f"{settings['objects']}: object '{name}' has a truth, but its scene '{row['scene']}' is a cloud, and"
-                " the evaluation compares cameras; empty the cell"
-            )
+        wrong = _scene_problem(row, scenes, settings["scenes"])
+        if wrong:
+            raise StageError(f"{settings['objects']}: object '{name}' {wrong}")
     wrong = _recipe_problem(settings["object"])
     if wrong:
         raise StageError(f"config, {wrong}")
@@ -111,6 +108,21 @@ def _cloud_problem(row: Row) -> str:
     for column in OF_PHOTOS:
         if row.get(column):
             return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
+    return ""
+
+
+def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
+    """What is wrong with an object beside its scene, or with one that lies in none; "" where nothing is."""
+    scene = row.get("scene")
+    if not scene:
+        if row.get("cloud"):
+            return "is a cloud and lies in no scene, so there is nothing to do; name its scene, or give photos"
+        told = next((column for column in OF_SCENE if row.get(column)), None)
+        return f"lies in no scene that its {told} could be of; empty that cell, or name its scene" if told else ""
+    if scene not in scenes:
+        return f"lies in scene '{scene}', which {table} does not list"
+    if row.get("truth") and scenes[scene].get("cloud"):
+        return f"has a truth, but its scene '{scene}' is a cloud, and the evaluation compares cameras; empty the cell"
     return ""
 
 

@@ -73,7 +73,7 @@ def sources_of(project: Project, name: str) -> list[Source]:
         path, listed = _table(project, row, name, "prompts")
         models: tuple[Path, ...] = (results / "sparse",)
         found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed))
-    scene = project.scenes[row["scene"]]
+    scene = project.scenes[row["scene"]] if row.get("scene") else {}
     if scene.get("photos"):
         results = Path("results/scenes") / row["scene"]
         pictures = scene_pictures(Path(scene["photos"]), results)

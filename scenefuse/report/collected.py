@@ -15,6 +15,8 @@ _OBJECT_FILES = (
 )
 _SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
 _JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
+ALONE = "by itself"
+"""Status of an object that is done and lies in no scene."""
 
 
 @dataclass(frozen=True)
@@ -29,6 +31,7 @@ class Collected:
         missing: the first file that should be there and is not, or "".
         failed: why a job of it failed, when something is missing; "" when nothing failed.
         failed_variants: variant -> why its own jobs failed.
+        alone: whether it lies in no scene, so that nothing but its own stages is to be done.
     """
 
     name: str
@@ -38,6 +41,7 @@ class Collected:
     missing: str
     failed: str
     failed_variants: dict[str, str]
+    alone: bool = False
 
 
 def collect_scene(folder: Path, chunks: int, is_cloud: bool = False) -> tuple[Fields, str]:
@@ -69,11 +73,12 @@ def collect(
         folder: the object's results.
         variants: registration variants, the one that is fused first.
         jobs: where the rules' logs and benchmarks are.
-        scene: name of the scene that the object lies in.
+        scene: name of the scene that the object lies in; "" for one by itself.
         scene_gap: the first file that this scene lacks, or "".
         is_cloud: whether the object was given as a cloud.
         linked: whether object and scene both have photos.
     """
+    alone = not scene
     there, gap = unbroken(folder, ("object.json",) if is_cloud else _OBJECT_FILES)
     stages = read_fields(folder, [*there, *(["alignment.json"] if linked and not gap else [])])
     if find(stages, "stage1.workspace") == "poses":
@@ -84,7 +89,8 @@ def collect(
     if linked and not gap:
         there, gap = unbroken(folder, ("alignment.json",))
         stages |= read_fields(folder, there)
-    per_variant, gaps = ({variant: {} for variant in variants}, {}) if gap else _collect_variants(folder, variants)
+    nothing: tuple[dict[str, Fields], dict[str, str]] = ({variant: {} for variant in variants}, {})
+    per_variant, gaps = nothing if gap or alone else _collect_variants(folder, variants)
     fusion: Fields = {}
     if "fine.status" in per_variant[variants[0]]:
         there, gap = unbroken(folder, ("evidence.json", "fusion.json", "metrics.json"))
@@ -102,7 +108,7 @@ def collect(
     unit = per_variant[variants[0]].get("crop.diagonal", {}).get("unit", "scene units")
     per_variant = {variant: _in_unit(fields, unit) for variant, fields in per_variant.items()}
     failed = why_unfinished(jobs, who) if gap else ""
-    return Collected(folder.name, stages, per_variant, fusion, gap, failed, failed_variants)
+    return Collected(folder.name, stages, per_variant, fusion, gap, failed, failed_variants, alone)
 
 
 def _collect_variants(folder: Path, variants: list[str]) -> tuple[dict[str, Fields], dict[str, str]]:
@@ -145,13 +151,17 @@ def _in_unit(fields: Fields, unit: str) -> Fields:
 
 
 def status_of(item: Collected, variant: str) -> str:
-    """registered, unregistered, ungated (a pose that nothing checked), failed (an error), or missing (did not run)."""
+    """registered, unregistered, ungated (a pose that nothing checked), failed (an error), missing, or ALONE."""
+    if item.alone and not item.missing:
+        return ALONE
     decided = find(item.variants.get(variant, {}), "fine.status")
     return str(decided) if decided else "failed" if _failure(item, variant) else "missing"
 
 
 def reason_of(item: Collected, variant: str) -> str | None:
     """Why an object is not registered in a variant."""
+    if item.alone and not item.missing:
+        return None
     if find(item.variants.get(variant, {}), "fine.status"):
         return find(item.variants[variant], "fine.reason") or None
     return why_missing(_failure(item, variant))

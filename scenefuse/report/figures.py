@@ -10,7 +10,7 @@ from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTUR
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.io.tiles.tiled_cloud import open_cloud
-from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, object_sheet, upright
+from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view.view_file import View, write_view
@@ -69,6 +69,30 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
             print(f"{name}.png", flush=True)
         if join.fused:
             write_view(folder, _view(inputs.name, join, azimuth_deg))
+
+
+def draw_lone_object(
+    *, name: str, object_cloud: Path, workspace: Path, masks: Path, stages: tuple[Path, ...], figures: Path
+) -> None:
+    """Draw an object that lies in no scene: object.png (as `draw_object` does), and its cloud for the page's 3D view.
+
+    Args:
+        name: the object's, for the titles.
+        object_cloud: its cloud (PLY), in its own frame.
+        workspace: its undistorted COLMAP workspace.
+        masks: folder of its masks, {photo}.png.
+        stages: folders of its four training stages.
+        figures: output folder.
+    """
+    cloud = upright(read_cloud(object_cloud), workspace)
+    sheet = object_sheet(name, cloud, workspace, masks, list(stages))
+    framed = inner(cloud.points)
+    low, high = framed.min(0), framed.max(0)
+    points = thin(merge(cloud, cloud), VIEW_POINTS)
+    view = View(points, {0: name}, "object units", low, high, SIDES_DEG[0], 18.0, len(cloud), len(cloud))
+    with atomic_directory(figures) as folder:
+        save_png(folder / "object.png", sheet)
+        write_view(folder, view)
 
 
 def draw_scene(

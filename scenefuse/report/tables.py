@@ -59,7 +59,7 @@ def registration_table(objects: list[Collected], variants: list[str]) -> pd.Data
 def ablation_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
     """One row an object and measure, one column a variant, all at the same thresholds."""
     rows: list[dict[str, Any]] = []
-    for item in objects:
+    for item in (item for item in objects if not item.alone):
         rows.append({"object": item.name, "measure": "status", "unit": ""} | {a: status_of(item, a) for a in variants})
         for name, key in REGISTRATION.items():
             values = {variant: number_in(item.variants.get(variant, {}), key) for variant in variants}

@@ -5,6 +5,7 @@ from dataclasses import replace
 from html import escape
 from pathlib import Path
 
+from scenefuse.report.collected import ALONE
 from scenefuse.report.page import document, embedded
 from scenefuse.report.values import number
 from scenefuse.report.view.view_file import View, read_view
@@ -62,7 +63,9 @@ _OBJECT_FIGURES = {
 }
 
 
-def write_report(*, summary: Path, scenes: list[Path], objects: list[Path], title: str, report: Path) -> None:
+def write_report(
+    *, summary: Path, scenes: tuple[Path, ...] = (), objects: tuple[Path, ...] = (), title: str, report: Path
+) -> None:
     """Write the report page of a run: every object and scene in 3D, figures, tables with notes, the text summary.
 
     Everything is in the one file: no script, font or picture is fetched.
@@ -129,10 +132,12 @@ def _object_section(folder: Path, registration: list[dict[str, str]], view: View
     """Heading with the decision, the 3D view, before/after slider, the figures that exist."""
     row = next((r for r in registration if r.get("object") == folder.name), {})
     status, reason = row.get("status", "-"), row.get("reason", "-")
-    badge = f'<span class="badge {"ok" if status == "registered" else "no"}">{escape(status)}</span>'
+    badge = f'<span class="badge {"ok" if status in ("registered", ALONE) else "no"}">{escape(status)}</span>'
     parts = [f'<h2 id="{escape(folder.name)}">{escape(folder.name)}{badge}</h2>']
     if reason not in ("-", ""):
         parts.append(f"<p>{escape(reason)}</p>")
+    if status == ALONE:
+        parts.append("<p>It lies in no scene: its cloud, <code>object.ply</code>, is the result.</p>")
     if status in ("failed", "missing"):
         return "\n".join([*parts, "<p>No 3D view and no figures: the object's stages did not finish.</p>"])
     if view is not None:

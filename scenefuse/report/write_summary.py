@@ -19,13 +19,13 @@ from scenefuse.stage import StageError, atomic_file
 
 def write_summary(
     *,
-    scenes: list[Path],
     chunks: int,
-    objects: list[Path],
-    scene_of: list[str],
     variants: list[str],
     jobs: JobRecords,
     summary: Path,
+    scenes: tuple[Path, ...] = (),
+    objects: tuple[Path, ...] = (),
+    scene_of: tuple[str, ...] = (),
     cloud_scenes: tuple[str, ...] = (),
     cloud_objects: tuple[str, ...] = (),
 ) -> None:
@@ -36,13 +36,13 @@ def write_summary(
     earlier run left behind a step that failed since is not shown.
 
     Args:
-        scenes: result folders of the scenes (results/scenes/{scene}).
         chunks: jobs that a scene's depth maps are split into.
-        objects: result folders of the objects (results/objects/{object}); they need not exist.
-        scene_of: name of the scene that each object lies in.
         variants: registration variants, the one that is fused first.
         jobs: folders of the rules' logs and benchmarks; see JobRecords.
         summary: output folder; other files in it are left alone.
+        scenes: result folders of the scenes (results/scenes/{scene}).
+        objects: result folders of the objects (results/objects/{object}); they need not exist.
+        scene_of: name of the scene that each object lies in; empty for one by itself.
         cloud_scenes: names of the scenes that were given as clouds.
         cloud_objects: names of the objects that were.
 
@@ -62,7 +62,7 @@ def write_summary(
             scene,
             parts[scene][1] if scene in parts else "",
             folder.name in cloud_objects,
-            folder.name not in cloud_objects and scene not in cloud_scenes,
+            bool(scene) and folder.name not in cloud_objects and scene not in cloud_scenes,
         )
         for folder, scene in zip(objects, scene_of)
     ]

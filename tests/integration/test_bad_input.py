@@ -3,7 +3,7 @@
 import json
 
 import pytest
-from support.user_project import HEADER
+from support.user_project import HEADER, planned
 
 
 @pytest.fixture
@@ -25,6 +25,18 @@ def test_typo_in_a_key(project, refused):
 
 def test_unknown_object_in_a_target(refused):
     assert "unknown object 'shad'; objects.tsv lists: shed" in refused("-n", "results/objects/shad/fused.ply")
+
+
+def test_an_object_in_no_scene_ends_with_its_cloud(project, snakemake, refused):
+    project.photos("close")
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\t\n"
+    (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t1.jpg\t20\t20\n")
+    result = snakemake(project.path, "-n", config=project.write())
+    rules = planned(result.stdout)
+    assert result.returncode == 0 and {"make_object_cloud", "draw_lone_object", "write_report"} <= rules
+    assert not {rule for rule in rules if "scene" in rule or "fuse" in rule or "regist" in rule}
+    told = refused("-n", "results/objects/shed/fused.ply")
+    assert "objects.tsv: object 'shed' lies in no scene" in told and "name its scene in the column scene" in told
 
 
 def test_missing_photo_folder(refused):

@@ -172,7 +172,10 @@ def test_environments_of_conda_are_refused_where_they_would_lack_the_library(ins
 def test_an_empty_project_says_what_is_missing(installed, tmp_path):
     assert scenefuse("init", "yard", cwd=tmp_path, library=installed)[0] == 0
     status, output = scenefuse("run", "-n", cwd=tmp_path / "yard", library=installed)
-    assert status == 1 and "config/scenes.tsv has no rows; add one for each scene" in output
+    assert (
+        status == 1
+        and "config/scenes.tsv and config/objects.tsv have no rows; add one for each scene and object" in output
+    )
 
 
 def test_a_run_in_a_folder_without_a_project_does_not_plan_the_demo(tmp_path):
@@ -185,7 +188,6 @@ def test_a_run_in_a_folder_without_a_project_does_not_plan_the_demo(tmp_path):
     [
         ({"folder": Path("taken")}, "README.md exists already"),
         ({"folder": Path("file")}, "file exists already"),
-        ({"folder": Path("new"), "objects": (Path("taken"),)}, "--scene as well"),
         ({"folder": Path("new"), "scene": Path("nowhere")}, "nowhere does not exist"),
         ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
     ],

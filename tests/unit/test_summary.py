@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 
 import numpy as np
 import pandas as pd
@@ -77,12 +78,12 @@ def results(tmp_path):
     return tmp_path
 
 
-def summarise(results, names=("house", "balloon", "sculpture")):
+def summarise(results, names=("house", "balloon", "sculpture"), lone=()):
     write_summary(
-        scenes=[results / "scenes/demo"],
+        scenes=(results / "scenes/demo",),
         chunks=2,
-        objects=[results / "objects" / name for name in names],
-        scene_of=["demo"] * len(names),
+        objects=tuple(results / "objects" / name for name in (*names, *lone)),
+        scene_of=("demo",) * len(names) + ("",) * len(lone),
         variants=["full", "paper"],
         jobs=JobRecords(results / "logs", results / "benchmarks"),
         summary=results / "summary",
@@ -190,6 +191,21 @@ def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results)
     assert f"taken away {away}" in words
     assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
     assert "1 of 3 objects registered" in text
+
+
+def test_an_object_in_no_scene_is_done_with_its_cloud(results):
+    head = results / "objects/head"
+    shutil.copytree(results / "objects/house", head)
+    summary = summarise(results, lone=("head", "arm"))
+    text = " ".join((summary / "summary.txt").read_text().split())
+    assert "object head: by itself" in text and "1 of 3 objects registered and fused, 2 by themselves" in text
+    assert "object arm: missing" in text
+    # What an earlier run with a scene left is not its own.
+    own = text[text.index("object head") : text.index("object arm")]
+    assert "fusion" not in own and "registration" not in own and "cloud" in own
+    assert read(summary, "objects").set_index("object").loc["head", "points"] > 0
+    page = report(results, lone=("head",))
+    assert '<span class="badge ok">by itself</span>' in page and "It lies in no scene" in page
 
 
 def test_the_text_says_that_ground_was_left_in(results):
@@ -341,16 +357,16 @@ def test_a_damaged_json_counts_as_absent(tmp_path):
     assert load(tmp_path / "x.json") == {} and load(tmp_path / "none.json") == {}
 
 
-def report(results, names=("house", "balloon", "sculpture")):
+def report(results, names=("house", "balloon", "sculpture"), lone=()):
     figures = results / "objects/house/figures"
     figures.mkdir(parents=True)
     for name in ("before", "after", "provenance"):
         Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures / f"{name}.png")
     page = results / "report.html"
     write_report(
-        summary=summarise(results, names),
+        summary=summarise(results, names, lone),
         scenes=[results / "scenes/demo"],
-        objects=[results / "objects" / name for name in ("house", "sculpture")],
+        objects=[results / "objects" / name for name in ("house", "sculpture", *lone)],
         title="Run <1>",
         report=page,
     )

@@ -211,9 +211,9 @@ def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):
         ({"object_row": "-shed\tyard\tclose"}, "objects.tsv, row 1, object: '-shed' will not do; use letters, digits"),
         ({"scene_row": "-yard\tflight"}, "scenes.tsv, row 1, scene: '-yard' will not do.*no - at the beginning"),
         ({"object_row": "shed\tyard\t"}, "objects.tsv: object .shed. has neither photos nor cloud; fill one of these"),
-        ({"scene_row": ""}, "scenes.tsv has no rows; add one for each scene"),
+        ({"scene_row": "", "object_row": ""}, "scenes.tsv and objects.tsv have no rows; add one for each scene"),
     ],
-    ids=["unknown scene", "object with a dash", "scene with a dash", "no photos", "no scene"],
+    ids=["unknown scene", "object with a dash", "scene with a dash", "no photos", "nothing"],
 )
 def test_a_bad_row_is_one_sentence_with_its_table(project, rows, sentence):
     with pytest.raises(StageError, match=sentence):
@@ -233,6 +233,14 @@ def cloud_project(tmp_path, monkeypatch):
         return read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"})
 
     return read
+
+
+def test_an_object_of_photos_may_lie_in_no_scene(project, cloud_project):
+    assert project(scene_row="", object_row="shed\t\tclose").objects["shed"]["scene"] == ""
+    with pytest.raises(StageError, match="object 'shed' is a cloud and lies in no scene, so there is nothing to do"):
+        cloud_project(obj={"scene": ""})
+    with pytest.raises(StageError, match="object 'shed' lies in no scene that its fiducials could be of; empty"):
+        cloud_project(obj={"scene": "", "cloud": "", "photos": "close", "fiducials": "corners.tsv"})
 
 
 def test_a_row_with_a_cloud_needs_no_photos(cloud_project):

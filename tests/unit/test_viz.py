@@ -9,9 +9,10 @@ from support.changed_scene import write_changes
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.io.maps import write_depth
 from scenefuse.io.sheets import save_png
-from scenefuse.report.figures import FigureInputs, draw_object, draw_scene
+from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, draw_scene
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
 from scenefuse.report.view.view_file import read_view
+from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import AFTER, BOTH
 from scenefuse.report.view.view_scene import view_scene
 from scenefuse.stage import StageError, quantity, write_json
@@ -219,6 +220,17 @@ def draw(capture, fine, figures):
         stages=[capture / f"stage{stage}" for stage in (1, 2, 3, 4)],
     )
     draw_object(inputs=inputs, figures=figures)
+
+
+def test_an_object_by_itself_is_drawn_and_can_be_turned(capture, tmp_path):
+    stages = tuple(capture / f"stage{stage}" for stage in (1, 2, 3, 4))
+    places = {"object_cloud": capture / "object.ply", "workspace": capture / "undistorted", "masks": capture / "masks"}
+    draw_lone_object(name="box", **places, stages=stages, figures=tmp_path / "figures")
+    assert {p.name for p in (tmp_path / "figures").iterdir()} == {"object.png", "view.ply", "view.json"}
+    view = read_view(tmp_path / "figures")
+    assert len(view.cloud) == 6000 and not view.cloud.fields["shown"].any()
+    section = view_section("object-box", "box", view)
+    assert '<fieldset class="when" hidden>' in section and '<fieldset class="colour">' in section
 
 
 def test_figures_show_what_was_added(capture, tmp_path):

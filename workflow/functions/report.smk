@@ -12,7 +12,8 @@ def results_of(wildcards):
     ]
     scene_ends = ["dense.json", "completed.json", "metrics.json"]
     files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
-    files += [f"results/objects/{name}/{end}" for name in OBJECTS for end in ends]
+    files += [f"results/objects/{name}/{end}" for name in JOINED for end in ends]
+    files += [f"results/objects/{name}/object.json" for name in LONE]
     files += [
         f"results/scenes/{name}/truth.json"
         for name, row in SCENES.items()
@@ -34,13 +35,27 @@ def scene_model(wildcards):
 
 def summary_command(log):
     """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
-    clouds = {"cloud_scenes": CLOUD_SCENES, "cloud_objects": CLOUD_OBJECTS}
-    given = flags({name: found for name, found in clouds.items() if found})
+    given = {
+        "scene_of": [row.get("scene", "") for row in OBJECTS.values()],
+        "cloud_scenes": CLOUD_SCENES,
+        "cloud_objects": CLOUD_OBJECTS,
+    }
+    given = flags({name: found for name, found in given.items() if found})
     return (
-        f"python {script('report/write_summary.py')} --scenes {' '.join(f'results/scenes/{name}' for name in SCENES)}"
-        f" --chunks {len(CHUNKS)} --objects {' '.join(f'results/objects/{name}' for name in OBJECTS)}"
-        f" --scene-of {' '.join(row['scene'] for row in OBJECTS.values())} --variants {' '.join(VARIANTS)}"
-        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary{given and f' {given}'} &> {log}"
+        f"python {script('report/write_summary.py')} {result_folders()} --chunks {len(CHUNKS)} --variants {' '.join(VARIANTS)}"
+        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary {given} &> {log}"
+    )
+
+
+def result_folders(wildcards=None):
+    """The result folders of all scenes and objects, as options; also a params function."""
+    names = {"scenes": SCENES, "objects": OBJECTS}
+    return flags(
+        {
+            kind: [f"results/{kind}/{name}" for name in rows]
+            for kind, rows in names.items()
+            if rows
+        }
     )
 
 

@@ -45,6 +45,9 @@ except StageError as error:
     raise WorkflowError(str(error)) from None
 config.update(PROJECT.settings)
 SCENES, OBJECTS, VARIANTS = PROJECT.scenes, PROJECT.objects, PROJECT.variants
+# Objects that lie in a scene, and those by themselves: their cloud is the result.
+JOINED = {name: row for name, row in OBJECTS.items() if row.get("scene")}
+LONE = [name for name in OBJECTS if name not in JOINED]
 CLOUD_SCENES, CLOUD_OBJECTS = (
     [name for name, row in rows.items() if row.get("cloud")]
     for rows in (SCENES, OBJECTS)
@@ -128,12 +131,22 @@ def settings(*sections, without=()):
     return words
 
 
+def scene_of(wildcards):
+    """The name of the scene that the object lies in."""
+    scene = object_row(wildcards.object).get("scene")
+    if not scene:
+        raise WorkflowError(
+            f"{config['objects']}: object '{wildcards.object}' lies in no scene, so it has nothing beyond"
+            f" results/objects/{wildcards.object}/object.ply and figures/; name its scene in the column scene"
+        )
+    return scene
+
+
 def in_scene(*paths):
     """Input function: files of the scene that the object lies in."""
 
     def files(wildcards):
-        scene = object_row(wildcards.object)["scene"]
-        return [f"results/scenes/{scene}/{path}" for path in paths]
+        return [f"results/scenes/{scene_of(wildcards)}/{path}" for path in paths]
 
     return files
 
@@ -142,8 +155,8 @@ def in_photographed_scene(*paths):
     """The same; none where the scene is given as a cloud."""
 
     def files(wildcards):
-        scene = object_row(wildcards.object)["scene"]
-        return [] if scene_row(scene).get("cloud") else in_scene(*paths)(wildcards)
+        given = scene_row(scene_of(wildcards)).get("cloud")
+        return [] if given else in_scene(*paths)(wildcards)
 
     return files
 
@@ -161,8 +174,8 @@ def if_photographed(*paths):
 
 def is_linked(wildcards):
     """Whether the object and its scene both have photos."""
-    row = object_row(wildcards.object)
-    return not (row.get("cloud") or scene_row(row["scene"]).get("cloud"))
+    given = object_row(wildcards.object).get("cloud")
+    return not (given or scene_row(scene_of(wildcards)).get("cloud"))
 
 
 def if_linked(*paths):
@@ -190,7 +203,7 @@ def options_of(*names):
 
 def objects_in(wildcards):
     """The names of the objects of a scene."""
-    return [name for name, row in OBJECTS.items() if row["scene"] == wildcards.scene]
+    return [name for name, row in JOINED.items() if row["scene"] == wildcards.scene]
 
 
 def object_folders(wildcards):

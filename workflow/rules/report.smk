@@ -79,6 +79,8 @@ rule draw_object:
         "results/logs/draw_object/{object}.log",
     benchmark:
         "results/benchmarks/draw_object/{object}.tsv"
+    wildcard_constraints:
+        object=one_of(JOINED),
     conda:
         "../../envs/report.yaml"
     resources:
@@ -95,6 +97,46 @@ rule draw_object:
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
         " --metrics-json {input.metrics} --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
         " {params.photos} --figures {output} &> {log}"
+
+
+rule draw_lone_object:
+    """An object that lies in no scene: its photos, masks, stages and cloud."""
+    input:
+        cloud="results/objects/{object}/object.ply",
+        workspace="results/objects/{object}/undistorted",
+        masks="results/objects/{object}/masks",
+        stages=expand(
+            "results/objects/{object}/stage{stage}",
+            stage=[1, 2, 3, 4],
+            allow_missing=True,
+        ),
+    output:
+        report(
+            directory("results/objects/{object}/figures"),
+            patterns=["{name}.png"],
+            category="Objects",
+            subcategory="{object}",
+            caption="../report/figures.rst",
+        ),
+    log:
+        "results/logs/draw_lone_object/{object}.log",
+    benchmark:
+        "results/benchmarks/draw_lone_object/{object}.tsv"
+    wildcard_constraints:
+        object=one_of(LONE),
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=by_size(4000, cloud=10),
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        script=script("report/draw_lone_object.py"),
+        code=code("report/draw_lone_object.py"),
+    message:
+        "{wildcards.object}: figures"
+    shell:
+        "exec python {params.script} --name {wildcards.object} --object-cloud {input.cloud} --workspace {input.workspace}"
+        " --masks {input.masks} --stages {input.stages} --figures {output} &> {log}"
 
 
 rule view_scene:
@@ -174,14 +216,13 @@ rule write_report:
         mem_mb=1000,
         runtime=10,
     params:
-        scenes=expand("results/scenes/{scene}", scene=SCENES),
-        objects=expand("results/objects/{object}", object=OBJECTS),
+        folders=result_folders,
         script=script("report/write_report.py"),
         code=code("report/write_report.py"),
     message:
         "Summary: report page"
     shell:
-        "exec python {params.script} --summary results/summary --scenes {params.scenes} --objects {params.objects}"
+        "exec python {params.script} --summary results/summary {params.folders}"
         " --title scenefuse --report {output} &> {log}"
 
 

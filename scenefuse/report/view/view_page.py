@@ -13,7 +13,7 @@ from matplotlib import colormaps
 from matplotlib.colors import to_hex
 
 from scenefuse.report.view.view_file import LEVELS, View, encode
-from scenefuse.report.view.view_points import AFTER, BEFORE, REMOVED, UNKNOWN
+from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN
 
 Mode = dict[str, Any]
 
@@ -39,9 +39,11 @@ def view_section(key: str, name: str, view: View) -> str:
     """
     about, planes = encode(view)
     about["modes"] = modes = _modes(view, about.get("deviation"))
+    # Of an object by itself there is nothing to compare.
+    changes = (view.cloud.fields["shown"] != BOTH).any()
     whens = [("before", "Before"), ("after", "After")]
     tools = (
-        _choice(key, "when", "Show", whens, "after")
+        _choice(key, "when", "Show", whens, "after", hidden=not changes)
         + _choice(key, "colour", "Colours", [(m["name"], m["button"]) for m in modes], modes[0]["name"])
         + '<button type="button" class="measure" aria-pressed="false">Measure</button>'
         '<button type="button" class="home">Reset view</button>'
@@ -76,14 +78,15 @@ def view_library() -> str:
     return f'<!-- {credit.replace("--", "- -")} -->\n<script type="text/plain" id="k3d">{packed}</script>'
 
 
-def _choice(key: str, kind: str, legend: str, options: list[tuple[str, str]], chosen: str) -> str:
+def _choice(key: str, kind: str, legend: str, options: list[tuple[str, str]], chosen: str, hidden: bool = False) -> str:
     """Radio buttons that look like one row of buttons."""
     buttons = (
         f'<label><input type="radio" name="{escape(kind)}-{escape(key)}" value="{escape(option)}"'
         f"{' checked' if option == chosen else ''}><span>{escape(text)}</span></label>"
         for option, text in options
     )
-    return f'<fieldset class="{kind}"><legend>{legend}</legend>{"".join(buttons)}</fieldset>'
+    unseen = " hidden" if hidden else ""
+    return f'<fieldset class="{kind}"{unseen}><legend>{legend}</legend>{"".join(buttons)}</fieldset>'
 
 
 def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
