@@ -26,7 +26,7 @@ from scenefuse.workspace import View, with_mask
 MASK_PX = 400
 """Longer side of the masks that the hull is counted in: finer than its cells."""
 POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
-COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "heading_deg", "pitch_deg", "shows")
+COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "above_close_ups", "heading_deg", "pitch_deg", "shows")
 """Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
 
 
@@ -103,12 +103,14 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     plan = plan_stations(missing, obj, around_it, cameras, up)
     write_cloud(outputs.missing, missing.cells)
     frame = scene_frame(read_json(inputs.georeference_json))
-    rows = photo_rows(plan, up, frame)
+    rows = photo_rows(plan, cameras, up, frame)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
     if around_it is not near:
         missing = replace(missing, notes=(*missing.notes, "points far from the object were thinned to plan stations"))
-    content = _report(missing, plan, unit) | {"seconds": quantity(time.perf_counter() - start, "s")}
+    higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
+    content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
+    content |= {"seconds": quantity(time.perf_counter() - start, "s")}
     write_json(outputs.report, content)
 
 
@@ -170,9 +172,12 @@ def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
     }
 
 
-def photo_rows(plan: Plan, up: Array, frame: LocalFrame | GridFrame | None) -> list[dict[str, Any]]:
+def photo_rows(
+    plan: Plan, close_ups: list[View], up: Array, frame: LocalFrame | GridFrame | None
+) -> list[dict[str, Any]]:
     """A row for each photo; up: (3,) direction opposite to gravity, scene frame."""
     rows, level = [], rotation_between(up, UPWARDS)
+    highest = max((float(view.centre @ up) for view in close_ups), default=0.0)
     for number, station in enumerate(plan.stations, 1):
         for view in station.photos:
             ahead = level @ view.cam_from_world[2, :3]
@@ -185,6 +190,7 @@ def photo_rows(plan: Plan, up: Array, frame: LocalFrame | GridFrame | None) -> l
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
                 row["altitude_m"] = round(altitude, 3)
+            row["above_close_ups"] = float(f"{view.centre @ up - highest:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
             rows.append(row | {"shows": round(station.shows, 4)})

@@ -300,7 +300,9 @@ def _still_missing(fusion: Fields) -> str:
     if not stations:
         return text
     shown = f"{_three(100 * shows)} % of it, blank parts apart"
-    return f"{text}; photos from {stations} stations (next_photos.csv) would show {shown}"
+    higher = find(fusion, "missing.stations_above_close_ups")
+    where = f"next_photos.csv; {higher} higher than any close-up" if higher else "next_photos.csv"
+    return f"{text}; photos from {stations} stations ({where}) would show {shown}"
 
 
 def _short(unit: str | None) -> str:

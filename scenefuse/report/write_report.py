@@ -26,7 +26,7 @@ _TABLES = {
 }
 _NOTES = {
     "scenes": "How many photos the scene model holds, how well it fits them, and the cloud that came out. Lengths are "
-    "in the unit named in the row: metres only where GPS made it so.",
+    "in the unit named in the row: metres where GPS, control points or known lengths gave them.",
     "objects": "PSNR (dB) and SSIM compare renders with photos: higher is better; `measured_on` says whether training "
     "saw those photos. Depth error, "
     "accuracy, precision, recall and F-score exist only where the true surface is known.",
@@ -85,11 +85,13 @@ def write_report(
         raise StageError(f"{text} does not exist; write the summary first")
     views = _views([*(f / "figures" for f in objects), *scenes])
     tables = {name: _read_table(summary / f"{name}.tsv") for name in _TABLES}
-    links = [*(f.name for f in objects), *(f"table-{name}" for name in _TABLES if tables[name])]
+    drawn = [f for f in scenes if (f / "scene.png").is_file()]
+    links = {f.name: f.name for f in objects} | {f"scene-{f.name}": f"scene {f.name}" for f in drawn}
+    links |= {f"table-{name}": name for name in _TABLES if tables[name]}
     body = [
         f"<h1>{escape(title)}</h1>",
         "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
-        "<nav>" + "".join(f'<a href="#{escape(n)}">{escape(n.removeprefix("table-"))}</a>' for n in links) + "</nav>",
+        "<nav>" + "".join(f'<a href="#{escape(to)}">{escape(name)}</a>' for to, name in links.items()) + "</nav>",
         *(_object_section(folder, tables["registration"], views.get(folder / "figures")) for folder in objects),
         *(_scene_section(folder, tables["scenes"], views.get(folder)) for folder in scenes),
         *(_table_section(name, rows) for name, rows in tables.items() if rows),
@@ -116,7 +118,7 @@ def _scene_section(folder: Path, scenes: list[dict[str, str]], view: View | None
     if not path.is_file():
         return ""
     row = next((r for r in scenes if r.get("scene") == folder.name), {})
-    parts = [f"<h2>Scene {escape(folder.name)}</h2>"]
+    parts = [f'<h2 id="scene-{escape(folder.name)}">Scene {escape(folder.name)}</h2>']
     if row.get("completed_points", "-") not in ("-", ""):
         parts.append(
             f"<p><code>{escape(str(folder))}/completed.ply</code> and <code>completed.laz</code>: the scene with all "

@@ -132,7 +132,7 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     plan = plan_stations(missing, cloud, cloud, photos.views, UP)
     frame = LocalFrame(47.4, 8.5, 400.0)
-    rows = photo_rows(plan, UP, frame)
+    rows = photo_rows(plan, photos.views, UP, frame)
     assert len(rows) == 3 * len(plan.stations) and set(rows[0]) == set(COLUMNS)
     for row in rows:
         eye = np.array([row[axis] for axis in "xyz"])
@@ -141,7 +141,9 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
         ahead, heading, pitch = CENTER - eye, np.radians(row["heading_deg"]), np.radians(row["pitch_deg"])
         looks = [np.sin(heading) * np.cos(pitch), np.cos(heading) * np.cos(pitch), np.sin(pitch)]
         assert looks @ ahead > 0.99 * np.linalg.norm(ahead)
-    assert "longitude_deg" not in photo_rows(plan, UP, None)[0]
+        highest = max(view.centre[2] for view in photos.views)
+        assert row["above_close_ups"] == pytest.approx(eye[2] - highest, abs=1e-3)
+    assert "longitude_deg" not in photo_rows(plan, photos.views, UP, None)[0]
 
 
 def test_an_object_of_which_nothing_came_into_the_scene_is_missing_as_a_whole(half):
