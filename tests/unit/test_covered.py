@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from scenefuse.mvs.consistency import compare
 from scenefuse.mvs.covered import covered_from
 from scenefuse.mvs.views import Views
 from scenefuse.nerf.volume import find_volume, hidden_pixels, silhouettes
@@ -90,6 +91,20 @@ def test_feet_that_some_photos_cannot_see_stay_in_the_hull_and_the_plinth_does_n
     hidden = hidden_pixels(volume, outlines)
     assert hidden[::2].any((1, 2)).all() and not (hidden & views.masks).any()
     assert np.isfinite(plinths[hidden]).mean() > 0.95
+
+
+def test_points_of_the_feet_may_lie_beside_the_masks_of_photos_that_cannot_see_them(figure):
+    views, _ = figure
+    feet = np.array([[0.3, 0.0, 0.03], [0.3, 0.1, 0.03], [0.3, -0.1, 0.04]])
+    nothing = np.zeros(views.masks.shape, np.float32)
+    given = feet, 1, nothing, views.masks, views.intrinsics, views.object_from_cam, 0.01
+    off, hidden = compare(*given).off_mask, compare(*given, covered_from(views)).off_mask
+    # Eight photos are taken from below; triangles do not reach all the way to the mask.
+    assert (off == 8).all() and (hidden <= 2).all()
+    # A point in the air is off the masks all the same.
+    air = feet + [0.5, 0, 0.6]
+    given = air, *given[1:]
+    assert (compare(*given, covered_from(views)).off_mask > 5).all()
 
 
 def test_too_few_points_beside_the_object_say_nothing(figure):

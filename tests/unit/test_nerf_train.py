@@ -75,6 +75,17 @@ def test_masks_without_a_common_volume_give_an_empty_hull(sphere):
         cube_from_cameras([outline.view for outline in empty])
 
 
+def test_pixels_that_something_stands_before_do_not_teach_emptiness(sphere):
+    cube, _ = sphere_volume(sphere)
+    photos = photos_of(sphere, cube)
+    hidden = torch.zeros_like(photos.masks)
+    hidden[:, : hidden.shape[1] // 2] = True
+    free, kept = pixel_pool(photos, band_px=2), pixel_pool(replace(photos, hidden=hidden), band_px=2)
+    rows = kept.outside // hidden.shape[2]
+    assert rows.min() >= hidden.shape[1] // 2 and 0.3 < len(kept.outside) / len(free.outside) < 0.7
+    np.testing.assert_array_equal(kept.inside, free.inside)
+
+
 def test_batches_repeat_and_keep_off_the_band(sphere):
     cube, _ = sphere_volume(sphere)
     photos = photos_of(sphere, cube)
