@@ -162,7 +162,7 @@ def _frontier(
 ) -> tuple[Grid, NDArray[np.float32]]:
     """Cells of unknown space that border on empty space, and for every cell the direction towards empty space."""
     centres = grid.centres
-    shown, off, _ = count_silhouettes(centres, map(Outline, masks))
+    shown, off, *_ = count_silhouettes(centres, map(Outline, masks))
     in_hull = (shown >= LEAST_PHOTOS) & (off <= OFF_MASK * shown)
     seen = see(centres, surface, views, step, margin)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
@@ -178,7 +178,7 @@ def _frontier(
 
 def _off_masks(points: Array, masks: list[View]) -> NDArray[np.bool_]:
     """(N,) points that three photos have in their frame, and too many of these outside the mask."""
-    shown, off, _ = count_silhouettes(points, map(Outline, masks))
+    shown, off, *_ = count_silhouettes(points, map(Outline, masks))
     return np.asarray((shown >= LEAST_PHOTOS) & (off > OFF_MASK * shown))
 
 

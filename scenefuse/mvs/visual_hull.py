@@ -71,36 +71,50 @@ class Hull:
 
 class Outline(NamedTuple):
     """A photo of the hull: a view with `pixels` (H, W) bool, True on the object, and the depth (H, W) along z of what
-    it shows beside the object, infinite where that is unknown; None where it is unknown everywhere."""
+    it shows, infinite where that is unknown; None where it is unknown everywhere."""
 
     view: View
-    covered_from: NDArray[np.float32] | None = None
+    depth: NDArray[np.float32] | None = None
 
 
-def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline]) -> tuple[Counts, Counts, Counts]:
-    """In how many photos each point lies in the frame and may be seen, (N,); in how many of these it lies off the
-    mask, (N,); and in how many others something stands before it, (N,), which say nothing.
+class Silhouettes(NamedTuple):
+    """How V photos show N points.
 
-    Source: Laurentini 1994. With the counts a caller decides how many photos may err.
+    Attributes:
+        shown: (N,) photos that have the point in the frame, with nothing of the surroundings before it.
+        missed: (N,) of these, photos that have it off the mask.
+        hidden: (N,) photos in which something of the surroundings stands before it: they say nothing.
+        open: (N,) photos that have it on the mask, and not behind the surface that they are known to show there.
+    """
+
+    shown: Counts
+    missed: Counts
+    hidden: Counts
+    open: Counts
+
+
+def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond: float = 0.0) -> Silhouettes:
+    """How photos show points; with the counts a caller decides how many photos may err. Source: Laurentini 1994.
 
     Args:
         points: (N, 3) in the views' world, float32 or float64; projections are computed in their precision.
         outlines: the photos.
+        beyond: how far behind the object's surface a point is still open, unit of the world.
     """
-    shown, missed, hidden = (np.zeros(len(points), dtype=np.int32) for _ in range(3))
-    for view, covered_from in outlines:
+    counts = Silhouettes(*(np.zeros(len(points), dtype=np.int32) for _ in range(4)))
+    for view, first in outlines:
         projection = view.projection.astype(points.dtype)
         x, y, depth = (points @ projection[:, :3].T + projection[:, 3]).T
         safe = np.maximum(depth, 1e-6)
         u, v = (np.clip(c / safe, -1, 1e6).astype(np.int32) for c in (x, y))
         rows = np.flatnonzero((depth > 0) & (x >= 0) & (u < view.width) & (y >= 0) & (v < view.height))
-        if covered_from is not None:
-            covered = depth[rows] > covered_from[v[rows], u[rows]]
-            hidden[rows[covered]] += 1
-            rows = rows[~covered]
-        shown[rows] += 1
-        missed[rows] += ~view.pixels[v[rows], u[rows]]
-    return shown, missed, hidden
+        inside = view.pixels[v[rows], u[rows]]
+        away = np.full(len(rows), -np.inf) if first is None else depth[rows] - first[v[rows], u[rows]]
+        counts.hidden[rows] += ~inside & (away > 0)
+        counts.missed[rows] += ~inside & (away <= 0)
+        counts.open[rows] += inside & np.isfinite(away) & (away <= beyond)
+        counts.shown[rows] += inside | (away <= 0)
+    return counts
 
 
 def carve(
@@ -125,8 +139,8 @@ def carve(
     shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
     for start in range(0, len(silhouettes), BATCH):
         counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + BATCH]))
-        shown[alive] += counts[0]
-        missed[alive] += counts[1]
+        shown[alive] += counts.shown
+        missed[alive] += counts.missed
         # A voxel outside more masks than all photos together could excuse is decided.
         alive = alive[missed[alive] <= tolerance * len(silhouettes)]
     occupied = np.zeros(len(centres), dtype=bool)

@@ -16,8 +16,8 @@ from scenefuse.cores import use_threads
 from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
 from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
-from scenefuse.mvs.covered import covered_from
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
+from scenefuse.mvs.sparse_depths import sparse_depths
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
@@ -157,7 +157,7 @@ def fuse_depths(
     size = 2 * MASK_REACH_PX + 1
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for m in views.masks])
     tolerance = settings.gates.point_agreement * diagonal
-    seen = grown, covered_from(views)
+    seen = grown, sparse_depths(views)
     parts = [_confirmed(views, poses, maps, seen, tolerance, index, settings) for index in range(len(poses))]
     return concatenate(parts), diagonal
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from scenefuse.checkpoints import State, key_of
 from scenefuse.cores import use_threads
 from scenefuse.depth.prior import DepthPrior, read_prior
-from scenefuse.mvs.covered import covered_from
 from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.mvs.sparse_depths import sparse_depths
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
@@ -188,7 +188,7 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
         if earlier["names"] == views.names:
             views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     trained = np.flatnonzero(~views.held_out)
-    outlines = silhouettes(views.masks, covered_from(views), views.intrinsics, views.object_from_cam)
+    outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam)
     seen = [outlines[row] for row in trained]
     volume = find_volume(seen, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
     prior = None

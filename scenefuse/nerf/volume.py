@@ -25,6 +25,9 @@ LEAST_PIXELS = 16
 HALF_DIAGONAL = 0.87
 # A cell counts only where so large a share of the photos has it in the frame; an orbit has the object in all of them.
 LEAST_SHARE, LEAST_PHOTOS = 0.3, 2
+# Photos that must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
+# have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
+LEAST_OPEN, BEYOND = 3, 0.05
 
 
 @dataclass(frozen=True)
@@ -60,15 +63,15 @@ def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim
 
 
 def silhouettes(
-    masks: NDArray[np.bool_], covered: NDArray[np.float32] | None, intrinsics: Array, object_from_cam: Array
+    masks: NDArray[np.bool_], depths: NDArray[np.float32] | None, intrinsics: Array, object_from_cam: Array
 ) -> list[Outline]:
-    """V outlines from (V, H, W) masks and `covered_from` depths, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
+    """V outlines from (V, H, W) masks and `first_depths`, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
     height, width = masks.shape[1:]
     cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
     cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
     cam_from_object[:, :3, 3] = -np.einsum("vij,vi->vj", object_from_cam[:, :3, :3], object_from_cam[:, :3, 3])
     views = [View("", k, pose, width, height, mask) for k, pose, mask in zip(intrinsics, cam_from_object, masks)]
-    return [Outline(view, None if covered is None else covered[k]) for k, view in enumerate(views)]
+    return [Outline(view, None if depths is None else depths[k]) for k, view in enumerate(views)]
 
 
 def hidden_pixels(volume: Volume, outlines: list[Outline]) -> NDArray[np.bool_]:
@@ -81,15 +84,15 @@ def hidden_pixels(volume: Volume, outlines: list[Outline]) -> NDArray[np.bool_]:
 
 def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
     """`hidden_pixels` (H, W) of one photo for cells with these centres (N, 3), `reach` half their diagonal."""
-    view, covered = outline
-    if covered is None:
+    view, first = outline
+    if first is None:
         return np.zeros((view.height, view.width), dtype=bool)
     rows, pixels, depth = view.visible(centres)
     farthest = np.zeros((view.height, view.width), np.float32)
     np.maximum.at(farthest, (pixels[:, 1], pixels[:, 0]), depth)
     radius = int(np.ceil(reach * view.intrinsics[0, 0] / np.median(depth))) if len(rows) else 0
     grown = cv2.dilate(farthest, np.ones((2 * radius + 1, 2 * radius + 1)))
-    return np.asarray(~view.pixels & (covered < grown))
+    return np.asarray(~view.pixels & (first < grown))
 
 
 def cube_from_cameras(views: list[View]) -> Sim3:
@@ -155,10 +158,14 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
         reach = object_from_unit.scale * HALF_DIAGONAL / count
-        shown, missed, hidden = count_silhouettes(points, (_grown(outline, points, reach) for outline in outlines))
-        if count < size:  # of a coarse cell that is hidden one part may be in sight
-            shown += hidden
-        cells = cells[(missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(outlines)))]
+        grown = (_grown(outline, points, reach) for outline in outlines)
+        found = count_silhouettes(points, grown, object_from_unit.scale * BEYOND)
+        # Of a coarse cell that is hidden one part may be in sight.
+        shown = found.shown + (found.hidden if count < size else 0)
+        kept = (found.missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(outlines)))
+        if count == size:
+            kept &= (found.hidden == 0) | (found.open >= LEAST_OPEN)
+        cells = cells[kept]
         if count == size or len(cells) == 0:
             hull = np.zeros((size, size, size), dtype=bool)
             hull[tuple(cells.T)] = True
@@ -172,12 +179,12 @@ def _corners(count: int) -> NDArray[np.int64]:
 
 
 def _grown(outline: Outline, points: Array, reach: float) -> Outline:
-    """The photo with its mask grown by a length `reach` at the points' median depth, and what covers them likewise."""
-    view, covered = outline
+    """The photo with its mask grown by a length `reach` at the points' median depth, and what it shows likewise."""
+    view, first = outline
     depth = np.maximum(points @ view.cam_from_world[2, :3] + view.cam_from_world[2, 3], 1e-9)
     wanted = int(np.ceil(reach * view.intrinsics[0, 0] / max(float(np.median(depth)), 1e-9)))
     radius = min(wanted, max(view.pixels.shape))  # a camera of a wrong pose may stand in the cube, or look away
-    if covered is not None:
-        least = cv2.erode(cv2.erode(covered, np.ones((2 * radius + 1, 1))), np.ones((1, 2 * radius + 1)))
-        covered = (least - reach).astype(np.float32)
-    return Outline(replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy()), covered)
+    if first is not None:
+        least = cv2.erode(cv2.erode(first, np.ones((2 * radius + 1, 1))), np.ones((1, 2 * radius + 1)))
+        first = (least - reach).astype(np.float32)
+    return Outline(replace(view, pixels=dilate(torch.from_numpy(view.pixels)[None], radius)[0].numpy()), first)

@@ -40,8 +40,9 @@ def summary_text(
         lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
     statuses = [status_of(item, variants[0]) for item in objects]
     joined = sum(not item.alone for item in objects)
-    done = f"{statuses.count('registered')} of {joined} objects registered and fused"
-    done += f", {len(objects) - joined} by themselves, in no scene" if joined < len(objects) else ""
+    alone = f"in no scene: {', '.join(item.name for item in objects if item.alone)}"
+    done = f"{statuses.count('registered')} of {joined} objects registered and fused" if joined else alone
+    done += f"; {alone}" if 0 < joined < len(objects) else ""
     done += f", {statuses.count('ungated')} fused without a check of the pose" if "ungated" in statuses else ""
     for item, row in zip(objects, records(tables["objects"])):
         lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)

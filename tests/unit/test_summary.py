@@ -198,7 +198,7 @@ def test_an_object_in_no_scene_is_done_with_its_cloud(results):
     shutil.copytree(results / "objects/house", head)
     summary = summarise(results, lone=("head", "arm"))
     text = " ".join((summary / "summary.txt").read_text().split())
-    assert "object head: by itself" in text and "1 of 3 objects registered and fused, 2 by themselves" in text
+    assert "object head: by itself" in text and "1 of 3 objects registered and fused; in no scene: head, arm" in text
     assert "object arm: missing" in text
     # What an earlier run with a scene left is not its own.
     own = text[text.index("object head") : text.index("object arm")]

@@ -92,15 +92,21 @@ def test_silhouettes_count_the_photos_that_frame_a_point_and_those_that_have_it_
     views = [View("a", k, np.eye(4), WIDTH, HEIGHT, right), View("b", k, np.eye(4), WIDTH, HEIGHT, ~right)]
     views += [View("c", k, behind, WIDTH, HEIGHT, right)]
     points = np.array([[0.5, 0, 5], [-0.5, 0, 5], [9, 0, 5], [0.5, 0, -5], [0, 0, 5]], precision)
-    shown, missed, hidden = count_silhouettes(points, map(Outline, views))
-    assert shown.tolist() == [2, 2, 0, 1, 2] and missed.tolist() == [1, 1, 0, 1, 1] and not hidden.any()
+    found = count_silhouettes(points, map(Outline, views))
+    assert found.shown.tolist() == [2, 2, 0, 1, 2] and found.missed.tolist() == [1, 1, 0, 1, 1]
+    assert not found.hidden.any() and not found.open.any()
     # Something stands before the left half of the first photo, four away; the third point is in no picture.
     before = np.where(right, np.inf, np.float32(4))
-    shown, missed, hidden = count_silhouettes(points, [Outline(views[0], before)])
-    assert shown.tolist() == [1, 0, 0, 0, 1] and missed.tolist() == [0] * 5 and hidden.tolist() == [0, 1, 0, 0, 0]
+    found = count_silhouettes(points, [Outline(views[0], before)])
+    assert found.shown.tolist() == [1, 0, 0, 0, 1] and found.missed.tolist() == [0] * 5
+    assert found.hidden.tolist() == [0, 1, 0, 0, 0] and not found.open.any()
     nearer = points * np.array([0.7, 1, 0.7], precision)
-    shown, missed, hidden = count_silhouettes(nearer, [Outline(views[0], before)])
-    assert shown.tolist() == [1, 1, 0, 0, 1] and missed.tolist() == [0, 1, 0, 0, 0] and not hidden.any()
+    found = count_silhouettes(nearer, [Outline(views[0], before)])
+    assert found.shown.tolist() == [1, 1, 0, 0, 1] and found.missed.tolist() == [0, 1, 0, 0, 0]
+    # The object's own surface, four away: a point one behind it is open within one and a half, not within a half.
+    surface = np.full(right.shape, np.float32(4))
+    deep = [count_silhouettes(points[:1], [Outline(views[0], surface)], reach).open.tolist() for reach in (1.5, 0.5)]
+    assert deep == [[1], [0]]
 
 
 def test_sources_are_views_of_good_angles_the_best_first(folder):

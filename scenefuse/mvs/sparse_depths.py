@@ -1,4 +1,4 @@
-"""What stands before an object: photos that look at it there say nothing about where the object ends (method K4)."""
+"""What a photo shows first, from its sparse points: a place behind it is hidden, whatever the mask says (method K4)."""
 
 import cv2
 import numpy as np
@@ -11,28 +11,30 @@ from scenefuse.transforms import Array
 LONGEST_SIDE = 0.06
 """Of a triangle between sparse points, over the photo's longer side; farther apart they need not be one surface."""
 FROM_MASK_PX = 2
-"""Sparse points this near to the mask may be the object's."""
+"""Sparse points off the mask, but this near to it, may be the object's: they are left out."""
 
 
-def covered_from(views: Views) -> NDArray[np.float32]:
-    """Depth (V, H, W) along z, object units, of what each photo shows beside the object; infinite where not known.
+def sparse_depths(views: Views) -> NDArray[np.float32]:
+    """Depth (V, H, W) along z, object units, of what each photo shows first; infinite where that is not known.
 
-    The sparse points that a photo observes off its mask span triangles in it, over which inverse depth is linear. A
-    place farther than that on the pixel's ray is hidden from the photo, which the object's masks alone cannot tell
-    from a place where the object is not.
+    The sparse points that a photo observes span triangles in it, those on its mask and those off it by themselves, over
+    which inverse depth is linear.
     """
-    return np.stack([_behind_mask(views, index) for index in range(len(views.names))])
+    return np.stack([_depths_of(views, index) for index in range(len(views.names))])
 
 
-def _behind_mask(views: Views, index: int) -> NDArray[np.float32]:
+def _depths_of(views: Views, index: int) -> NDArray[np.float32]:
     """The map (H, W) of one photo."""
     view, mask = views.view(index), views.masks[index]
     points = views.sparse[views.tracks[index]]
     rows, pixels, depth = view.visible(points)
     size = 2 * FROM_MASK_PX + 1
-    off = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))[pixels[:, 1], pixels[:, 0]] == 0
-    nearness = _interpolated(view.project(points[rows[off]])[0], 1 / depth[off], mask.shape)
-    return np.where(mask | (nearness <= 0), np.inf, 1 / np.maximum(nearness, 1e-12)).astype(np.float32)
+    at = pixels[:, 1], pixels[:, 0]
+    on, off = mask[at], cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))[at] == 0
+    exact = view.project(points[rows])[0]
+    of_object, beside = (_interpolated(exact[part], 1 / depth[part], mask.shape) for part in (on, off))
+    nearness = np.where(mask, of_object, beside)
+    return np.where(nearness <= 0, np.inf, 1 / np.maximum(nearness, 1e-12)).astype(np.float32)
 
 
 def _interpolated(at: Array, values: Array, shape: tuple[int, ...]) -> Array:
