@@ -65,7 +65,7 @@ def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim
 def silhouettes(
     masks: NDArray[np.bool_], depths: NDArray[np.float32] | None, intrinsics: Array, object_from_cam: Array
 ) -> list[Outline]:
-    """V outlines from (V, H, W) masks and `first_depths`, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
+    """V outlines from (V, H, W) masks and `sparse_depths`, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
     height, width = masks.shape[1:]
     cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
     cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
