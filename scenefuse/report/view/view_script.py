@@ -21,7 +21,8 @@ VIEW_STYLE = """
 .view[data-state=failed] .view-note { padding: 10px; font-size: 15px; }
 .view-tools { display: flex; flex-wrap: wrap; gap: 8px 16px; align-items: center; padding: 8px 10px;
   border-bottom: 1px solid var(--line); }
-.view-tools fieldset:not([hidden]) { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0; align-items: center; }
+.view-tools fieldset:not([hidden]) { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0;
+  align-items: center; }
 .view-tools legend { float: left; padding: 0 8px 0 0; color: var(--soft); font-size: 13px; }
 .view-tools label span, .view-tools button { display: inline-block; min-height: 34px; padding: 5px 12px;
   border: 1px solid #c3cad1; background: #fff; font: inherit; font-size: 13.5px; color: var(--ink); cursor: pointer; }
