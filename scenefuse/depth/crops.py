@@ -29,22 +29,25 @@ class Crops:
         views: the cut photos with intrinsics to match.
         crop_from_photo: (V, 2, 3) affine maps between pixels with centres at +0.5.
         masks: (V, H, W) bool, the masks of the whole photos.
+        sizes: (V, 2) rows and columns of the whole photos (`Views.sizes`).
     """
 
     views: Views
     crop_from_photo: NDArray[np.float64]
     masks: NDArray[np.bool_]
+    sizes: NDArray[np.int64]
 
     def cut(self, index: int, depth: Map) -> Map:
         """(h, w) depth of a whole photo, of any size, on photo `index`'s canvas; 0 where there is none."""
-        height, width = self.masks.shape[1:]
+        height, width = self.sizes[index]
         photo_from_map = np.diag([width / depth.shape[1], height / depth.shape[0]])
         a = self.crop_from_photo[index]
         return _moved(depth, np.column_stack([a[:, :2] @ photo_from_map, a[:, 2]]), self.views.masks.shape[1:])
 
     def paste(self, index: int, on_canvas: Map) -> Map:
-        """(H, W) map of the whole photo from the one on photo `index`'s canvas; 0 off the object."""
-        mask = self.masks[index]
+        """(h, w) map of the whole photo from the one on photo `index`'s canvas; 0 off the object."""
+        height, width = self.sizes[index]
+        mask = self.masks[index, :height, :width]
         return _moved(on_canvas, cv2.invertAffineTransform(self.crop_from_photo[index]), mask.shape) * mask
 
 
@@ -61,19 +64,23 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
     largest = np.minimum(np.minimum(ideal, np.percentile(extent, FITTING_PERCENT, axis=0) + SPARE_PX), [width, height])
     canvas = np.maximum(np.round(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
-    images, mattes, intrinsics, moves = [], [], [], []
+    wholes = {"images": views.images, "mattes": views.mattes, "known": (~views.beyond).astype(np.uint8)}
+    parts: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in wholes}
+    intrinsics, moves = [], []
     for index, box in enumerate(boxes):
         shrink = min(1.0, *(canvas / extent[index]))
         size = (max(1, round(width * shrink)), max(1, round(height * shrink)))
         scale = np.array(size) / [width, height]
         corner = np.round((box[:2] + box[2:]) / 2 * scale - canvas / 2).astype(int)
         move = np.column_stack([np.diag(scale), -corner])
-        images.append(_window(cv2.resize(views.images[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
-        mattes.append(_window(cv2.resize(views.mattes[index], size, interpolation=cv2.INTER_AREA), corner, canvas))
+        for name, whole in wholes.items():
+            smaller = cv2.resize(whole[index], size, interpolation=cv2.INTER_AREA)
+            parts[name].append(_window(smaller, corner, canvas))
         intrinsics.append(np.vstack([move, [0, 0, 1]]) @ views.intrinsics[index])
         moves.append(move)
-    cut = replace(views, images=np.stack(images), mattes=np.stack(mattes), intrinsics=np.stack(intrinsics))
-    return Crops(cut, np.stack(moves), views.masks)
+    images, mattes, known = (np.stack(pictures) for pictures in parts.values())
+    cut = replace(views, images=images, mattes=mattes, beyond=known == 0, intrinsics=np.stack(intrinsics))
+    return Crops(cut, np.stack(moves), views.masks, views.sizes)
 
 
 def _box(mask: NDArray[np.bool_]) -> NDArray[np.float64]:

@@ -132,7 +132,8 @@ def _best_hypothesis(
     matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, flat=SMALL_WINDOW_FLAT)
     scores = matcher.score((1.0 / depths).contiguous())
     moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
-    outside = _outside_silhouettes(photos.masks[chosen], depths, moves, reference, sources)
+    silhouettes = torch.maximum(photos.masks, photos.beyond)[chosen]
+    outside = _outside_silhouettes(silhouettes, depths, moves, reference, sources)
     scores = torch.where(outside, torch.full_like(scores, -1.0), scores)
     best = scores.argmax(0)[None]
     last = len(hypotheses) - 1
@@ -157,7 +158,7 @@ def _gray(photos: DepthPhotos, index: int, cut: tuple[slice, slice], shrink: int
 def _outside_silhouettes(masks: Tensor, depths: Tensor, moves: Tensor, reference: View, sources: list[View]) -> Tensor:
     """(D, h, w), True for the (D, h, w) depths of the reference that lie off the object in two of its sources.
 
-    Such a depth is outside the visual hull; a single mask may be wrong.
+    Such a depth is outside the visual hull; a single mask may be wrong. `masks` (S, 1, H, W) are one beyond the photos.
     """
     count, size = len(sources), (sources[0].height, sources[0].width)
     shrink = round(masks.shape[2] / size[0])

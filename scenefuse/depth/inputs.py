@@ -32,6 +32,7 @@ class DepthPhotos:
     Attributes:
         images: (V, 3, H, W) in 0..1.
         masks: (V, 1, H, W) zeros and ones.
+        beyond: (V, 1, H, W) ones beyond the photo's border, where nothing is known.
         intrinsics: (V, 3, 3).
         object_from_cam: (V, 4, 4).
         trained: (V,) bool, False for held-out photos.
@@ -45,6 +46,7 @@ class DepthPhotos:
 
     images: Tensor
     masks: Tensor
+    beyond: Tensor
     intrinsics: Tensor
     object_from_cam: Tensor
     trained: NDArray[np.bool_]
@@ -89,6 +91,7 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
     return DepthPhotos(
         as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
         as_tensor(views.masks)[:, None],
+        as_tensor(views.beyond)[:, None],
         as_tensor(views.intrinsics),
         as_tensor(views.object_from_cam),
         ~views.held_out,

@@ -1,6 +1,6 @@
 """The depth prior of a NeRF stage: maps of an earlier stage, moved to where the training photos match, and checked."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -52,14 +52,8 @@ def read_prior(
         order_of_all: whether the order of all depths is learned, and not of the confident ones only.
     """
     training = np.flatnonzero(~views.held_out)
-    names = [views.names[i] for i in training]
-    seen = replace(
-        views, names=names, images=views.images[training], mattes=views.mattes[training],
-        intrinsics=views.intrinsics[training], object_from_cam=views.object_from_cam[training],
-        held_out=views.held_out[training], tracks=[views.tracks[i] for i in training],
-    )  # fmt: skip
-    depths = np.stack([_scaled(folder / "depth_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
-    certain = np.stack([_scaled(folder / "confidence_maps" / f"{name}.bin", seen.masks.shape[1:]) for name in names])
+    seen = views.select(training)
+    depths, certain = (_scaled_maps(folder / kind, seen) for kind in ("depth_maps", "confidence_maps"))
     depths = np.where(np.isfinite(depths) & (depths > 0) & seen.masks, depths, 0).astype(np.float32)
     everything = depths
     matched = refine_by_photos(seen, seen.object_from_cam, depths, settings)
@@ -75,11 +69,14 @@ def read_prior(
     return DepthPrior(whole[0], whole[1], refined, share, whole[2] if order_of_all else None)
 
 
-def _scaled(path: Path, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """A map at another size, zeros where there is none."""
-    if not path.is_file():
-        return np.zeros(shape, np.float32)
-    return np.asarray(cv2.resize(read_depth(path), shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
+def _scaled_maps(folder: Path, views: Views) -> NDArray[np.float32]:
+    """The maps (V, H, W) of views at their size, zeros where there is none."""
+    maps = np.zeros(views.masks.shape, np.float32)
+    for place, name, (height, width) in zip(maps, views.names, views.sizes.tolist()):
+        path = folder / f"{name}.bin"
+        if path.is_file():
+            place[:height, :width] = cv2.resize(read_depth(path), (width, height), interpolation=cv2.INTER_NEAREST)
+    return maps
 
 
 def _confirmed(views: Views, depths: NDArray[np.float32], agreement: float) -> NDArray[np.bool_]:

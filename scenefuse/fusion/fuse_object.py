@@ -318,7 +318,11 @@ def _report(
 
 
 def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
-    """What photos say of both sides' points; without `evidence`, only what was taken away."""
+    """What photos say of both sides' points; without `evidence`, only what was taken away.
+
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added, better in the scene, or
+    contradicted.
+    """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
     content = {"scene_removed": quantity(removed, "points")}
     weighed = fused.weighed
@@ -332,6 +336,7 @@ def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
         "object_measured": quantity(int(measured.sum()), "points"),
         "object_nerf_only": quantity(int((kinds == NERF_ONLY).sum()), "points"),
         "object_contradicted": quantity(int(weighed.contradicted.sum()), "points"),
+        "object_measured_contradicted": quantity(int((measured & weighed.contradicted).sum()), "points"),
         "object_better_in_scene": quantity(int((measured & ~weighed.contradicted & ~weighed.added).sum()), "points"),
         "object_added": quantity(int(weighed.added.sum()), "points"),
         "deviation_median": quantity(middle, unit),

@@ -75,7 +75,7 @@ def refine_by_photos(
             continue
         pad = 2 * window
         top, left = max(rows.min() - pad, 0), max(columns.min() - pad, 0)
-        bottom, right = rows.max() + pad + 1, columns.max() + pad + 1
+        bottom, right = (min(end.max() + pad + 1, side) for end, side in zip((rows, columns), views.sizes[index]))
         part = np.s_[top:bottom, left:right]
         near = [photos[s] for s in sources[index]]
         matcher = Matcher(_cut(photos[index], top, left, bottom, right), near, BEST_SOURCES, window, device)

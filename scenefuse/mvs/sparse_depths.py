@@ -15,7 +15,8 @@ FROM_MASK_PX = 2
 
 
 def sparse_depths(views: Views) -> NDArray[np.float32]:
-    """Depth (V, H, W) along z, object units, of what each photo shows first; infinite where that is not known.
+    """Depth (V, H, W) along z, object units, of what each photo shows first; infinite where that is not known, and
+    beyond a photo that is smaller than its picture minus infinity: whatever lies there is hidden.
 
     The sparse points that a photo observes span triangles in it, those on its mask and those off it by themselves, over
     which inverse depth is linear.
@@ -25,7 +26,8 @@ def sparse_depths(views: Views) -> NDArray[np.float32]:
 
 def _depths_of(views: Views, index: int) -> NDArray[np.float32]:
     """The map (H, W) of one photo."""
-    view, mask = views.view(index), views.masks[index]
+    view = views.view(index)
+    mask = views.masks[index, : view.height, : view.width]
     points = views.sparse[views.tracks[index]]
     rows, pixels, depth = view.visible(points)
     size = 2 * FROM_MASK_PX + 1
@@ -34,7 +36,9 @@ def _depths_of(views: Views, index: int) -> NDArray[np.float32]:
     exact = view.project(points[rows])[0]
     of_object, beside = (_interpolated(exact[part], 1 / depth[part], mask.shape) for part in (on, off))
     nearness = np.where(mask, of_object, beside)
-    return np.where(nearness <= 0, np.inf, 1 / np.maximum(nearness, 1e-12)).astype(np.float32)
+    whole = np.full(views.masks.shape[1:], -np.inf, np.float32)
+    whole[: view.height, : view.width] = np.where(nearness <= 0, np.inf, 1 / np.maximum(nearness, 1e-12))
+    return whole
 
 
 def _interpolated(at: Array, values: Array, shape: tuple[int, ...]) -> Array:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,15 +13,18 @@ from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, read_workspace
 
+Pixel = TypeVar("Pixel", bound=np.generic)
+
 
 @dataclass(frozen=True)
 class Views:
-    """V photos of one object, undistorted, at one size, with their cameras in the object's SfM frame.
+    """V photos of one object, undistorted, on pictures of one size, with their cameras in the object's SfM frame.
 
     Attributes:
         names: V file names.
         images: (V, H, W, 3) uint8 RGB.
         mattes: (V, H, W) uint8, the share of each pixel that is object, in 255ths.
+        beyond: (V, H, W) bool, True where the picture goes on beyond its photo: nothing is known there.
         intrinsics: (V, 3, 3) float64, pixels at this size, pixel centres at +0.5.
         object_from_cam: (V, 4, 4) float64 rigid camera poses.
         held_out: (V,) bool, True for photos that no training stage sees; they measure quality.
@@ -31,6 +35,7 @@ class Views:
     names: list[str]
     images: NDArray[np.uint8]
     mattes: NDArray[np.uint8]
+    beyond: NDArray[np.bool_]
     intrinsics: Array
     object_from_cam: Array
     held_out: NDArray[np.bool_]
@@ -42,15 +47,32 @@ class Views:
         """(V, H, W), True where a pixel is mostly object."""
         return self.mattes > 127
 
+    @cached_property
+    def sizes(self) -> NDArray[np.int64]:
+        """(V, 2) rows and columns of each photo, which begins at the upper left of its picture."""
+        known = ~self.beyond
+        return np.stack([known.any(2).sum(1), known.any(1).sum(1)], axis=1)
+
     def view(self, index: int) -> View:
-        """One photo with its camera, (H, W, 3) uint8 RGB pixels; the world is the object's SfM frame."""
-        height, width = self.mattes.shape[1:]
+        """One photo with its camera, (h, w, 3) uint8 RGB pixels; the world is the object's SfM frame."""
+        height, width = (int(side) for side in self.sizes[index])
         pose = np.linalg.inv(self.object_from_cam[index])
-        return View(self.names[index], self.intrinsics[index], pose, width, height, self.images[index])
+        pixels = self.images[index, :height, :width]
+        return View(self.names[index], self.intrinsics[index], pose, width, height, pixels)
+
+    def select(self, rows: NDArray[np.int64]) -> "Views":
+        """The photos of these rows; all sparse points."""
+        of_photos = ("images", "mattes", "beyond", "intrinsics", "object_from_cam", "held_out")
+        chosen: dict[str, Any] = {name: getattr(self, name)[rows] for name in of_photos}
+        names, tracks = ([listed[i] for i in rows] for listed in (self.names, self.tracks))
+        return replace(self, **chosen, names=names, tracks=tracks)
 
 
 def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int) -> Views:
     """Read an undistorted COLMAP workspace and its masks, scaled to `width_px` columns.
+
+    Photos of several sizes, upright ones among others for instance, get about as many pixels each, the widest of them
+    `width_px` columns, and lie at the upper left of pictures that hold them all.
 
     Args:
         workspace: folder with images/ and sparse/, PINHOLE cameras.
@@ -60,7 +82,7 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
             workspace, one name a line, lists them instead.
 
     Raises:
-        StageError: no photo has a mask, a photo or mask cannot be read, or sizes differ between photos.
+        StageError: no photo has a mask, or a photo or mask cannot be read.
     """
     read = read_workspace(workspace)
     files = [masks / f"{Path(view.name).stem}.png" for view in read.views]
@@ -70,14 +92,15 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
         raise StageError(
             f"no photo in {workspace} has a mask in {masks}; mask files are named like their photo, with .png"
         )
-    photos = [_scaled(read.rgb(view), width_px) for view in read.views]
-    mattes = [_scaled(_matte(file, view), width_px).pixels for file, view in zip(files, read.views)]
-    if len({(view.width, view.height) for view in photos}) > 1:
-        raise StageError(f"the photos in {workspace}/images have different sizes; use photos of one camera at one size")
+    scales = _scales(read.views, width_px)
+    photos = [_scaled(read.rgb(view), scale) for view, scale in zip(read.views, scales)]
+    mattes = [_scaled(_matte(file, view), scale) for file, view, scale in zip(files, read.views, scales)]
+    shape = max(view.height for view in photos), max(view.width for view in photos)
     return Views(
         [view.name for view in photos],
-        np.stack([view.pixels for view in photos]),
-        np.stack(mattes),
+        np.stack([on_picture(view.pixels, shape, "edge") for view in photos]),
+        np.stack([on_picture(matte.pixels, shape) for matte in mattes]),
+        np.stack([~on_picture(np.ones((view.height, view.width), bool), shape) for view in photos]),
         np.stack([view.intrinsics for view in photos]),
         np.stack([view.world_from_cam for view in photos]),
         _held_out(workspace, [view.name for view in photos], hold_out_every),
@@ -86,9 +109,24 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
     )
 
 
-def _scaled(view: View, width_px: int) -> View:
-    """The view at most `width_px` wide."""
-    scale = min(1.0, width_px / view.width)
+def on_picture(
+    pixels: NDArray[Pixel], shape: tuple[int, int], mode: Literal["constant", "edge"] = "constant"
+) -> NDArray[Pixel]:
+    """Pixels (h, w, ...) at the upper left of a picture of a shape (H, W), the rest zero or, by `edge`, repeated."""
+    spare = [(0, shape[axis] - pixels.shape[axis]) for axis in (0, 1)]
+    return np.pad(pixels, spare + [(0, 0)] * (pixels.ndim - 2), mode)
+
+
+def _scales(views: list[View], width_px: int) -> list[float]:
+    """By how much each photo is scaled: the widest to `width_px`, those of other sizes to as many pixels in all."""
+    side = np.sqrt([view.width * view.height for view in views])
+    alike = side.max() / side
+    widest = max(round(view.width * factor) for view, factor in zip(views, alike))
+    return [float(min(1.0, width_px / widest) * factor) for factor in alike]
+
+
+def _scaled(view: View, scale: float) -> View:
+    """The view, larger or smaller."""
     return view.resized(round(view.width * scale), round(view.height * scale))
 
 

@@ -18,7 +18,7 @@ from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import sparse_depths
-from scenefuse.mvs.views import Views, load_views
+from scenefuse.mvs.views import Views, load_views, on_picture
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
@@ -208,7 +208,7 @@ def with_plane_normals(cloud: Cloud) -> Cloud:
 
 def _views(inputs: CloudInputs, names: list[str]) -> Views:
     """The photos at the size of the stage's maps."""
-    width = read_depth(inputs.stage / "depth_maps" / f"{names[0]}.bin").shape[1]
+    width = max(read_depth(inputs.stage / "depth_maps" / f"{name}.bin").shape[1] for name in names)
     views = load_views(inputs.workspace, inputs.masks, width, 0)
     if views.names != list(names):
         raise StageError(
@@ -225,11 +225,13 @@ def _neutral(views: Views, saved: dict[str, Any]) -> Views:
 
 def _read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps:
     """The maps of all views, without depths outside the masks or below the least confidence."""
+    shape = views.masks.shape[1:]
     depths, confidence = (
-        np.stack([read_depth(stage / folder / f"{name}.bin") for name in views.names])
+        np.stack([on_picture(read_depth(stage / folder / f"{name}.bin"), shape) for name in views.names])
         for folder in ("depth_maps", "confidence_maps")
     )
-    normals = np.stack([read_normals(stage / "normal_maps" / f"{name}.bin") for name in views.names])
+    files = [stage / "normal_maps" / f"{name}.bin" for name in views.names]
+    normals = np.stack([on_picture(read_normals(file), shape) for file in files])
     kept = np.where((confidence >= least_confidence) & views.masks, depths, 0).astype(np.float32)
     return SurfaceMaps(kept, confidence, normals)
 

@@ -114,14 +114,17 @@ def render_maps(
 
 def write_maps(maps: RenderedMaps, folder: Path) -> None:
     """Write depth_maps/, confidence_maps/, normal_maps/ of all photos, and renders/ of those that measure quality."""
-    for index, name in enumerate(maps.views.names):
-        write_depth(folder / "depth_maps" / f"{name}.bin", maps.depths[index])
-        write_depth(folder / "confidence_maps" / f"{name}.bin", maps.confidence[index])
+    sizes = maps.views.sizes.tolist()
+    for index, (name, (height, width)) in enumerate(zip(maps.views.names, sizes)):
+        photo = np.s_[:height, :width]
+        write_depth(folder / "depth_maps" / f"{name}.bin", maps.depths[index][photo])
+        write_depth(folder / "confidence_maps" / f"{name}.bin", maps.confidence[index][photo])
         normals = normals_from_depth(maps.depths[index], maps.views.intrinsics[index], NORMAL_STEP_PX, NORMAL_JUMP)
-        write_normals(folder / "normal_maps" / f"{name}.bin", normals)
+        write_normals(folder / "normal_maps" / f"{name}.bin", normals[photo])
     (folder / "renders").mkdir()
     for row in np.flatnonzero(maps.measured):
-        picture = (maps.rendered[row].color.clamp(0, 1).numpy() * 255 + 0.5).astype(np.uint8)
+        height, width = sizes[row]
+        picture = (maps.rendered[row].color.clamp(0, 1).numpy()[:height, :width] * 255 + 0.5).astype(np.uint8)
         write_picture(folder / "renders" / f"{Path(maps.views.names[row]).stem}.png", picture)
 
 

@@ -188,7 +188,7 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
         if earlier["names"] == views.names:
             views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     trained = np.flatnonzero(~views.held_out)
-    outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam)
+    outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam, views.sizes)
     seen = [outlines[row] for row in trained]
     volume = find_volume(seen, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
     prior = None

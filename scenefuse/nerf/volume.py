@@ -63,23 +63,41 @@ def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim
 
 
 def silhouettes(
-    masks: NDArray[np.bool_], depths: NDArray[np.float32] | None, intrinsics: Array, object_from_cam: Array
+    masks: NDArray[np.bool_],
+    depths: NDArray[np.float32] | None,
+    intrinsics: Array,
+    object_from_cam: Array,
+    sizes: NDArray[np.int64] | None = None,
 ) -> list[Outline]:
-    """V outlines from (V, H, W) masks and `sparse_depths`, (V, 3, 3) intrinsics and (V, 4, 4) poses."""
-    height, width = masks.shape[1:]
+    """V outlines from (V, H, W) masks and `sparse_depths`, (V, 3, 3) intrinsics and (V, 4, 4) poses.
+
+    sizes: (V, 2) rows and columns of each photo, where they differ (`Views.sizes`).
+    """
+    shapes = [masks.shape[1:]] * len(masks) if sizes is None else sizes.tolist()
     cam_from_object = np.tile(np.eye(4), (len(masks), 1, 1))
     cam_from_object[:, :3, :3] = object_from_cam[:, :3, :3].transpose(0, 2, 1)
     cam_from_object[:, :3, 3] = -np.einsum("vij,vi->vj", object_from_cam[:, :3, :3], object_from_cam[:, :3, 3])
-    views = [View("", k, pose, width, height, mask) for k, pose, mask in zip(intrinsics, cam_from_object, masks)]
-    return [Outline(view, None if depths is None else depths[k]) for k, view in enumerate(views)]
+    outlines = []
+    for row, (height, width) in enumerate(shapes):
+        part = np.s_[row, :height, :width]
+        view = View("", intrinsics[row], cam_from_object[row], width, height, masks[part])
+        outlines.append(Outline(view, None if depths is None else depths[part]))
+    return outlines
 
 
 def hidden_pixels(volume: Volume, outlines: list[Outline]) -> NDArray[np.bool_]:
-    """(V, H, W), pixels off the mask where something stands before a part of the hull: it need not be empty there."""
+    """(V, H, W), pixels off the mask where something stands before a part of the hull: it need not be empty there.
+
+    Nor need it beyond a photo that is smaller than the others.
+    """
     object_from_unit = volume.nerf_from_object.inverse()
     centres = object_from_unit.apply((np.argwhere(volume.hull) + 0.5) / len(volume.hull))
     reach = object_from_unit.scale * HALF_DIAGONAL / len(volume.hull)
-    return np.stack([_hides(outline, centres, reach) for outline in outlines])
+    height, width = (max(getattr(outline.view, side) for outline in outlines) for side in ("height", "width"))
+    hidden = np.ones((len(outlines), height, width), dtype=bool)
+    for place, outline in zip(hidden, outlines):
+        place[: outline.view.height, : outline.view.width] = _hides(outline, centres, reach)
+    return hidden
 
 
 def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:

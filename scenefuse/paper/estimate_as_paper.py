@@ -207,4 +207,4 @@ def write_stage(
 def whole_frames(views: Views) -> Crops:
     """The frames as they are, for what reads and writes maps of cut ones."""
     same: Any = np.tile(np.eye(3)[:2], (len(views.names), 1, 1))
-    return Crops(views, same, views.masks)
+    return Crops(views, same, views.masks, views.sizes)

@@ -70,6 +70,7 @@ def frames_of(views: Views, device: torch.device) -> DepthPhotos:
     frames = DepthPhotos(
         as_tensor(views.images).permute(0, 3, 1, 2).contiguous() / 255.0,
         as_tensor(views.masks)[:, None],
+        as_tensor(views.beyond)[:, None],
         as_tensor(views.intrinsics),
         torch.eye(4, device=device).repeat(count, 1, 1),
         ~views.held_out,

@@ -112,6 +112,7 @@ def fusions() -> dict[str, FusionSettings]:
     for mode in get_args(get_type_hints(FusionSettings)["mode"]):
         if mode not in THINNED:
             found[mode] = FusionSettings(mode=mode)
+            found[f"{mode}, nerf_only"] = FusionSettings(mode=mode, nerf_only=True)
             continue
         for density, name in ((1, "the scene's density"), (0, "its own density")):
             found[f"{mode}, {name}"] = FusionSettings(mode=mode, density=density)

@@ -24,4 +24,5 @@ def sideways_video(count: int = 10, step: float = STEP) -> Views:
     nothing = np.zeros((0, 3)), [np.zeros(0, np.int64)] * count
     mattes = np.full((count, HEIGHT, WIDTH), 255, np.uint8)
     names = [f"{index:03d}.jpg" for index in range(count)]
-    return Views(names, np.stack(images), mattes, np.repeat(intrinsics[None], count, 0), poses, held_out, *nothing)
+    k = np.repeat(intrinsics[None], count, 0)
+    return Views(names, np.stack(images), mattes, mattes == 0, k, poses, held_out, *nothing)

@@ -46,7 +46,9 @@ def plane_views(count: int = 8, width: int = 64, height: int = 48, held_out: int
     names = [f"{i:03d}.jpg" for i in range(count)]
     k = np.repeat(intrinsics[None], count, 0)
     mattes = np.stack(masks).astype(np.uint8) * 255
-    views = Views(names, np.stack(images), mattes, k, np.stack(poses), held, sparse, tracks)
+    views = Views(
+        names, np.stack(images), mattes, np.zeros(mattes.shape, bool), k, np.stack(poses), held, sparse, tracks
+    )
     return views, np.stack(depths)
 
 

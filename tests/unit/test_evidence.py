@@ -221,6 +221,9 @@ def test_every_point_says_what_is_known_of_it(near, far):
     report = evidence_report(fused, "m")
     kept = value(report, "scene_measured") + value(report, "scene_stereo_only")
     assert kept + sum(value(report, "scene_removed").values()) == value(report, "scene_checked") == len(fused.rows)
+    measured = [f"object_{name}" for name in ("added", "better_in_scene", "measured_contradicted")]
+    assert sum(value(report, name) for name in measured) == value(report, "object_measured")
+    assert value(report, "object_measured") + value(report, "object_nerf_only") == value(report, "object_points")
 
 
 def test_a_measured_point_goes_where_a_larger_share_of_photos_sees_through_than_confirms():

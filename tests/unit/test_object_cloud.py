@@ -27,7 +27,7 @@ def _views():
     names = [f"{i}.png" for i in range(len(images))]
     held_out = np.zeros(len(images), bool)
     mattes = masks.astype(np.uint8) * 255
-    views = Views(names, images, mattes, k, poses, held_out, np.zeros((0, 3)), empty)
+    views = Views(names, images, mattes, np.zeros(mattes.shape, bool), k, poses, held_out, np.zeros((0, 3)), empty)
     return views, depths.astype(np.float32)
 
 

@@ -1,5 +1,7 @@
 """A figure on a plinth, seen from below by half of the photos, which do not see its feet."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -54,14 +56,14 @@ def figure():
     count = len(poses)
     images = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
     names, intrinsics = [f"{i}.png" for i in range(count)], np.repeat(k[None], count, 0)
-    mattes = np.array(mattes, np.uint8)
-    views = Views(names, images, mattes, intrinsics, poses, np.zeros(count, bool), np.concatenate(points), tracks)
+    mattes, beyond, held_out = np.array(mattes, np.uint8), np.zeros(images.shape[:3], bool), np.zeros(count, bool)
+    views = Views(names, images, mattes, beyond, intrinsics, poses, held_out, np.concatenate(points), tracks)
     return views, np.stack(plinths)
 
 
 def hull_of(views, covered):
     """The hull's volume, and the centres of its cells."""
-    outlines = silhouettes(views.masks, covered, views.intrinsics, views.object_from_cam)
+    outlines = silhouettes(views.masks, covered, views.intrinsics, views.object_from_cam, views.sizes)
     volume = find_volume(outlines, CELLS, 0.04)
     cells = volume.nerf_from_object.inverse().apply((np.argwhere(volume.hull) + 0.5) / CELLS)
     return volume, outlines, cells
@@ -108,7 +110,21 @@ def test_points_of_the_feet_may_lie_beside_the_masks_of_photos_that_cannot_see_t
 
 def test_too_few_points_beside_the_object_say_nothing(figure):
     views, _ = figure
-    alone = Views(**{
-        name: getattr(views, name) for name in ("names", "images", "mattes", "intrinsics", "object_from_cam")
-    }, held_out=views.held_out, sparse=views.sparse[:2], tracks=[np.arange(2)] * len(views.names))  # fmt: skip
+    alone = replace(views, sparse=views.sparse[:2], tracks=[np.arange(2)] * len(views.names))
     assert np.isinf(sparse_depths(alone)).all()
+
+
+def test_what_lies_beyond_a_smaller_photo_is_neither_off_its_mask_nor_empty(figure):
+    views, _ = figure
+    narrow = (np.arange(WIDTH) >= WIDTH // 2) & (np.arange(len(views.names)) % 3 == 0)[:, None]
+    beyond = np.repeat(narrow[:, None], HEIGHT, axis=1)
+    lower = replace(views, mattes=np.where(beyond, 0, views.mattes))
+    smaller = replace(lower, beyond=beyond)
+    whole, carved, known = (hull_of(v, None) for v in (views, lower, smaller))
+    widths = [np.ptp(cells[:, 0]) for _, _, cells in (whole, carved, known)]
+    assert widths[1] < 0.8 * widths[0] < widths[2]
+    assert hidden_pixels(*known[:2])[beyond].all() and not hidden_pixels(*carved[:2]).any()
+    middle = np.array([[0.0, 0.0, 0.3]])
+    nothing = np.zeros(views.masks.shape, np.float32)
+    given = middle, 1, nothing, smaller.masks, views.intrinsics, views.object_from_cam, 0.01
+    assert compare(*given).off_mask > 0 == compare(*given, sparse_depths(smaller)).off_mask

@@ -5,6 +5,7 @@ import numpy as np
 import pycolmap
 import pytest
 
+from scenefuse.depth.crops import crop_to_object
 from scenefuse.mvs.view_selection import select_views
 from scenefuse.mvs.views import load_views
 from scenefuse.mvs.visual_hull import Outline, count_silhouettes
@@ -20,23 +21,29 @@ SHIFTS = (-2.0, 0.0, 1.0, 8.0)
 @pytest.fixture
 def folder(tmp_path):
     """Four photos that look along +z from beside each other, each observing every point, the first one twice."""
+    return planted(tmp_path, upright=())
+
+
+def planted(tmp_path, upright):
+    """The photos; those `upright` are taken with the camera turned by a quarter."""
     for name in ("images", "sparse", "masks"):
         (tmp_path / name).mkdir()
     model = pycolmap.Reconstruction()
-    params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="PINHOLE", width=WIDTH, height=HEIGHT, params=params)
-    )
+    for number, (width, height) in enumerate([(WIDTH, HEIGHT), (HEIGHT, WIDTH)], 1):
+        params = [FOCAL, FOCAL, width / 2, height / 2]
+        camera = pycolmap.Camera(camera_id=number, model="PINHOLE", width=width, height=height, params=params)
+        model.add_camera_with_trivial_rig(camera)
     ids = [model.add_point3D(p, pycolmap.Track(), np.zeros(3, np.uint8)) for p in POINTS]
     for k, shift in enumerate(SHIFTS, 1):
-        image = pycolmap.Image(name=f"{k}.png", camera_id=1, image_id=k)
+        image = pycolmap.Image(name=f"{k}.png", camera_id=2 if k in upright else 1, image_id=k)
+        width, height = (HEIGHT, WIDTH) if k in upright else (WIDTH, HEIGHT)
         image.points2D = pycolmap.Point2DList([pycolmap.Point2D([float(j), 5.0]) for j in range(len(ids) + 1)])
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-shift, 0, 0])))
         for j, point in enumerate([*ids, ids[0]]):
             model.add_observation(point, pycolmap.TrackElement(k, j))
-        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), np.full((HEIGHT, WIDTH, 3), (10, 20, 40 * k), np.uint8))
-        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-        mask[:, WIDTH // 2 :] = 255
+        cv2.imwrite(str(tmp_path / "images" / f"{k}.png"), np.full((height, width, 3), (10, 20, 40 * k), np.uint8))
+        mask = np.zeros((height, width), np.uint8)
+        mask[:, width // 2 :] = 255
         cv2.imwrite(str(tmp_path / "masks" / f"{k}.png"), mask)
     model.write_binary(tmp_path / "sparse")
     return tmp_path
@@ -60,6 +67,35 @@ def test_a_view_of_views_projects_as_its_photo(folder):
     whole = read_workspace(folder).views[2]
     np.testing.assert_allclose(view.project(POINTS)[0], whole.project(POINTS)[0] / 2)
     assert view.pixels.shape == (view.height, view.width, 3)
+
+
+def test_upright_photos_lie_on_pictures_that_hold_them_all(tmp_path):
+    folder = planted(tmp_path, upright=(2, 3))
+    views = load_views(folder, folder / "masks", width_px=40, hold_out_every=0)
+    assert views.images.shape == (4, 40, 40, 3) and views.sizes.tolist() == [[30, 40], [40, 30], [40, 30], [30, 40]]
+    assert (views.images[1] == (80, 20, 10)).all() and not views.masks[views.beyond].any()
+    assert views.masks[1, :, 15:30].all() and views.beyond[1, :, 30:].all() and not views.beyond[1, :, :30].any()
+    for index, whole in enumerate(read_workspace(folder).views):
+        view = views.view(index)
+        assert (view.width, view.height) == (whole.width / 2, whole.height / 2)
+        np.testing.assert_allclose(view.project(POINTS)[0], whole.project(POINTS)[0] / 2)
+    some = views.select(np.array([3, 1]))
+    assert some.names == ["4.png", "2.png"] and some.sizes.tolist() == [[30, 40], [40, 30]]
+
+
+def test_maps_of_a_cut_upright_photo_have_its_own_size(tmp_path):
+    folder = planted(tmp_path, upright=(2, 3))
+    crops = crop_to_object(load_views(folder, folder / "masks", 40, 0), 40)
+    on_canvas = np.full(crops.views.masks.shape[1:], 7, np.float32)
+    whole = [crops.paste(index, on_canvas) for index in range(4)]
+    assert [part.shape for part in whole] == [(30, 40), (40, 30), (40, 30), (30, 40)]
+    # The mask is the right half; what the canvas shows beside the photo is beyond it.
+    for index, part in enumerate(whole):
+        half = part.shape[1] // 2
+        assert (part[:, half:] == 7).all() and not part[:, :half].any()
+        again = crops.cut(index, part)
+        assert (again[crops.views.masks[index]] == 7).all() and not again[crops.views.beyond[index]].any()
+    assert crops.views.beyond.any() and not (crops.views.beyond & crops.views.masks).any()
 
 
 def test_held_out_photos_are_every_nth_or_listed(folder):
