@@ -220,14 +220,16 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     toward = join.stations[: len(SIDES_DEG) - 1] - middle
     turns = np.degrees(np.arctan2(toward[:, 1], toward[:, 0])).tolist()
     heights = np.degrees(np.arctan2(toward[:, 2], np.linalg.norm(toward[:, :2], axis=1))).tolist()
-    titles = [f"from station {k}" for k in range(1, len(turns) + 1)]
+    away = np.linalg.norm(toward, axis=1)
+    titles = [f"from station {k}, {distance:.3g} {join.unit} away" for k, distance in enumerate(away, 1)]
     for azimuth in SIDES_DEG[len(turns) + 1 :]:
         turns, heights, titles = [*turns, azimuth], [*heights, 22.0], [*titles, f"azimuth {azimuth:.0f}°"]
     images: list[Image | None] = [_plan_view(join, cloud, sizes, colors.astype(np.uint8), tile)]
     for turn, height in zip(turns, heights):
         images.append(render(cloud, orbit_camera(join.framed, turn, height, tile), sizes, colors.astype(np.uint8)))
     counts = ", ".join(f"{name.replace('_', ' ')} {(kinds == kind).sum()}" for kind, name in CLASSES.items())
-    note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}, see next_photos.csv"
+    shown = f", the best {len(away)} shown" if len(away) < len(join.stations) else ""
+    note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}{shown}; see next_photos.csv"
     columns = ["from above, with the stations", *titles]
     return draw_sheet(Sheet(f"{name}: what is still missing", note, [images], [], columns, {}, tile))
 

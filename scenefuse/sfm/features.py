@@ -28,7 +28,7 @@ class FeatureSettings:
     """-1 looks for features in photos enlarged twice as well: more small features, four times the work; 0 does not."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"] = setting("SIMPLE_RADIAL")
     """COLMAP's camera model; focal length and distortion are refined."""
-    camera_mode: Literal["auto", "single", "per_folder", "per_photo"] = setting("single")
+    camera_mode: Literal["auto", "single", "per_folder", "per_photo"] = setting("auto")
     """Which photos share one camera; auto: those with one size, EXIF camera and focal length."""
 
 
