@@ -31,6 +31,8 @@ LEAST_POINTS = 100
 MASK_REACH_PX = 2
 # A point is as far from the others as the mean of its distances to so many.
 NEAR_POINTS = 8
+# Voxels are no larger than so many pixels: windows of five pixels, which the depths were matched by, tell no more.
+VOXEL_PIXELS = 2
 # Points belong to one group where steps of this many spacings lead from one to the other.
 STEP_SPACINGS = 3
 # Points that a normal's plane is fitted to.
@@ -62,7 +64,7 @@ class CloudSettings:
     min_views: int = setting(2, least=1)
     """Views that must agree on a point, its own included; more keep fewer and better points."""
     spacing: float = setting(0.004, above=0, most=1)
-    """Distance between points, share of the object's diagonal."""
+    """Voxels that keep one point each, share of the object's diagonal; smaller where the maps' pixels are smaller."""
     gates: CloudGates = CloudGates()
     """Which points are kept."""
     refinement: RefinementSettings = RefinementSettings()
@@ -118,9 +120,9 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
             f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
             "or lower min_views"
         )
-    thinned = voxel_downsample(raw, settings.spacing * diagonal)
-    gates = settings.gates
-    cleaned = clean(thinned, gates.outlier_deviations, gates.min_component, settings.spacing * diagonal)
+    voxel = min(settings.spacing * diagonal, VOXEL_PIXELS * footprint(maps.depths, views.intrinsics))
+    thinned, gates = voxel_downsample(raw, voxel), settings.gates
+    cleaned = clean(thinned, gates.outlier_deviations, gates.min_component, voxel)
     cleaned = with_plane_normals(cleaned)
     shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)
     write_cloud(cloud, cleaned)
@@ -184,6 +186,12 @@ def _confirmed(
         "views": (found.agree[keep] + 1).astype(np.int32),
     }
     return Cloud(found.mean[keep], normals, views.images[index, rows, columns], fields)
+
+
+def footprint(depths: Maps, intrinsics: NDArray[np.float64]) -> float:
+    """How large a pixel of the maps (V, H, W) is on the surface that it faces, the median; unit of the depths."""
+    rows, *pixels = np.nonzero(depths > 0)
+    return float(np.median(depths[rows, *pixels] / intrinsics[rows, 0, 0]))
 
 
 def clean(cloud: Cloud, deviations: float, min_component: float, step: float) -> Cloud:
