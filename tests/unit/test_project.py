@@ -74,7 +74,7 @@ def test_a_preset_holds_settings_and_goes_into_a_new_project(preset, tmp_path):
     init(tmp_path / "yard", preset=preset)
     assert read_differences(tmp_path / "yard/config/config.yaml") == found
     width = with_defaults(found, schema_of("config"))["object"]["nerf"]["width_px"]
-    assert (preset, width > 480, width < 480) in {
+    assert (preset, width > 800, width < 800) in {
         ("draft", False, True),
         ("normal", False, False),
         ("high", True, False),
