@@ -49,7 +49,7 @@ class NerfSettings:
     device: Literal["auto", "cpu", "cuda"] = setting("auto")
     """Where the NeRF trains; `auto` takes CUDA where there is a GPU."""
     width_px: int = setting(800, unit="px", least=16)
-    """Photos are scaled down to this width, for training and for the rendered maps, from whose pixels the points come."""
+    """Photos are scaled down to this width, for training and for the rendered maps; points come from their pixels."""
     hull_tolerance: float = setting(0.04, least=0, most=1)
     """Share of the photos that may have a part of the object outside their mask; raise it where thin parts are lost."""
     field: FieldSettings = FieldSettings()
