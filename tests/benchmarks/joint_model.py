@@ -1,4 +1,4 @@
-"""A registered object beside one reconstruction of all photos together: how far its pose is off, where no truth is known.
+"""A registered object beside one reconstruction of all photos: how far its pose is off, where no truth is known.
 
 snakemake --configfile config/examples/boulder/config.yaml --cores 2, and all photos as one scene of another run, then
 PYTHONPATH=. python tests/benchmarks/joint_model.py --scene results/scenes/paving --object results/objects/boulder \\
@@ -65,10 +65,9 @@ def joint_model(*, scene: Path, object: Path, joint: Path) -> None:
             continue
         error = registration_error(Sim3.from_matrix(np.array(matrix)), scene_from_object, points.mean(0), diagonal)
         stated = [value(fine, name) for name in ("scale_sd_log", "rotation_sd_deg", "translation_sd")]
-        print(
-            f"  scale {error.scale_pct:.3f} % (stated {100 * stated[0]:.3f}), rotation {error.rotation_deg:.3f}"
-            f" ({stated[1]:.3f}) degrees, shift {100 * error.translation_over_diagonal:.3f} % ({100 * stated[2] / diagonal:.3f})"
-        )
+        shift, sd = 100 * error.translation_over_diagonal, 100 * stated[2] / diagonal
+        print(f"  scale {error.scale_pct:.3f} % (stated {100 * stated[0]:.3f})", end="")
+        print(f", rotation {error.rotation_deg:.3f} degrees ({stated[1]:.3f}), shift {shift:.3f} % ({sd:.3f})")
 
 
 if __name__ == "__main__":
