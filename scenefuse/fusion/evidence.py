@@ -39,7 +39,8 @@ SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
 the sparser side where that is more; never farther than this share of the diagonal."""
 CLEARLY = 1.5
 """The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
-denser ones, and equals would alternate."""
+denser ones, and equals would alternate. Where they are more than this factor farther apart than the scene's, these give
+way likewise."""
 SMOOTH_POINTS = 8
 """Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
 ROUGH_SIDE, ROUGH_SPACINGS, ROUGH_POINTS = 0.02, 4.0, 6
@@ -96,7 +97,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
     that hides and is seen. What photos see through is not there (a measured point of the scene where a larger share of
     the photos that it is open to see through it than of those asked confirm it), nor what no photo can see. Where both
-    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller.
+    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller; those of a
+    clearly denser scene stay unless the object's is.
 
     Args:
         obj: the object in the scene's frame, registered.
@@ -270,6 +272,8 @@ def _compare(
     if len(second):
         rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
+    beside = second.points[cKDTree(first.points).query(second.points, workers=threads())[0] < coarse]
+    factor = 1 / CLEARLY if len(beside) > 1 and fine > CLEARLY * spacing(beside) else CLEARLY
     theirs = np.full(len(scene), np.inf)
     theirs[on_scene] = other
     # What the scene did not measure lies as far off as what it measured, at least.
@@ -281,18 +285,16 @@ def _compare(
 
     distance, partner = cKDTree(first.points).query(scene.points, workers=threads())
     # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
-    worse = same(distance, mine[partner], theirs, SAME_SPACINGS * np.where(on_scene, fine, coarse)) & (
-        mine[partner] <= CLEARLY * theirs
-    )
+    least = SAME_SPACINGS * np.where(on_scene, fine, coarse)
+    worse = same(distance, mine[partner], theirs, least) & (mine[partner] <= factor * theirs)
     # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
     assert first.normals is not None
     along = ((scene.points - first.points[partner]) * first.normals[partner]).sum(1)
     worse &= ~on_scene | (distance**2 - along**2 <= coarse**2)
     if len(second):
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
-        better[on_obj] = same(distance, mine, other[partner], SAME_SPACINGS * coarse) & (
-            mine > CLEARLY * other[partner]
-        )
+        there = same(distance, mine, other[partner], SAME_SPACINGS * coarse)
+        better[on_obj] = there & (mine > factor * other[partner])
     return worse, better
 
 

@@ -233,3 +233,12 @@ def test_a_measured_point_goes_where_a_larger_share_of_photos_sees_through_than_
     matches = Matches(nothing, nothing, np.full(count, 4), np.full(count, 9), nothing, nothing, nothing)
     measured = np.array([True, True, False])
     assert is_seen_through(seen, matches, measured).tolist() == [False, True, True]
+
+
+def test_of_equals_the_denser_side_stays(near, far):
+    coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
+    for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
+        found = weigh(Side(obj, near), Side(scene, near), nerf_only=False)
+        middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
+        assert (found.added[middle].mean() > 0.95) == added
+        assert ((found.reason[around] == KEPT).mean() < 0.05) == added
