@@ -97,8 +97,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
     that hides and is seen. What photos see through is not there (a measured point of the scene where a larger share of
     the photos that it is open to see through it than of those asked confirm it), nor what no photo can see. Where both
-    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller; those of a
-    clearly denser scene stay unless the object's is.
+    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller; a clearly
+    denser scene stays unless the object's is.
 
     Args:
         obj: the object in the scene's frame, registered.
