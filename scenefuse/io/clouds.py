@@ -80,8 +80,11 @@ def concatenate(clouds: list[Cloud]) -> Cloud:
     )
 
 
-def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
-    """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value."""
+def voxel_downsample(cloud: Cloud, voxel: float, mean_colors: bool = False) -> Cloud:
+    """One point per occupied voxel: the one nearest to the voxel's mean, so that every field stays a measured value.
+
+    With `mean_colors` its colour is the mean of the voxel's: for pictures, where one in many would be a speckle.
+    """
     if len(cloud) == 0:
         return cloud
     group, counts = _voxels(cloud.points, voxel)
@@ -89,7 +92,12 @@ def voxel_downsample(cloud: Cloud, voxel: float) -> Cloud:
     distance = ((cloud.points - means[group]) ** 2).sum(1)
     order = np.lexsort((distance, group))
     first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    return cloud[np.sort(order[first])]
+    chosen = np.sort(order[first])
+    kept = cloud[chosen]
+    if mean_colors and cloud.colors is not None:
+        colors = np.rint(_group_means(cloud.colors, group, counts)[group[chosen]])
+        kept = replace(kept, colors=colors.astype(cloud.colors.dtype))
+    return kept
 
 
 def voxel_average(cloud: Cloud, voxel: float) -> Cloud:

@@ -107,3 +107,11 @@ def test_a_laz_file_that_does_not_fit_is_one_sentence_and_leaves_nothing(tmp_pat
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_downsampled_cloud_may_have_the_mean_colors_of_its_voxels():
+    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.2, 0.1, 0.1], [5.0, 0, 0]])
+    colors = np.array([[0, 0, 0], [90, 60, 30], [30, 0, 0], [7, 8, 9]], np.uint8)
+    thin, mean = (voxel_downsample(Cloud(points, colors=colors), 1.0, mean_colors) for mean_colors in (False, True))
+    assert thin.colors.tolist() == [[30, 0, 0], [7, 8, 9]] and mean.colors.tolist() == [[40, 20, 10], [7, 8, 9]]
+    np.testing.assert_array_equal(thin.points, mean.points)

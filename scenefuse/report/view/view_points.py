@@ -62,7 +62,7 @@ def thin(view: Cloud, most: int) -> Cloud:
             break
         # Points lie on surfaces: their number falls with the square of the voxel.
         voxel *= np.sqrt(count / (0.96 * most))
-    return concatenate([voxel_downsample(part, voxel * factor) for part, factor in parts])
+    return concatenate([voxel_downsample(part, voxel * factor, mean_colors=True) for part, factor in parts])
 
 
 def within(points: Array, low: Array, high: Array, margin: float = 0.05) -> NDArray[np.bool_]:
