@@ -26,7 +26,7 @@ class Crops:
     """The photos cut out around their masks, all on canvases of one size.
 
     Attributes:
-        views: the cut photos with intrinsics to match.
+        views: the cut photos with intrinsics to match; each begins anywhere on its canvas, so `sizes` say nothing.
         crop_from_photo: (V, 2, 3) affine maps between pixels with centres at +0.5.
         masks: (V, H, W) bool, the masks of the whole photos.
         sizes: (V, 2) rows and columns of the whole photos (`Views.sizes`).

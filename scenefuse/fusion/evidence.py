@@ -39,8 +39,9 @@ SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
 the sparser side where that is more; never farther than this share of the diagonal."""
 CLEARLY = 1.5
 """The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
-denser ones, and equals would alternate. Where they are more than this factor farther apart than the scene's, these give
-way likewise."""
+denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise."""
+OUTNUMBERED = 2.0
+"""Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser."""
 SMOOTH_POINTS = 8
 """Neighbours whose median standard deviation says which side is the better one: single points would mix both."""
 ROUGH_SIDE, ROUGH_SPACINGS, ROUGH_POINTS = 0.02, 4.0, 6
@@ -90,7 +91,7 @@ class Weighed:
     notes: tuple[str, ...]
 
 
-def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None) -> Weighed:
+def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None, share: float = 1.0) -> Weighed:
     """Check the points of an object and of the scene around it in the photos of both.
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
@@ -105,6 +106,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
         scene: the scene's points around it.
         nerf_only: whether points of the object that no photo confirms are added where the scene has none.
         certain: how certain the registration was; see `settle`.
+        share: of the scene's points there that are given.
     """
     if len(scene.cloud) > MOST_CHECKED:
         return _weigh_some(obj, scene, nerf_only, certain)
@@ -128,7 +130,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
     added = on_obj & ~contradicted
-    worse, better = _compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal)
+    worse, better = _compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal, share)
     reason[(reason == KEPT) & worse] = REPLACED
     added &= ~better
     if nerf_only:
@@ -143,7 +145,7 @@ def _weigh_some(obj: Side, scene: Side, nerf_only: bool, certain: float | None) 
     """`weigh` with MOST_CHECKED points of the scene; each of the others shares the fate of the nearest of these."""
     count = len(scene.cloud)
     chosen = np.sort(np.random.default_rng(0).choice(count, MOST_CHECKED, replace=False))
-    some = weigh(obj, replace(scene, cloud=scene.cloud[chosen]), nerf_only, certain)
+    some = weigh(obj, replace(scene, cloud=scene.cloud[chosen]), nerf_only, certain, MOST_CHECKED / count)
     nearest = cKDTree(scene.cloud.points[chosen]).query(scene.cloud.points, workers=threads())[1]
     fields = {name: values[nearest] for name, values in some.scene.fields.items()}
     note = f"of {count} points of the scene near the object {MOST_CHECKED} were checked; the others follow the nearest"
@@ -256,11 +258,12 @@ def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float
 
 def _compare(
     obj: Cloud, of_obj: Array, on_obj: NDArray[np.bool_], scene: Cloud, of_scene: Array, on_scene: NDArray[np.bool_],
-    diagonal: float,
+    diagonal: float, share: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
     """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
 
-    of_obj (N,), of_scene (M,): standard deviations; on_obj (N,), on_scene (M,): points that are measured and stay.
+    of_obj (N,), of_scene (M,): standard deviations; on_obj (N,), on_scene (M,): points that are measured and stay;
+    share: of the scene's points that are given.
     """
     worse, better = np.zeros(len(scene), dtype=bool), np.zeros(len(obj), dtype=bool)
     if not on_obj.any() or len(scene) == 0:
@@ -272,8 +275,8 @@ def _compare(
     if len(second):
         rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
-    beside = second.points[cKDTree(first.points).query(second.points, workers=threads())[0] < coarse]
-    factor = 1 / CLEARLY if len(beside) > 1 and fine > CLEARLY * spacing(beside) else CLEARLY
+    outnumbered = _times_as_many(second.points, first.points, coarse) > OUTNUMBERED * share
+    factor = 1 / CLEARLY if outnumbered else CLEARLY
     theirs = np.full(len(scene), np.inf)
     theirs[on_scene] = other
     # What the scene did not measure lies as far off as what it measured, at least.
@@ -288,14 +291,35 @@ def _compare(
     least = SAME_SPACINGS * np.where(on_scene, fine, coarse)
     worse = same(distance, mine[partner], theirs, least) & (mine[partner] <= factor * theirs)
     # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
-    assert first.normals is not None
-    along = ((scene.points - first.points[partner]) * first.normals[partner]).sum(1)
-    worse &= ~on_scene | (distance**2 - along**2 <= coarse**2)
+    worse &= ~on_scene | (_beside(scene.points, first[partner]) <= coarse)
     if len(second):
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
         there = same(distance, mine, other[partner], SAME_SPACINGS * coarse)
+        if outnumbered:
+            # Of equals the object's points stay in the holes of a denser scene.
+            hole = np.where(mine > CLEARLY * other[partner], np.inf, SAME_SPACINGS * spacing(second.points))
+            there &= _beside(first.points, second[partner]) <= hole
         better[on_obj] = there & (mine > factor * other[partner])
     return worse, better
+
+
+def _times_as_many(points: Array, others: Array, reach: float) -> float:
+    """How many of (N, 3) points there are for each of the others (M, 3), where both are within `reach` of each other.
+
+    Counted, since regular points lie farther from their nearest ones than as many irregular ones; doubles are one.
+    """
+    if not len(points):
+        return 0.0
+    shared = [a[cKDTree(b).query(a, workers=threads())[0] < reach] for a, b in ((points, others), (others, points))]
+    return len(np.unique(shared[0], axis=0)) / max(len(shared[1]), 1)
+
+
+def _beside(points: Array, partners: Cloud) -> Array:
+    """How far (N,) points lie beside their partners, along the surface of these."""
+    assert partners.normals is not None
+    away = points - partners.points
+    along = (away * partners.normals).sum(1)
+    return np.asarray(np.sqrt(np.maximum((away**2).sum(1) - along**2, 0)))
 
 
 def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
@@ -346,6 +370,8 @@ def _supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> N
 
 def _smooth(points: Array, deviation: Array) -> Array:
     """Median standard deviation (N,) of the points around each."""
+    if not len(points):
+        return deviation
     near = cKDTree(points).query(points, k=min(SMOOTH_POINTS, len(points)), workers=threads())[1]
     return np.median(deviation[near.reshape(len(points), -1)], axis=1)
 

@@ -77,7 +77,7 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
     Args:
         workspace: folder with images/ and sparse/, PINHOLE cameras.
         masks: folder of {name}.png, above 127 on the object.
-        width_px: target width; photos are never enlarged.
+        width_px: target width; photos are not enlarged, but for some that are smaller than most.
         hold_out_every: every n-th photo (in name order) is held out, 0 holds out none; a file held_out.txt in the
             workspace, one name a line, lists them instead.
 
@@ -92,9 +92,9 @@ def load_views(workspace: Path, masks: Path, width_px: int, hold_out_every: int)
         raise StageError(
             f"no photo in {workspace} has a mask in {masks}; mask files are named like their photo, with .png"
         )
-    scales = _scales(read.views, width_px)
-    photos = [_scaled(read.rgb(view), scale) for view, scale in zip(read.views, scales)]
-    mattes = [_scaled(_matte(file, view), scale) for file, view, scale in zip(files, read.views, scales)]
+    factors = scales(read.views, width_px)
+    photos = [_scaled(read.rgb(view), scale) for view, scale in zip(read.views, factors)]
+    mattes = [_scaled(_matte(file, view), scale) for file, view, scale in zip(files, read.views, factors)]
     shape = max(view.height for view in photos), max(view.width for view in photos)
     return Views(
         [view.name for view in photos],
@@ -117,10 +117,13 @@ def on_picture(
     return np.pad(pixels, spare + [(0, 0)] * (pixels.ndim - 2), mode)
 
 
-def _scales(views: list[View], width_px: int) -> list[float]:
-    """By how much each photo is scaled: the widest to `width_px`, those of other sizes to as many pixels in all."""
-    side = np.sqrt([view.width * view.height for view in views])
-    alike = side.max() / side
+def scales(views: list[View], width_px: int) -> list[float]:
+    """By how much each photo is scaled: the widest to `width_px`, so that all get about as many pixels; none becomes
+    longer than most, a narrow strip for instance."""
+    sides = np.array([(view.width, view.height) for view in views])
+    size = np.sqrt(sides.prod(1))
+    middle = int(np.argsort(size, kind="stable")[len(size) // 2])
+    alike = np.minimum(size[middle] / size, sides[middle].max() / sides.max(1))
     widest = max(round(view.width * factor) for view, factor in zip(views, alike))
     return [float(min(1.0, width_px / widest) * factor) for factor in alike]
 

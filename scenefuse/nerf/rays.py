@@ -22,7 +22,7 @@ THIN_SHARE = 0.2
 
 @dataclass(frozen=True)
 class PhotoTensors:
-    """V photos of one size, in the frame of the unit cube ("nerf").
+    """V photos on pictures of one size, in the frame of the unit cube ("nerf").
 
     Attributes:
         images: (V, H, W, 3) uint8 RGB.

@@ -92,7 +92,7 @@ def render_maps(
         StageError: no ray met a surface.
     """
     measured = views.held_out if views.held_out.any() else np.ones(len(views.names), bool)
-    where = dilate(photos.masks, BEYOND_MASK_PX)
+    where = dilate(photos.masks, BEYOND_MASK_PX) & ~torch.from_numpy(views.beyond)
     looks = nerf.appearance.log_gain.cpu(), nerf.appearance.falloff.cpu()
     log_gain = gains_nearby(looks[0], photos.center, torch.from_numpy(np.flatnonzero(~views.held_out)))
     rendered = [
@@ -183,7 +183,7 @@ def measure_quality(
     for index in np.flatnonzero(measured):
         mask = torch.from_numpy(views.masks[index])
         photo = torch.from_numpy(views.images[index]).float() / 255.0
-        picture, everything = rendered[index].color.clamp(0, 1), torch.ones_like(mask)
+        picture, everything = rendered[index].color.clamp(0, 1), torch.from_numpy(~views.beyond[index])
         masked = photo * (torch.from_numpy(views.mattes[index]) / 255.0 if exact else mask)[..., None]
         near = dilate(mask[None], SSIM_REACH_PX)[0]
         signal = psnr(picture, masked, mask), psnr(picture, masked, everything)

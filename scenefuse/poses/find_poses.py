@@ -144,7 +144,8 @@ def _read_photos(workspace: Workspace) -> list[View]:
     """The workspace's views with their photos."""
     if len({(view.width, view.height) for view in workspace.views}) > 1:
         raise StageError(
-            f"the photos in {workspace.folder}/images have different sizes; use photos of one camera at one size"
+            f"the photos in {workspace.folder}/images have different sizes, which this source of poses does not take;"
+            " use photos of one camera at one size (with object.features.camera_mode: single), or stage1.pose_source: sfm"
         )
     return [workspace.rgb(view) for view in workspace.views]
 

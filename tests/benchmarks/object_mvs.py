@@ -1,6 +1,6 @@
 """The demo's objects by dense multi-view stereo alone, on the same photos and masks, beside the four stages.
 
-make demo; then python tests/benchmarks/object_mvs.py --results results
+make demo; then python tests/benchmarks/object_mvs.py --results results --settings config/demo.yaml
 """
 
 import os
@@ -133,7 +133,7 @@ def early_stages(folder: Path, truth: ObjectTruth, settings: dict[str, Any]) -> 
 def cleaned(cloud: Cloud, folder: Path, own: dict[str, Any]) -> Cloud:
     """Thinned and cleaned like the object's cloud."""
     settings = build(CloudSettings, own["cloud"])
-    step = settings.spacing * value(read_json(folder / "object.json"), "diagonal")
+    step = settings.spacing * value(read_json(folder / "object.json"), "diagonal")  # the demo's pixels are larger
     return clean(voxel_downsample(cloud, step), settings.gates.outlier_deviations, settings.gates.min_component, step)
 
 

@@ -242,3 +242,23 @@ def test_of_equals_the_denser_side_stays(near, far):
         middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
         assert (found.added[middle].mean() > 0.95) == added
         assert ((found.reason[around] == KEPT).mean() < 0.05) == added
+
+
+def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.012)
+    scene = scene[np.linalg.norm(scene.points[:, :2], axis=1) > 0.08]
+    found = weigh(Side(obj, near), Side(scene, near), nerf_only=False)
+    inside, beside = (np.linalg.norm(obj.points[:, :2], axis=1) < r for r in (0.05, 0.5))
+    assert found.added[inside].mean() > 0.7 and found.added[beside & (np.abs(obj.points[:, 0]) > 0.2)].mean() < 0.05
+
+
+def test_doubles_do_not_make_a_scene_dense(near):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
+    found = weigh(Side(obj, near), Side(concatenate([scene] * 10), near), nerf_only=False)
+    assert found.added.mean() > 0.95
+
+
+def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
+    obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
+    found = weigh(Side(obj, near), Side(floating, far), nerf_only=False)
+    assert found.added.mean() > 0.9 and (found.reason != KEPT).mean() > 0.9

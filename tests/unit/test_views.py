@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.depth.crops import crop_to_object
 from scenefuse.mvs.view_selection import select_views
-from scenefuse.mvs.views import load_views
+from scenefuse.mvs.views import load_views, scales
 from scenefuse.mvs.visual_hull import Outline, count_silhouettes
 from scenefuse.stage import StageError
 from scenefuse.workspace import View, read_workspace
@@ -96,6 +96,22 @@ def test_maps_of_a_cut_upright_photo_have_its_own_size(tmp_path):
         again = crops.cut(index, part)
         assert (again[crops.views.masks[index]] == 7).all() and not again[crops.views.beyond[index]].any()
     assert crops.views.beyond.any() and not (crops.views.beyond & crops.views.masks).any()
+
+
+def test_one_odd_photo_does_not_set_the_size_of_all():
+    def views(*sizes):
+        return [View(f"{k}", np.eye(3), np.eye(4), width, height) for k, (width, height) in enumerate(sizes)]
+
+    strip = _scaled_sizes(views(*[(1600, 1200)] * 5, (1600, 300)), 800)
+    assert strip == [(800, 600)] * 5 + [(800, 150)]
+    assert _scaled_sizes(views(*[(640, 480)] * 5, (4000, 3000)), 800) == [(640, 480)] * 6
+    mixed = views((1280, 852), (852, 1280), (1280, 852), (768, 511))
+    first = _scaled_sizes(mixed, 800)
+    assert _scaled_sizes(mixed, max(width for width, _ in first)) == first and first[1] == first[0][::-1]
+
+
+def _scaled_sizes(views, width_px):
+    return [(round(v.width * s), round(v.height * s)) for v, s in zip(views, scales(views, width_px))]
 
 
 def test_held_out_photos_are_every_nth_or_listed(folder):
