@@ -145,7 +145,7 @@ def _read_photos(workspace: Workspace) -> list[View]:
     if len({(view.width, view.height) for view in workspace.views}) > 1:
         raise StageError(
             f"the photos in {workspace.folder}/images have different sizes, which this source of poses does not take;"
-            " use photos of one camera at one size (with object.features.camera_mode: single), or stage1.pose_source: sfm"
+            " use photos of one camera at one size (with features.camera_mode: single), or stage1.pose_source: sfm"
         )
     return [workspace.rgb(view) for view in workspace.views]
 
