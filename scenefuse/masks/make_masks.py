@@ -12,7 +12,8 @@ from scenefuse.io.pictures import write_picture
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.contact_sheet import draw_contact_sheet
 from scenefuse.masks.prompted import Prompted, masks_from_prompts
-from scenefuse.masks.sam2 import load_network
+from scenefuse.masks.sam2 import Sam2, load_network
+from scenefuse.masks.sam2_weights import why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.masks.target import points_in_masks, target_from_points
@@ -78,7 +79,7 @@ def make_masks(
     cv2.setNumThreads(threads())
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
-    made, found, weights = _make(inputs, photos, settings, seed)
+    made, found, by = _make(inputs, photos, settings, seed)
     for sentence in found.left_out:
         print(f"left out of {inputs.prompts}: {sentence}", flush=True)
     for name, reason in sorted(made.dropped.items()):
@@ -95,18 +96,18 @@ def make_masks(
         files = manifest(folder)
     with atomic_file(contact_sheet) as path:
         write_picture(path, _sheet(photos.views, made))
-    content = _report(made, found, len(photos.views), kept, settings)
+    content = _report(made, found, len(photos.views), kept, settings) | by
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
-    write_json(report, content | ({"weights": quantity(weights, "")} if weights else {}) | {"files": files})
+    write_json(report, content | {"files": files})
 
 
 def _make(
     inputs: MaskInputs, photos: Workspace, settings: MaskSettings, seed: int
-) -> tuple[ScoredMasks, Prompted, str]:
-    """Masks of all photos that have one, what they were made from, and which weights segmented them."""
+) -> tuple[ScoredMasks, Prompted, dict[str, Any]]:
+    """Masks of all photos that have one, what they were made from, and by which method and weights."""
     up = np.array(value(read_json(inputs.workspace_json), "up_in_camera_frame"), dtype=np.float64)
     unusable: dict[str, str] = {}
-    weights = ""
+    by = {"method": quantity(settings.method, "")}
     if settings.method == "supplied":
         masks, photos, unusable = _supplied(inputs, photos)
         target = target_from_points(points_in_masks(photos, masks, up), photos, up, seed)
@@ -116,11 +117,8 @@ def _make(
             raise StageError(
                 "masks from prompts need a prompts file; set its path in config/objects.tsv, or supply masks"
             )
-        marked, sizes, network = read_points(inputs.prompts), original_sizes(read_json(inputs.photos_json)), None
-        if settings.method == "sam2":
-            checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
-            encoder, decoder = Path(settings.sam2_encoder), Path(settings.sam2_decoder)
-            network, weights = load_network(encoder, decoder, checkpoint, threads())
+        marked, sizes = read_points(inputs.prompts), original_sizes(read_json(inputs.photos_json))
+        network, by = _network(settings)
         found = masks_from_prompts(marked, inputs.sparse, sizes, photos, up, network, settings, seed)
     own = found.target.kind
     print(f"{np.sum(own > 0)} sparse points on the object, {np.sum(own < 0)} not", flush=True)
@@ -128,7 +126,24 @@ def _make(
     for name in set(scored.dropped) & set(found.reasons):
         scored.dropped[name] += f"; {found.reasons[name]}"
     made = _kept(scored, settings.keep, inputs.sparse, photos.views)
-    return replace(made, dropped=unusable | made.dropped), found, weights
+    return replace(made, dropped=unusable | made.dropped), found, by
+
+
+def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:
+    """SAM 2, or None for GrabCut; and for the report which of them, with what weights, and why not the better one."""
+    encoder, decoder = Path(settings.sam2_encoder), Path(settings.sam2_decoder)
+    checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
+    if settings.method == "grabcut":
+        return None, {"method": quantity("grabcut", "")}
+    if settings.method == "auto" and checkpoint is None and (why := why_unavailable(encoder)):
+        fallback = (
+            f"masks by GrabCut, since SAM 2's weights could not be fetched ({why}); with a network, run snakemake"
+            " --forcerun fetch_sam2_weights"
+        )
+        print(fallback, flush=True)
+        return None, {"method": quantity("grabcut", ""), "fallback": quantity(fallback, "")}
+    network, weights = load_network(encoder, decoder, checkpoint, threads())
+    return network, {"method": quantity("sam2", ""), "weights": quantity(weights, "")}
 
 
 def _supplied(inputs: MaskInputs, photos: Workspace) -> tuple[list[Mask], Workspace, dict[str, str]]:
@@ -169,7 +184,6 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
         for name, mask in made.masks.items()
     }
     return {
-        "method": quantity(settings.method, ""),
         "keep": quantity(settings.keep, ""),
         "masks": quantity(len(kept), "1"),
         "photos": quantity(photos, "1"),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256
+from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
 from scenefuse.masks.target import Target, far_apart
 from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError, sha256
@@ -275,8 +275,8 @@ def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
     """
     if not path.is_file():
         raise StageError(
-            f"the SAM 2 weights {path} do not exist; fetch the shipped ones (rule fetch_sam2_weights), correct the"
-            " path, or use grabcut"
+            f"the SAM 2 weights {path} do not exist ({why_unavailable(path) or 'never fetched'}); fetch the shipped"
+            " ones (snakemake --forcerun fetch_sam2_weights), correct the path, or set object.masks.method: grabcut"
         )
     found = sha256(path)
     if found == expected_sha256:

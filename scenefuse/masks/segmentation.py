@@ -29,14 +29,15 @@ TRUST_TOLERANCE = 0.34
 class MaskSettings:
     """How masks are made."""
 
-    method: Literal["grabcut", "sam2", "supplied"] = setting("grabcut")
-    """Where masks come from; a folder in the column `masks` of the objects' table goes before."""
+    method: Literal["auto", "sam2", "grabcut", "supplied"] = setting("auto")
+    """Where masks come from: SAM 2, GrabCut, or (`auto`) SAM 2, and GrabCut where its weights cannot be fetched. A
+    folder in the column `masks` of the objects' table goes before."""
     keep: str = setting("object")
     """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
     brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
     shows nothing of that."""
     sam2_encoder: str = setting(ENCODER)
-    """For sam2: weights of the encoder (.ort or .onnx). The shipped path is fetched by a rule."""
+    """For sam2: weights of the encoder (.ort or .onnx). Those at the shipped path are fetched by a rule."""
     sam2_decoder: str = setting(DECODER)
     """For sam2: weights of the decoder (.onnx), likewise."""
     sam2_checkpoint: str | None = setting(None)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scenefuse.pick.clicks import Rows
 from scenefuse.pick.pictures import Picture, at_most, read_upright
-from scenefuse.stage import StageError, threads
+from scenefuse.stage import StageError, atomic_directory, threads
 
 if TYPE_CHECKING:
     from scenefuse.masks.clicked.clicks import PhotoClicks
@@ -70,25 +70,30 @@ class Segmenter:
         self._closed = False
 
     def load(self) -> None:
-        """Load the network, or GrabCut where the settings say so or there are no weights; seconds."""
+        """Load the network, or GrabCut where the settings say so or there are no weights; seconds.
+
+        The weights are fetched, as the workflow would, where nothing has tried that yet.
+        """
         from scenefuse.masks.grabcut_passes import ask_grabcut
 
         settings = self._settings
         with self._busy:
             if self.method:
                 return
-            if settings["method"] == "sam2":
+            if settings["method"] != "grabcut":
                 from scenefuse.masks.sam2 import ask_sam2, load_network
 
                 checkpoint = settings["sam2_checkpoint"]
                 encoder, decoder = Path(settings["sam2_encoder"]), Path(settings["sam2_decoder"])
                 try:
+                    if checkpoint is None:
+                        _fetch_once({encoder, decoder})
                     network, _ = load_network(encoder, decoder, checkpoint and Path(checkpoint), threads())
                     self._network = _Remembering(network)
                     self._ask, self.method = partial(ask_sam2, self._network), "SAM 2"
                     return
-                except StageError as error:
-                    self.trouble = f"Masks are shown by GrabCut, not by SAM 2 as the workflow will: {error}"
+                except (StageError, OSError) as error:
+                    self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
             from scenefuse.masks.segmentation import MaskSettings
 
             self._ask, self.method = partial(ask_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
@@ -163,6 +168,19 @@ class Segmenter:
             while len(self._photos) > KEPT:
                 self._photos.popitem(last=False)
         return self._photos[picture.name]
+
+
+def _fetch_once(paths: set[Path]) -> None:
+    """Put the shipped weights to their place, if these are they and the workflow has not tried it yet.
+
+    Raises:
+        OSError: they cannot be fetched; nothing is left behind then.
+    """
+    from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, download_weights
+
+    if paths == {Path(ENCODER), Path(DECODER)} and not Path(WEIGHTS).exists():
+        with atomic_directory(Path(WEIGHTS)) as folder:
+            download_weights(folder)
 
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":

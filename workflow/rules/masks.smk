@@ -2,17 +2,16 @@
 #
 # INPUTS    config/objects.tsv: prompts or masks; results/objects/{object}/undistorted/; config: object.masks
 # OUTPUTS   results/objects/{object}/masks/, masks.json, masks.png
-#           results/weights/                                                SAM 2's, for masks by it
+#           results/weights/sam2/                                           SAM 2's, for masks by it
 
 
 include: "../functions/masks.smk"
 
 
 rule fetch_sam2_weights:
-    """SAM 2's weights for ONNX Runtime; needed only by masks that use them."""
+    """SAM 2's weights for ONNX Runtime, or why they cannot be had; needed only by masks that use them."""
     output:
-        encoder="results/weights/sam2_encoder.ort",
-        decoder="results/weights/sam2_decoder.onnx",
+        directory("results/weights/sam2"),
     log:
         "results/logs/fetch_sam2_weights.log",
     localrule: True
@@ -24,7 +23,7 @@ rule fetch_sam2_weights:
     message:
         "SAM 2's weights"
     shell:
-        "exec python {params.script} --sam2-encoder {output.encoder} --sam2-decoder {output.decoder} &> {log}"
+        "exec python {params.script} --weights {output} &> {log}"
 
 
 rule make_masks:
