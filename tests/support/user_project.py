@@ -21,6 +21,8 @@ class Project:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.config: dict = {"scenes": "scenes.tsv", "objects": "objects.tsv"}
+        # Fetches nothing.
+        self.config["object"] = {"masks": {"method": "grabcut"}}
         self.scenes = "scene\tphotos\nyard\tflight\n"
         self.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n"
 
