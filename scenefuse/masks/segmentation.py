@@ -53,7 +53,7 @@ class MaskSettings:
     of its mask's outline; others are left out and named."""
     min_photos: int = 5
     """Fewest good masks to go on with."""
-    hull_voxels: int = 96
+    hull_voxels: int = 160
     """Voxels of the visual hull along the longest side of the box."""
     grabcut_width_px: int = 320
     """The first cut runs on photos at most this wide, in pixels."""
