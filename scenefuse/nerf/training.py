@@ -54,7 +54,7 @@ class Schedule:
 
     epochs: int = setting(20, least=1)
     """Epochs of this stage; an epoch is a number of rays."""
-    rays_per_epoch: int = setting(60000, least=1)
+    rays_per_epoch: int = setting(120_000, least=1)
     """Rays drawn per epoch."""
 
 

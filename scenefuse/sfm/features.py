@@ -22,7 +22,7 @@ class FeatureSettings:
 
     max_image_size_px: int = setting(2000, unit="px", least=0)
     """Longest side at which features are looked for; larger photos are scaled down for this stage only."""
-    max_features: int = setting(1500, least=0)
+    max_features: int = setting(4000, least=0)
     """Most features kept per photo, the largest first."""
     first_octave: int = setting(-1, least=-1)
     """-1 looks for features in photos enlarged twice as well: more small features, four times the work; 0 does not."""

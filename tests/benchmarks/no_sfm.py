@@ -1,6 +1,6 @@
 """The demo's objects without any structure from motion: poses, stages 1 to 4 and the cloud from frames and masks.
 
-snakemake --configfile config/examples/ideal_camera.yaml --cores 2
+snakemake --configfile config/demo.yaml config/examples/ideal_camera.yaml --cores 2
 PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --out results/bench/no_sfm
 
 Without SfM nothing calibrates a lens, so the demo has to be the one of the ideal camera.
