@@ -182,7 +182,9 @@ def _alignment(fields: Fields) -> str:
         return "" if found is None else f"not found: {reason}"
     deviation = 100 * find(fields, "alignment.scale_sd_log")
     scale = number(find(fields, "alignment.scale"))
-    return f"scale {scale} (standard deviation {number(deviation)} %, bending apart), {reason}"
+    miss, photos = find(fields, "alignment.gps_miss"), find(fields, "alignment.gps_photos")
+    by_gps = "" if miss is None else f"; GPS of {photos} photos {number(miss)} standard deviations apart"
+    return f"scale {scale} (standard deviation {number(deviation)} %, bending apart), {reason}{by_gps}"
 
 
 def _variant_lines(item: Collected, variants: list[str]) -> list[str]:

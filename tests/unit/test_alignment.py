@@ -1,7 +1,7 @@
 """The alignment from shared features finds a planted similarity, and refuses where nothing is shared."""
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_models
 from scenefuse.registration.shared_features.landmarks import match_landmarks, read_landmarks
 from scenefuse.registration.shared_features.reprojection import match_errors, minimise_reprojection, observations
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.sfm.photos import Photo
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_angle_deg
 
 SETTINGS = AlignmentSettings()
@@ -83,8 +85,9 @@ def capture(folder, name, seen, views, seed, *, model_from_world=None, noise_px=
     return folder / name, folder / f"{name}.db"
 
 
-def aligned(folder, obj, scene, settings=SETTINGS, seed=0):
+def aligned(folder, obj, scene, settings=SETTINGS, seed=0, **files):
     align_models(
+        **files,
         object_sparse=obj[0],
         object_features=obj[1],
         scene_sparse=scene[0],
@@ -180,7 +183,63 @@ def test_another_place_is_not_found(pair, tmp_path):
     assert value(found, "found") is False and "are needed" in value(found, "reason")
 
 
+def positions(folder, shift=(0, 0, 0), noise_m=0.3):
+    """The files that say where the photos of an orbit of the world's middle were taken, moved by `shift`."""
+    frame = LocalFrame(47.5, 8.5, 400.0)
+    centres = np.array([centre for centre, _ in ring(6, 2.5, 10)]) + shift
+    centres += np.random.default_rng(0).normal(0, noise_m, centres.shape)
+    # Another flight's heights have another zero.
+    places = frame.inverse(centres) + [0, 0, 40]
+    listed = [
+        Photo(f"object{k}.jpg", 800, 600, "", *place, horizontal_sd_m=noise_m) for k, place in enumerate(places, 1)
+    ]
+    write_json(folder / "photos.json", {"photos": [asdict(photo) for photo in listed]})
+    origin = {"origin_latitude_deg": 47.5, "origin_longitude_deg": 8.5, "origin_altitude_m": 400.0}
+    write_json(folder / "scene.json", {name: quantity(number, "") for name, number in origin.items()})
+    return {"object_photos": folder / "photos.json", "scene_json": folder / "scene.json"}
+
+
+def test_gps_says_the_same(pair, found, tmp_path):
+    beside = aligned(tmp_path, *pair, **positions(tmp_path))
+    assert value(beside, "scene_from_object") == value(found, "scene_from_object")
+    assert value(beside, "gps_photos") == 10 and value(beside, "gps_miss") < 3 and value(beside, "notes") == []
+    assert value(beside, "gps_shift_apart") < 0.5 and abs(value(beside, "gps_heading_apart_deg")) < 6
+    assert value(found, "gps_photos") == 0 and value(found, "gps_miss") is None
+
+
+def test_gps_that_contradicts_the_pose_is_a_note(pair, found, tmp_path):
+    beside = aligned(tmp_path, *pair, **positions(tmp_path, (9, 0, 0)))
+    assert value(beside, "scene_from_object") == value(found, "scene_from_object")
+    assert value(beside, "gps_shift_apart") == pytest.approx(9, abs=0.5)
+    assert "GPS of 10 of its photos contradicts the pose" in value(beside, "notes")[0]
+
+
+def test_gps_says_where_to_click_on_an_object_that_shares_nothing(pair, tmp_path):
+    elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
+    lost = aligned(tmp_path, pair[0], elsewhere, **positions(tmp_path, (9, 0, 0)))
+    assert value(lost, "found") is False and "stands at (" in value(lost, "notes")[0]
+    assert value(lost, "gps_place")[0] == pytest.approx(9, abs=0.5)
+
+
+def test_gps_that_spreads_too_little_says_nothing(pair, tmp_path):
+    beside = aligned(tmp_path, *pair, **positions(tmp_path, noise_m=3.0))
+    assert value(beside, "found") is True and value(beside, "gps_photos") == 0
+
+
+@pytest.mark.parametrize("shift", [0.0, 12.0])
+def test_gps_tells_an_object_from_its_twin(tmp_path, shift):
+    obj, scene = with_twin(tmp_path)
+    found = aligned(tmp_path, obj, scene, **positions(tmp_path, (shift, 0, 0)))
+    place = Sim3.from_matrix(np.array(value(found, "scene_from_object"))).apply(OBJECT_FROM_WORLD.apply(np.zeros(3)))
+    assert value(found, "found") is True and np.linalg.norm(place - [shift, 0, 0]) < 0.1
+
+
 def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
+    found = aligned(tmp_path, *with_twin(tmp_path))
+    assert value(found, "found") is False and "twice" in value(found, "reason")
+
+
+def with_twin(tmp_path):
     """Its twin looks the same where it looks like anything: each half of the matches agrees on another place."""
     whole = world(1)
     middle = near(whole)
@@ -193,8 +252,7 @@ def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):
     looks = np.concatenate([rest.looks, own.looks, twin.looks])
     scene = capture(tmp_path, "scene", World(points, looks), ring(6, 25, 12, (6, 0, 0)), 3)
     obj = capture(tmp_path, "object", middle, ring(6, 2.5, 10), 4, model_from_world=OBJECT_FROM_WORLD)
-    found = aligned(tmp_path, obj, scene)
-    assert value(found, "found") is False and "twice" in value(found, "reason")
+    return obj, scene
 
 
 def test_points_along_one_line_leave_the_rotation_open(tmp_path):

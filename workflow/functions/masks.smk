@@ -32,7 +32,9 @@ def mask_inputs(wildcards):
         files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
     elif settings["method"] != "grabcut":
         weights = settings["sam2_encoder"], settings["sam2_decoder"]
-        files += {WEIGHTS if file in (ENCODER, DECODER) else file: None for file in weights}
+        files += {
+            WEIGHTS if file in (ENCODER, DECODER) else file: None for file in weights
+        }
     return files + own_file("object", wildcards.object, "prompts")
 
 

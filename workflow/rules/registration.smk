@@ -19,6 +19,7 @@ rule align_models:
         object_sparse="results/objects/{object}/sparse",
         object_json="results/objects/{object}/sparse.json",
         object_features="results/objects/{object}/features.db",
+        object_photos="results/objects/{object}/photos.json",
         scene_sparse=in_scene("georeferenced"),
         scene_json=in_scene("georeference.json"),
         scene_features=in_scene("features.db"),
@@ -43,7 +44,8 @@ rule align_models:
         "{wildcards.object}: alignment from shared features"
     shell:
         "exec python {params.script} --object-sparse {input.object_sparse} --object-features {input.object_features}"
-        " --scene-sparse {input.scene_sparse} --scene-features {input.scene_features} --report {output}"
+        " --object-photos {input.object_photos} --scene-sparse {input.scene_sparse} --scene-features {input.scene_features}"
+        " --scene-json {input.scene_json} --report {output}"
         " --seed {params.seed} {params.options} &> {log}"
 
 

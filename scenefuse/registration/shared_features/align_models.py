@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.registration.shared_features.gps import CONTRADICTED, GpsPose, gps_quantities, pose_by_gps
 from scenefuse.registration.shared_features.landmarks import Landmarks, match_landmarks, read_landmarks
 from scenefuse.registration.shared_features.localise import Centres, localise
 from scenefuse.registration.shared_features.reprojection import (
@@ -52,6 +53,8 @@ class AlignmentSettings:
     nearest_points: int = 200
     """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
     bent against each other."""
+    gps_accuracy_m: float = 3.0
+    """Standard error of GPS positions of the object's photos that state none."""
 
 
 @dataclass(frozen=True)
@@ -62,11 +65,13 @@ class Consensus:
         pose: scene_from_object.
         inliers: (M,) bool over the matches.
         rival: inliers of the best pose among the rest.
+        other: that pose, or None.
     """
 
     pose: Sim3
     inliers: NDArray[np.bool_]
     rival: int
+    other: Sim3 | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +104,8 @@ def align_models(
     report: Path,
     seed: int,
     settings: AlignmentSettings,
+    object_photos: Path | None = None,
+    scene_json: Path | None = None,
 ) -> None:
     """Find scene_from_object from features that the object's photos share with the scene's (method R14).
 
@@ -106,6 +113,7 @@ def align_models(
     similarity of free scale, and Gauss-Newton minimises the reprojection of each model's points in the other's photos.
     Camera centres: each photo of the object is localised in the scene by itself, and a similarity is fitted to the
     centres; it shares the matches but neither the object's points nor the minimiser, and is reported beside the first.
+    GPS: where both sides have it, it gives one more estimate, which tells an object from its like elsewhere.
 
     Args:
         object_sparse: COLMAP model of the object's original photos; its frame is the object frame.
@@ -115,6 +123,8 @@ def align_models(
         report: output JSON: `found`, `reason`, `scene_from_object`, how certain it is.
         seed: of all random choices.
         settings: see AlignmentSettings.
+        object_photos: JSON list of the object's photos with their GPS positions, if any.
+        scene_json: JSON of the georeferencing stage, for the scene's origin.
 
     Raises:
         StageError: a database does not belong to its model.
@@ -122,20 +132,25 @@ def align_models(
     begin = time.perf_counter()
     obj = read_landmarks(object_sparse, object_features)
     scene = read_landmarks(scene_sparse, scene_features)
-    content = align_landmarks(obj, scene, settings, seed)
+    gps = pose_by_gps(obj, object_photos, scene_json, settings.gps_accuracy_m, seed)
+    content = align_landmarks(obj, scene, settings, seed, gps)
     print(f"{'found' if content['found']['value'] else 'not found'}: {content['reason']['value']}", flush=True)
     write_json(report, {**content, "seconds": quantity(time.perf_counter() - begin, "s")})
 
 
-def align_landmarks(obj: Landmarks, scene: Landmarks, settings: AlignmentSettings, seed: int) -> dict[str, Any]:
+def align_landmarks(
+    obj: Landmarks, scene: Landmarks, settings: AlignmentSettings, seed: int, gps: GpsPose | None = None
+) -> dict[str, Any]:
     """Match, find a consensus, refine, apply the gate: the stage JSON without its time."""
     pairs = match_landmarks(obj, scene, settings.max_ratio)
     print(f"{len(obj.points)} points of the object, {len(scene.points)} of the scene, {len(pairs)} matches", flush=True)
     seen = observations(obj, scene, pairs)
     consensus = find_consensus(seen, seed)
-    if consensus is None or not consensus.inliers.any():
-        return _report(None, len(pairs))
     centre = np.median(obj.points, axis=0)
+    if consensus is None or not consensus.inliers.any():
+        return _report(None, len(pairs)) | gps_quantities(gps, None, obj.looked_at())
+    if gps is not None:
+        consensus = _by_gps(seen, consensus, gps, obj.looked_at())
     inliers = seen.subset(consensus.inliers)
     near = nearest(inliers, obj.looked_at(), settings.nearest_points)
     pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2, ROUNDS)
@@ -145,7 +160,8 @@ def align_landmarks(obj: Landmarks, scene: Landmarks, settings: AlignmentSetting
     consensus = replace(consensus, pose=pose)
     problem = rejection_reason(consensus, inliers, len(pairs), uncertainty, settings)
     centres = None if problem else localise(obj, scene, pairs, pose, MAX_ERROR_PX, seed)
-    return _report(Found(consensus, inliers, uncertainty, problem, centres, centre), len(pairs))
+    found = _report(Found(consensus, inliers, uncertainty, problem, centres, centre), len(pairs))
+    return found | gps_quantities(gps, None if problem else pose, obj.looked_at())
 
 
 def nearest(seen: Observations, place: Array, count: int) -> Observations:
@@ -163,7 +179,19 @@ def find_consensus(seen: Observations, seed: int) -> Consensus | None:
     others = seen.subset(error > 3 * MAX_ERROR_PX)
     other = _most_supported(others, seed)
     rival = 0 if other is None else int((match_errors(others, other) <= MAX_ERROR_PX).sum())
-    return Consensus(pose, error <= MAX_ERROR_PX, rival)
+    return Consensus(pose, error <= MAX_ERROR_PX, rival, other)
+
+
+def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array) -> Consensus:
+    """The consensus where GPS contradicts its rival, the rival where GPS contradicts the consensus only."""
+    if consensus.other is None or consensus.rival <= MAX_RIVAL_SHARE * consensus.inliers.sum():
+        return consensus
+    wrong, other_wrong = (gps.miss(pose, at) > CONTRADICTED for pose in (consensus.pose, consensus.other))
+    if wrong == other_wrong:
+        return consensus
+    pose = consensus.other if wrong else consensus.pose
+    print(f"of two poses, with {consensus.inliers.sum()} and {consensus.rival} matches, GPS settles one", flush=True)
+    return Consensus(pose, match_errors(seen, pose) <= MAX_ERROR_PX, 0)
 
 
 def _most_supported(seen: Observations, seed: int) -> Sim3 | None:

@@ -1,0 +1,123 @@
+"""Where the GPS of an object's photos puts it in a georeferenced scene: an estimate that no feature enters."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.registration.shared_features.landmarks import Landmarks
+from scenefuse.sfm.geodesy import LocalFrame, scene_frame
+from scenefuse.sfm.gravity import estimate_up
+from scenefuse.sfm.photos import gps_accuracies, gps_positions, read_photos
+from scenefuse.sfm.survey.placement import MIN_GPS_PHOTOS, GeoreferenceSettings, place_by_gps
+from scenefuse.stage import quantity, read_json
+from scenefuse.transforms import Array, Sim3
+
+# Errors of GPS drift slowly: so many photos that follow each other err alike.
+ERR_ALIKE = 5
+# A pose farther off than so many standard deviations is another one.
+CONTRADICTED = 4.0
+
+
+@dataclass(frozen=True)
+class GpsPose:
+    """The pose that GPS gives, and how well.
+
+    Heights take no part in what follows: those of two flights often have other zeros.
+
+    Attributes:
+        pose: scene_from_object.
+        photos: that it rests on.
+        turn_sd: standard deviation of log scale, and of the heading in radians.
+        shift_sd: of the place in the plane, scene units (metres).
+    """
+
+    pose: Sim3
+    photos: int
+    turn_sd: float
+    shift_sd: float
+
+    def differences(self, other: Sim3, at: Array) -> tuple[float, float, float]:
+        """Another pose's ratio of scales (log), heading in radians, and shift in the plane, at (3,) of the object."""
+        turn = other.rotation @ self.pose.rotation.T
+        heading = float(np.arctan2(turn[1, 0] - turn[0, 1], turn[0, 0] + turn[1, 1]))
+        shift = float(np.linalg.norm((other.apply(at) - self.pose.apply(at))[:2]))
+        return float(np.log(other.scale / self.pose.scale)), heading, shift
+
+    def miss(self, other: Sim3, at: Array) -> float:
+        """How far another pose is off, in standard deviations, by the worst of scale, heading and place."""
+        scale, heading, shift = self.differences(other, at)
+        return max(abs(scale) / self.turn_sd, abs(heading) / self.turn_sd, shift / self.shift_sd)
+
+
+def pose_by_gps(
+    obj: Landmarks, photos: Path | None, scene_json: Path | None, accuracy_m: float, seed: int
+) -> GpsPose | None:
+    """The similarity of the camera centres to their GPS positions; None where either side has too few, or they spread
+    too little beside their accuracy.
+
+    Args:
+        obj: the object's cameras.
+        photos: photos.json of the object.
+        scene_json: georeference.json of the scene.
+        accuracy_m: standard error of positions that state none.
+        seed: of RANSAC.
+    """
+    frame = None if scene_json is None else scene_frame(read_json(scene_json))
+    listed = [] if photos is None else read_photos(photos)
+    names, positions = gps_positions(listed)
+    known = [k for k, name in enumerate(names) if name in set(obj.photos)]
+    if not isinstance(frame, LocalFrame) or len(known) < MIN_GPS_PHOTOS:
+        return None
+    view = [obj.photos.index(names[k]) for k in known]
+    rotations = obj.cam_from_model[view, :, :3].transpose(0, 2, 1)
+    centres = -np.einsum("nij,nj->ni", rotations, obj.cam_from_model[view, :, 3])
+    target, sd_m = frame.apply(positions[known]), float(np.median(gps_accuracies(listed, accuracy_m)[known, 0]))
+    up = estimate_up(rotations, centres)[0]
+    placed = place_by_gps(centres, target, up, GeoreferenceSettings(True, accuracy_m), seed, sd_m)
+    if placed.status != "georeferenced":
+        return None
+    there = target[placed.inliers, :2]
+    off = placed.local_from_model.apply(centres[placed.inliers])[:, :2] - there
+    each = max(sd_m, float(np.sqrt((off**2).mean())))
+    extent = float(np.sqrt(((there - there.mean(0)) ** 2).sum()))
+    # The scene's own positions err as those of the object, and neither error is averaged out by more photos.
+    return GpsPose(
+        placed.local_from_model, len(there), each * np.sqrt(ERR_ALIKE) / max(extent, 1e-12), each * np.sqrt(2)
+    )
+
+
+def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> dict[str, Any]:
+    """What GPS says of the pose that was found, or of the place where none was; null where it is not known."""
+    scale = heading = shift = miss = place = None
+    notes = []
+    if gps is not None and at is not None:
+        place = gps.pose.apply(at)
+        about = f"the GPS of {gps.photos} of its photos"
+        if pose is None:
+            notes.append(
+                f"{about} says that it stands at ({place[0]:.1f}, {place[1]:.1f}) in the scene, give or take"
+                f" {gps.shift_sd:.2g}: click on it there (column fiducials)"
+            )
+        else:
+            scale, heading, shift = gps.differences(pose, at)
+            miss, heading = gps.miss(pose, at), float(np.degrees(heading))
+            if miss > CONTRADICTED:
+                notes.append(
+                    f"{about} contradicts the pose: {np.expm1(abs(scale)):.1%} of scale, {abs(heading):.1f} degrees and"
+                    f" {shift:.3g} in the plane apart, and GPS is known to {gps.turn_sd:.1%},"
+                    f" {np.degrees(gps.turn_sd):.1f} degrees and {gps.shift_sd:.2g}; see in before_after.png whether it"
+                    " is the object, or its like"
+                )
+    return {
+        "gps_photos": quantity(0 if gps is None else gps.photos, "1"),
+        "gps_place": quantity(place, "scene units"),
+        "gps_turn_sd": quantity(None if gps is None else gps.turn_sd, "log scale, radians"),
+        "gps_shift_sd": quantity(None if gps is None else gps.shift_sd, "scene units"),
+        "gps_scale_apart": quantity(scale, "log"),
+        "gps_heading_apart_deg": quantity(heading, "deg"),
+        "gps_shift_apart": quantity(shift, "scene units"),
+        "gps_miss": quantity(miss, "standard deviations"),
+        "notes": quantity(notes, ""),
+    }
