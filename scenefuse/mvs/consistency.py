@@ -4,12 +4,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from scenefuse.transforms import Array
 
 MOST_VIEWS = 64
 """Views that a view is compared with at most: what more photos cost then grows with them, not with their square."""
+
+POINTS_A_BLOCK = 4096
 
 
 @dataclass(frozen=True)
@@ -101,35 +104,51 @@ def compare(
         tolerance: largest difference of depth that agrees, unit of the frame.
         covered: (V, H, W) depth along z from which on a view sees nothing off its mask, where it is known.
     """
-    count = len(points)
-    agree, through, hidden, off_mask = (np.zeros(count, np.int32) for _ in range(4))
-    total = points.copy()
-    height, width = depths.shape[1:]
     compared = others(view, frame_from_cam)
-    for other in compared:
-        pose, k = frame_from_cam[other], intrinsics[other]
-        in_camera = (points - pose[:3, 3]) @ pose[:3, :3]
-        z = in_camera[:, 2]
-        safe = np.maximum(z, 1e-9)
-        x, y = in_camera[:, 0] / safe * k[0, 0] + k[0, 2], in_camera[:, 1] / safe * k[1, 1] + k[1, 2]
-        index = np.flatnonzero((z > 0) & (x >= 0) & (x < width) & (y >= 0) & (y < height))
-        column, row = x[index].astype(np.int64), y[index].astype(np.int64)
-        beside = ~masks[other, row, column]
-        off_mask[index] += beside if covered is None else beside & (z[index] < covered[other, row, column])
-        measured = depths[other, row, column].astype(np.float64)
-        index, column, row = (a[measured > 0] for a in (index, column, row))
-        measured = measured[measured > 0]
-        difference = z[index] - measured
-        through[index] += difference < -tolerance
-        hidden[index] += difference > tolerance
-        same = np.abs(difference) <= tolerance
-        agree[index] += same
-        # The other view's depth, taken along the ray through the point itself, not through the pixel's centre.
-        confirmed = index[same]
-        total[confirmed] += (
-            in_camera[confirmed] * (measured[same] / z[confirmed])[:, None] @ pose[:3, :3].T + pose[:3, 3]
-        )
+    counts, total = np.zeros((4, len(points)), np.int32), points.astype(np.float64)
+    known = np.zeros((0, 0, 0), np.float32) if covered is None else covered
+    cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64)
+    _compare(points.astype(np.float64), compared, depths, masks, known, *cameras, tolerance, counts, total)
+    agree, through, hidden, off_mask = counts
     return DepthAgreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(compared))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_cam, tolerance, counts, total):  # type: ignore[no-untyped-def]
+    """Add to counts (4, N) of `DepthAgreement` and to the sum (N, 3) of the points that agree.
+
+    A thread takes neighbouring points through one map after the other: what they look up stays in its cache.
+    """
+    height, width = depths.shape[1:]
+    for block in prange((len(points) + POINTS_A_BLOCK - 1) // POINTS_A_BLOCK):
+        for other in compared:
+            pose, k = frame_from_cam[other], intrinsics[other]
+            for n in range(block * POINTS_A_BLOCK, min((block + 1) * POINTS_A_BLOCK, len(points))):
+                dx, dy, dz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+                z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
+                if not z > 0:
+                    continue
+                x = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
+                y = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
+                u, v = x / z * k[0, 0] + k[0, 2], y / z * k[1, 1] + k[1, 2]
+                if not (u >= 0 and u < width and v >= 0 and v < height):
+                    continue
+                row, column = int(v), int(u)
+                if not masks[other, row, column] and (len(covered) == 0 or z < covered[other, row, column]):
+                    counts[3, n] += 1
+                measured = depths[other, row, column]
+                if not measured > 0:
+                    continue
+                if z - measured < -tolerance:
+                    counts[1, n] += 1
+                elif z - measured > tolerance:
+                    counts[2, n] += 1
+                else:
+                    counts[0, n] += 1
+                    # The other view's depth, taken along the ray through the point itself, not the pixel's centre.
+                    for axis in range(3):
+                        along = x * pose[axis, 0] + y * pose[axis, 1] + z * pose[axis, 2]
+                        total[n, axis] += along * measured / z + pose[axis, 3]
 
 
 def normals_from_depth(

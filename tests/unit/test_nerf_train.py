@@ -195,6 +195,34 @@ def test_depth_maps_confirm_each_other_and_give_normals(sphere):
     assert np.median((normals * truth).sum(1)[found]) > 0.99
 
 
+def test_comparing_depth_maps_is_what_it_says(sphere):
+    """Point by point, in plain Python, beside what comes out for all at once, with any number of threads."""
+    _, masks, k, poses, depths = sphere
+    rng = np.random.default_rng(0)
+    depths = (depths * rng.normal(1, 0.01, depths.shape)).astype(np.float32)
+    covered = rng.uniform(0.5, 1.5, depths.shape).astype(np.float32) * np.median(depths[depths > 0])
+    points = CENTER + rng.normal(0, 1, (400, 3)) * RADIUS
+    tolerance = 0.1 * RADIUS
+    found = compare(points, 1, depths, masks, k, poses, tolerance, covered)
+    for n, point in enumerate(points):
+        counts, agreeing = dict.fromkeys(("agree", "through", "hidden", "off_mask"), 0), [point]
+        for other in (v for v in range(len(depths)) if v != 1):
+            in_camera = np.linalg.inv(poses[other])[:3] @ [*point, 1]
+            u, v, z = (*(k[other] @ in_camera)[:2] / in_camera[2], in_camera[2])
+            if z <= 0 or not (0 <= u < masks.shape[2] and 0 <= v < masks.shape[1]):
+                continue
+            at = other, int(v), int(u)
+            counts["off_mask"] += not masks[at] and z < covered[at]
+            if depths[at] > 0:
+                side = "through" if z < depths[at] - tolerance else "hidden" if z > depths[at] + tolerance else "agree"
+                counts[side] += 1
+                if side == "agree":
+                    agreeing.append(poses[other][:3] @ [*in_camera * depths[at] / z, 1])
+        assert counts == {name: getattr(found, name)[n] for name in counts}
+        assert found.mean[n] == pytest.approx(np.mean(agreeing, axis=0), abs=1e-9)
+    assert min(getattr(found, name).sum() for name in counts) > 20
+
+
 def test_quality_measures():
     rng = torch.Generator().manual_seed(0)
     picture, everything = torch.rand(20, 20, 3, generator=rng), torch.ones(20, 20, dtype=torch.bool)

@@ -23,7 +23,7 @@ rule train_object_nerf:
         "results/benchmarks/train_object_nerf/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 1
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 8000 * attempt,
         runtime=lambda wildcards, attempt: 480 * attempt,
@@ -90,7 +90,7 @@ rule make_object_cloud:
         "results/benchmarks/make_object_cloud/{object}.tsv"
     conda:
         "../../envs/training.yaml"
-    threads: 1
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
