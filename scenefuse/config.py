@@ -123,7 +123,7 @@ SECTIONS: dict[str, list[Any]] = {
     "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
     "demo.clicks": [PromptSettings(inside=3, box=True)],
     "scene": [ChunkSettings()],
-    "scene.features": [FeatureSettings(first_octave=0)],
+    "scene.features": [FeatureSettings()],
     "scene.matches": [MatchSettings()],
     "scene.sparse": [MappingSettings(min_registered_share=0.8)],
     "scene.georegister": [GeoreferenceSettings()],

@@ -76,7 +76,8 @@ def make_masks(
     Raises:
         StageError: prompts, weights or masks are missing or wrong; too few good masks.
     """
-    cv2.setNumThreads(threads())
+    # On several threads GrabCut does not repeat to the last pixel; the network has them all.
+    cv2.setNumThreads(1)
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
     made, found, by = _make(inputs, photos, settings, seed)

@@ -49,6 +49,7 @@ rule make_masks:
         "results/benchmarks/make_masks/{object}.tsv"
     conda:
         "../../envs/reconstruction.yaml"
+    threads: OBJECT_THREADS
     resources:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 120 * attempt,
