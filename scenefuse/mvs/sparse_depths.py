@@ -12,6 +12,10 @@ LONGEST_SIDE = 0.06
 """Of a triangle between sparse points, over the photo's longer side; farther apart they need not be one surface."""
 FROM_MASK_PX = 2
 """Sparse points off the mask, but this near to it, may be the object's: they are left out."""
+LEAST_ON, SURE = 3, 0.8
+"""Photos that have a sparse point of the object on their masks, and their share of all that observe it."""
+BEFORE = 0.02
+"""What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge."""
 
 
 def sparse_depths(views: Views) -> NDArray[np.float32]:
@@ -19,22 +23,49 @@ def sparse_depths(views: Views) -> NDArray[np.float32]:
     beyond a photo that is smaller than its picture minus infinity: whatever lies there is hidden.
 
     The sparse points that a photo observes span triangles in it, those on its mask and those off it by themselves, over
-    which inverse depth is linear.
+    which inverse depth is linear. A point of the object that a photo has off its mask, and does not observe, is hidden
+    by something just before it.
     """
-    return np.stack([_depths_of(views, index) for index in range(len(views.names))])
+    own = _own_points(views)
+    return np.stack([_depths_of(views, index, own) for index in range(len(views.names))])
 
 
-def _depths_of(views: Views, index: int) -> NDArray[np.float32]:
+def _own_points(views: Views) -> NDArray[np.bool_]:
+    """(P,) which sparse points are the object's: on the masks of three photos, and of nearly all that observe them."""
+    on, seen = np.zeros(len(views.sparse), np.int64), np.zeros(len(views.sparse), np.int64)
+    for index in range(len(views.names)):
+        rows, on_mask, _ = _beside_mask(views, index, views.tracks[index])[:3]
+        seen[rows] += 1
+        on[rows[on_mask]] += 1
+    return (on >= LEAST_ON) & (on >= SURE * seen)
+
+
+def _beside_mask(
+    views: Views, index: int, rows: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_], Array, Array]:
+    """Of sparse points, the rows of those in a photo's frame, which are on its mask, which clearly off it, their pixels
+    (N, 2) and depths along z."""
+    view = views.view(index)
+    mask = views.masks[index, : view.height, : view.width]
+    shown, pixels, depth = view.visible(views.sparse[rows])
+    size, at = 2 * FROM_MASK_PX + 1, (pixels[:, 1], pixels[:, 0])
+    off = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))[at] == 0
+    return rows[shown], mask[at], off, view.project(views.sparse[rows[shown]])[0], depth
+
+
+def _depths_of(views: Views, index: int, own: NDArray[np.bool_]) -> NDArray[np.float32]:
     """The map (H, W) of one photo."""
     view = views.view(index)
     mask = views.masks[index, : view.height, : view.width]
-    points = views.sparse[views.tracks[index]]
-    rows, pixels, depth = view.visible(points)
-    size = 2 * FROM_MASK_PX + 1
-    at = pixels[:, 1], pixels[:, 0]
-    on, off = mask[at], cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))[at] == 0
-    exact = view.project(points[rows])[0]
-    of_object, beside = (_interpolated(exact[part], 1 / depth[part], mask.shape) for part in (on, off))
+    _, on, off, exact, depth = _beside_mask(views, index, views.tracks[index])
+    unseen = np.setdiff1d(np.flatnonzero(own), views.tracks[index])
+    _, _, hidden, there, behind = _beside_mask(views, index, unseen)
+    of_object = _interpolated(exact[on], 1 / depth[on], mask.shape)
+    beside = _interpolated(
+        np.concatenate([exact[off], there[hidden]]),
+        1 / np.concatenate([depth[off], (1 - BEFORE) * behind[hidden]]),
+        mask.shape,
+    )
     nearness = np.where(mask, of_object, beside)
     whole = np.full(views.masks.shape[1:], -np.inf, np.float32)
     whole[: view.height, : view.width] = np.where(nearness <= 0, np.inf, 1 / np.maximum(nearness, 1e-12))

@@ -108,6 +108,37 @@ def test_points_of_the_feet_may_lie_beside_the_masks_of_photos_that_cannot_see_t
     assert (compare(*given, sparse_depths(views)).off_mask > 5).all()
 
 
+def test_what_hides_the_object_without_points_of_its_own_is_told_by_those_of_the_object(figure):
+    """A bush before the lower half of the figure, in six photos; nothing of it is triangulated."""
+    views, _ = figure
+    rng = np.random.default_rng(1)
+    points = rng.uniform(*FIGURE, (3000, 3))
+    side = rng.integers(0, 2, len(points))
+    points[np.arange(len(points)), side] = FIGURE[rng.integers(0, 2, len(points)), side]
+    bush = np.arange(len(views.names)) % 3 == 0
+    mattes, tracks = views.mattes.copy(), []
+    for k in range(len(views.names)):
+        rows, pixels, depth = views.view(k).visible(points)
+        if bush[k]:
+            mattes[k, int(views.view(k).project(np.array([[0, 0, 0.5]]))[0][0, 1]) :] = 0
+        pose = views.object_from_cam[k]
+        rays = points[rows] - pose[:3, 3]
+        front = enter(FIGURE, pose[:3, 3], rays) > 1 - 1e-6
+        tracks.append(rows[front & (mattes[k, pixels[:, 1], pixels[:, 0]] > 0)])
+    hiding = replace(views, mattes=mattes, sparse=points, tracks=tracks)
+    assert hull_of(hiding, None)[2][:, 2].min() > 0.35
+    volume, outlines, cells = hull_of(hiding, sparse_depths(hiding))
+    assert cells[:, 2].min() < 0.1 and np.abs(cells[:, :2]).max() < 0.45
+    hidden = hidden_pixels(volume, outlines).any((1, 2))
+    assert hidden[bush].all()
+    # Off the object, and before it, the photos still say that nothing is there.
+    air, before = np.array([[0.9, 0.0, 0.3]]), 0.5 * views.object_from_cam[:1, :3, 3]
+    nothing = np.zeros(views.masks.shape, np.float32)
+    for place in (air, before):
+        given = place, 1, nothing, hiding.masks, views.intrinsics, views.object_from_cam, 0.01, sparse_depths(hiding)
+        assert compare(*given).off_mask >= compare(*given[:-1]).off_mask - 1
+
+
 def test_too_few_points_beside_the_object_say_nothing(figure):
     views, _ = figure
     alone = replace(views, sparse=views.sparse[:2], tracks=[np.arange(2)] * len(views.names))
