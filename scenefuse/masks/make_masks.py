@@ -136,10 +136,10 @@ def _network(settings: MaskSettings) -> tuple[Sam2 | None, dict[str, Any]]:
     checkpoint = Path(settings.sam2_checkpoint) if settings.sam2_checkpoint else None
     if settings.method == "grabcut":
         return None, {"method": quantity("grabcut", "")}
-    if settings.method == "auto" and checkpoint is None and (why := why_unavailable(encoder)):
+    if settings.method == "auto" and checkpoint is None and (why := why_unavailable(encoder, decoder)):
         fallback = (
-            f"masks by GrabCut, since SAM 2's weights could not be fetched ({why}); with a network, run snakemake"
-            " --forcerun fetch_sam2_weights"
+            f"masks by GrabCut, since SAM 2's weights could not be fetched ({why}); delete {encoder.parent} and run"
+            " again to try once more"
         )
         print(fallback, flush=True)
         return None, {"method": quantity("grabcut", ""), "fallback": quantity(fallback, "")}

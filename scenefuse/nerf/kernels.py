@@ -1,8 +1,8 @@
 """CPU kernels in Numba for the hash grid and ray marching.
 
-Each one has a plain PyTorch twin beside its caller, which tests compare against and which runs on other devices or
-where Numba is not installed. Loops are arranged so that no two threads write to one place: results do not depend on
-the number of threads. Rows of large levels are fetched ahead of their use, since the processor cannot guess them.
+Each one has a plain PyTorch twin beside its caller, which tests compare against and which runs on other devices.
+Loops are arranged so that no two threads write to one place: results do not depend on the number of threads. Rows of
+large levels are fetched ahead of their use, since the processor cannot guess them.
 """
 
 from typing import Any

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from scenefuse.pick.clicks import Rows
 from scenefuse.pick.pictures import Picture, at_most, read_upright
-from scenefuse.stage import StageError, atomic_directory, threads
+from scenefuse.stage import StageError, scratch_directory, threads
 
 if TYPE_CHECKING:
     from scenefuse.masks.clicked.clicks import PhotoClicks
@@ -50,6 +50,7 @@ class Segmenter:
 
     Attributes:
         method: what segments, for a person; "" until it is loaded.
+        loading: what is being done until then.
         trouble: why it is not what the settings ask for, or why there is nothing; "" where all is well.
     """
 
@@ -67,6 +68,7 @@ class Segmenter:
         self._busy = threading.Lock()
         self._waiting, self._asked_at = 0, -IDLE_S
         self.method = self.trouble = ""
+        self.loading = "Loading the network ..."
         self._closed = False
 
     def load(self) -> None:
@@ -80,23 +82,40 @@ class Segmenter:
         with self._busy:
             if self.method:
                 return
-            if settings["method"] != "grabcut":
+            if settings["method"] in ("auto", "sam2"):
                 from scenefuse.masks.sam2 import ask_sam2, load_network
+                from scenefuse.masks.sam2_weights import UnavailableError
 
                 checkpoint = settings["sam2_checkpoint"]
                 encoder, decoder = Path(settings["sam2_encoder"]), Path(settings["sam2_decoder"])
                 try:
                     if checkpoint is None:
-                        _fetch_once({encoder, decoder})
+                        self._fetch_once({encoder, decoder})
                     network, _ = load_network(encoder, decoder, checkpoint and Path(checkpoint), threads())
                     self._network = _Remembering(network)
                     self._ask, self.method = partial(ask_sam2, self._network), "SAM 2"
                     return
-                except (StageError, OSError) as error:
+                except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
             from scenefuse.masks.segmentation import MaskSettings
 
             self._ask, self.method = partial(ask_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
+
+    def _fetch_once(self, paths: set[Path]) -> None:
+        """Put the shipped weights to their place, if these are they and nothing has tried it yet, neither meanwhile.
+
+        Raises:
+            UnavailableError, OSError: they cannot be fetched or written; nothing is left behind then.
+        """
+        from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, download_weights
+
+        place = Path(WEIGHTS)
+        if paths == {Path(ENCODER), Path(DECODER)} and not place.exists():
+            self.loading = "Fetching SAM 2's weights (184 MB, once) ..."
+            with scratch_directory(place) as folder:
+                download_weights(folder)
+                if not place.exists():
+                    folder.rename(place)
 
     def compute_ahead(self, wanted: Callable[[], list[Picture]]) -> None:
         """Compute features until closed, in the order wanted; run in a thread of its own.
@@ -168,19 +187,6 @@ class Segmenter:
             while len(self._photos) > KEPT:
                 self._photos.popitem(last=False)
         return self._photos[picture.name]
-
-
-def _fetch_once(paths: set[Path]) -> None:
-    """Put the shipped weights to their place, if these are they and the workflow has not tried it yet.
-
-    Raises:
-        OSError: they cannot be fetched; nothing is left behind then.
-    """
-    from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, download_weights
-
-    if paths == {Path(ENCODER), Path(DECODER)} and not Path(WEIGHTS).exists():
-        with atomic_directory(Path(WEIGHTS)) as folder:
-            download_weights(folder)
 
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":

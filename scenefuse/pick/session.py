@@ -101,7 +101,8 @@ class Session:
         """Begin the work in the background: thumbnails, and features of the photos that come first."""
         threading.Thread(target=self._make_thumbnails).start()
         if self.boards[0].document.kind == "labels":
-            threading.Thread(target=self.segmenter.compute_ahead, args=(self._ahead,)).start()
+            # A download or a network at work does not keep the page from ending.
+            threading.Thread(target=self.segmenter.compute_ahead, args=(self._ahead,), daemon=True).start()
 
     def close(self) -> Iterator[str]:
         """End the background's work and keep what is not saved; a sentence for each table that is not."""

@@ -58,8 +58,7 @@ class SidePanel:
     def show_note(self) -> None:
         """Say what makes the mask, and what is wrong with it."""
         segmenter = self._page.session.segmenter
-        loading = "Loading the network (the first time, 184 MB are fetched) ..."
-        method = f"Mask by {segmenter.method}." if segmenter.method else loading
+        method = f"Mask by {segmenter.method}." if segmenter.method else segmenter.loading
         self._note.set_text(f"{method} {self._page.mask_note}")
 
     def _fill_carried(self) -> None:

@@ -1,6 +1,7 @@
 """What each part of the four stages is worth: the demo's objects again without it, over seeds, against the truth.
 
-make demo; then python tests/benchmarks/object_ablation.py --results results --objects house --seeds 3
+make demo; then
+python tests/benchmarks/object_ablation.py --results results --objects house --seeds 3 --settings config/demo.yaml
 
 The same command goes on after it was stopped: runs that stand in bench/object_ablation.tsv are not made again.
 """

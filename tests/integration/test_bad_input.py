@@ -39,6 +39,25 @@ def test_an_object_in_no_scene_ends_with_its_cloud(project, snakemake, refused):
     assert "objects.tsv: object 'shed' lies in no scene" in told and "name its scene in the column scene" in told
 
 
+def test_weights_are_fetched_only_where_the_masks_may_need_them(project, snakemake):
+    project.photos("close")
+    project.scenes, project.objects = "scene\tphotos\n", HEADER + "shed\t\tclose\t\tprompts.tsv\t\t\n"
+    (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t1.jpg\t20\t20\n")
+    (project.path / "own.ort").touch()
+
+    def fetches(**masks):
+        project.config["object"] = {"masks": masks}
+        result = snakemake(project.path, "-n", "results/objects/shed/masks.png", config=project.write())
+        assert result.returncode == 0, result.stdout
+        return "fetch_sam2_weights" in planned(result.stdout)
+
+    assert fetches() and fetches(method="sam2") and fetches(sam2_encoder="own.ort")
+    assert not fetches(method="grabcut") and not fetches(sam2_encoder="own.ort", sam2_decoder="own.ort")
+    # As the clicking page leaves them.
+    (project.path / "results/weights/sam2").mkdir(parents=True)
+    assert not fetches()
+
+
 def test_missing_photo_folder(refused):
     assert "scenes.tsv, scene 'yard': the photo folder flight does not exist" in refused(
         "-n", "results/scenes/yard/photos.json"

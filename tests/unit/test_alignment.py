@@ -183,7 +183,7 @@ def test_another_place_is_not_found(pair, tmp_path):
     assert value(found, "found") is False and "are needed" in value(found, "reason")
 
 
-def positions(folder, shift=(0, 0, 0), noise_m=0.3):
+def positions(folder, shift=(0, 0, 0), noise_m=0.3, scene_sd_m=0.3):
     """The files that say where the photos of an orbit of the world's middle were taken, moved by `shift`."""
     frame = LocalFrame(47.5, 8.5, 400.0)
     centres = np.array([centre for centre, _ in ring(6, 2.5, 10)]) + shift
@@ -196,7 +196,13 @@ def positions(folder, shift=(0, 0, 0), noise_m=0.3):
     write_json(folder / "photos.json", {"photos": [asdict(photo) for photo in listed]})
     origin = {"origin_latitude_deg": 47.5, "origin_longitude_deg": 8.5, "origin_altitude_m": 400.0}
     write_json(folder / "scene.json", {name: quantity(number, "") for name, number in origin.items()})
-    return {"object_photos": folder / "photos.json", "scene_json": folder / "scene.json"}
+    flight = [Photo("a.jpg", 800, 600, "", 47.5, 8.5, 430.0, horizontal_sd_m=scene_sd_m)]
+    write_json(folder / "flight.json", {"photos": [asdict(photo) for photo in flight]})
+    return {
+        "object_photos": folder / "photos.json",
+        "scene_photos": folder / "flight.json",
+        "scene_json": folder / "scene.json",
+    }
 
 
 def test_gps_says_the_same(pair, found, tmp_path):
@@ -214,10 +220,17 @@ def test_gps_that_contradicts_the_pose_is_a_note(pair, found, tmp_path):
     assert "GPS of 10 of its photos contradicts the pose" in value(beside, "notes")[0]
 
 
+def test_exact_close_ups_do_not_contradict_a_pose_in_a_scene_of_ordinary_gps(pair, tmp_path):
+    exact = positions(tmp_path, (2, 1, 0), noise_m=0.02, scene_sd_m=3.0)
+    beside = aligned(tmp_path, *pair, **exact)
+    assert value(beside, "gps_miss") < 3 and value(beside, "notes") == []
+    assert value(beside, "gps_shift_apart") == pytest.approx(5**0.5, abs=0.1)
+
+
 def test_gps_says_where_to_click_on_an_object_that_shares_nothing(pair, tmp_path):
     elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
     lost = aligned(tmp_path, pair[0], elsewhere, **positions(tmp_path, (9, 0, 0)))
-    assert value(lost, "found") is False and "stands at (" in value(lost, "notes")[0]
+    assert value(lost, "found") is False and "m east and" in value(lost, "notes")[0]
     assert value(lost, "gps_place")[0] == pytest.approx(9, abs=0.5)
 
 
@@ -232,6 +245,7 @@ def test_gps_tells_an_object_from_its_twin(tmp_path, shift):
     found = aligned(tmp_path, obj, scene, **positions(tmp_path, (shift, 0, 0)))
     place = Sim3.from_matrix(np.array(value(found, "scene_from_object"))).apply(OBJECT_FROM_WORLD.apply(np.zeros(3)))
     assert value(found, "found") is True and np.linalg.norm(place - [shift, 0, 0]) < 0.1
+    assert value(found, "settled_by_gps") is True and "GPS tells it from its like" in value(found, "reason")
 
 
 def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):

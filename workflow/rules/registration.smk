@@ -22,6 +22,7 @@ rule align_models:
         object_photos="results/objects/{object}/photos.json",
         scene_sparse=in_scene("georeferenced"),
         scene_json=in_scene("georeference.json"),
+        scene_photos=in_scene("photos.json"),
         scene_features=in_scene("features.db"),
     output:
         "results/objects/{object}/alignment.json",
@@ -45,7 +46,7 @@ rule align_models:
     shell:
         "exec python {params.script} --object-sparse {input.object_sparse} --object-features {input.object_features}"
         " --object-photos {input.object_photos} --scene-sparse {input.scene_sparse} --scene-features {input.scene_features}"
-        " --scene-json {input.scene_json} --report {output}"
+        " --scene-photos {input.scene_photos} --scene-json {input.scene_json} --report {output}"
         " --seed {params.seed} {params.options} &> {log}"
 
 

@@ -35,6 +35,8 @@ MAX_ERROR_PX = 6.0
 ROUNDS = 20
 # The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
 MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
+# Places alike of which GPS may settle one.
+MOST_ALIKE = 10
 # Draws of photos and points for the standard deviations.
 BOOTSTRAP_DRAWS = 200
 PER_UNIT = "scene units per object unit"
@@ -54,7 +56,7 @@ class AlignmentSettings:
     """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
     bent against each other."""
     gps_accuracy_m: float = 3.0
-    """Standard error of GPS positions of the object's photos that state none."""
+    """Standard error of the GPS positions of either side that state none, when they are compared."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +68,14 @@ class Consensus:
         inliers: (M,) bool over the matches.
         rival: inliers of the best pose among the rest.
         other: that pose, or None.
+        settled_by_gps: whether GPS chose among several.
     """
 
     pose: Sim3
     inliers: NDArray[np.bool_]
     rival: int
     other: Sim3 | None = None
+    settled_by_gps: bool = False
 
 
 @dataclass(frozen=True)
@@ -105,6 +109,7 @@ def align_models(
     seed: int,
     settings: AlignmentSettings,
     object_photos: Path | None = None,
+    scene_photos: Path | None = None,
     scene_json: Path | None = None,
 ) -> None:
     """Find scene_from_object from features that the object's photos share with the scene's (method R14).
@@ -124,6 +129,7 @@ def align_models(
         seed: of all random choices.
         settings: see AlignmentSettings.
         object_photos: JSON list of the object's photos with their GPS positions, if any.
+        scene_photos: the same of the scene, for their accuracy.
         scene_json: JSON of the georeferencing stage, for the scene's origin.
 
     Raises:
@@ -132,7 +138,7 @@ def align_models(
     begin = time.perf_counter()
     obj = read_landmarks(object_sparse, object_features)
     scene = read_landmarks(scene_sparse, scene_features)
-    gps = pose_by_gps(obj, object_photos, scene_json, settings.gps_accuracy_m, seed)
+    gps = pose_by_gps(obj, scene, object_photos, scene_photos, scene_json, settings.gps_accuracy_m, seed)
     content = align_landmarks(obj, scene, settings, seed, gps)
     print(f"{'found' if content['found']['value'] else 'not found'}: {content['reason']['value']}", flush=True)
     write_json(report, {**content, "seconds": quantity(time.perf_counter() - begin, "s")})
@@ -183,15 +189,19 @@ def find_consensus(seen: Observations, seed: int) -> Consensus | None:
 
 
 def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array) -> Consensus:
-    """The consensus where GPS contradicts its rival, the rival where GPS contradicts the consensus only."""
-    if consensus.other is None or consensus.rival <= MAX_RIVAL_SHARE * consensus.inliers.sum():
+    """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
+    poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
+    other, rival = consensus.other, consensus.rival
+    while other is not None and rival > least and len(poses) < MOST_ALIKE:
+        poses.append(other)
+        rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
+        other = _most_supported(rest, 0)
+        rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
+    allowed = [pose for pose in poses if gps.miss(pose, at) <= CONTRADICTED]
+    if len(poses) == 1 or len(allowed) != 1 or len(poses) == MOST_ALIKE:
         return consensus
-    wrong, other_wrong = (gps.miss(pose, at) > CONTRADICTED for pose in (consensus.pose, consensus.other))
-    if wrong == other_wrong:
-        return consensus
-    pose = consensus.other if wrong else consensus.pose
-    print(f"of two poses, with {consensus.inliers.sum()} and {consensus.rival} matches, GPS settles one", flush=True)
-    return Consensus(pose, match_errors(seen, pose) <= MAX_ERROR_PX, 0)
+    print(f"GPS settles which of {len(poses)} poses it is", flush=True)
+    return Consensus(allowed[0], match_errors(seen, allowed[0]) <= MAX_ERROR_PX, 0, settled_by_gps=True)
 
 
 def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
@@ -262,14 +272,16 @@ def _report(found: Found | None, matches: int) -> dict[str, Any]:
     """The stage JSON; what was not found or not looked for is null."""
     if found is None:
         problem: str | None = f"{matches} points of the models look alike, and no three of them fit one similarity"
-        count, photos, rival, error, uncertainty, pose = 0, (0, 0), 0, None, None, None
+        count, photos, rival, error, uncertainty, pose, settled = 0, (0, 0), 0, None, None, None, False
     else:
         problem, consensus, inliers = found.problem, found.consensus, found.inliers
         count, photos, rival, uncertainty = len(inliers.x), inliers.photos, consensus.rival, found.uncertainty
+        settled = consensus.settled_by_gps
         error = float(np.sqrt((match_errors(inliers, consensus.pose) ** 2).mean())) if count else None
         pose = None if problem else consensus.pose
     words = (
         f"{count} of {matches} matched points agree, in {photos[0]} photos of the object and {photos[1]} of the scene"
+        + ("; GPS tells it from its like" if settled else "")
     )
     return {
         "found": quantity(problem is None, ""),
@@ -280,6 +292,7 @@ def _report(found: Found | None, matches: int) -> dict[str, Any]:
         "matches": quantity(matches, "1"),
         "inlier_share": quantity(count / matches if matches else 0.0, "1"),
         "rival_points": quantity(rival, "1"),
+        "settled_by_gps": quantity(settled, ""),
         "object_photos": quantity(photos[0], "1"),
         "scene_photos": quantity(photos[1], "1"),
         "reprojection_px": quantity(error, "px"),

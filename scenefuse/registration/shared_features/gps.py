@@ -30,7 +30,7 @@ class GpsPose:
         pose: scene_from_object.
         photos: that it rests on.
         turn_sd: standard deviation of log scale, and of the heading in radians.
-        shift_sd: of the place in the plane, scene units (metres).
+        shift_sd: of the place in the plane, metres (the scene's unit).
     """
 
     pose: Sim3
@@ -52,14 +52,22 @@ class GpsPose:
 
 
 def pose_by_gps(
-    obj: Landmarks, photos: Path | None, scene_json: Path | None, accuracy_m: float, seed: int
+    obj: Landmarks,
+    scene: Landmarks,
+    photos: Path | None,
+    scene_photos: Path | None,
+    scene_json: Path | None,
+    accuracy_m: float,
+    seed: int,
 ) -> GpsPose | None:
     """The similarity of the camera centres to their GPS positions; None where either side has too few, or they spread
     too little beside their accuracy.
 
     Args:
         obj: the object's cameras.
+        scene: the scene's, in metres.
         photos: photos.json of the object.
+        scene_photos: photos.json of the scene.
         scene_json: georeference.json of the scene.
         accuracy_m: standard error of positions that state none.
         seed: of RANSAC.
@@ -67,12 +75,11 @@ def pose_by_gps(
     frame = None if scene_json is None else scene_frame(read_json(scene_json))
     listed = [] if photos is None else read_photos(photos)
     names, positions = gps_positions(listed)
-    known = [k for k, name in enumerate(names) if name in set(obj.photos)]
+    row_of = {name: row for row, name in enumerate(obj.photos)}
+    known = [k for k, name in enumerate(names) if name in row_of]
     if not isinstance(frame, LocalFrame) or len(known) < MIN_GPS_PHOTOS:
         return None
-    view = [obj.photos.index(names[k]) for k in known]
-    rotations = obj.cam_from_model[view, :, :3].transpose(0, 2, 1)
-    centres = -np.einsum("nij,nj->ni", rotations, obj.cam_from_model[view, :, 3])
+    rotations, centres = (part[[row_of[names[k]] for k in known]] for part in _cameras(obj))
     target, sd_m = frame.apply(positions[known]), float(np.median(gps_accuracies(listed, accuracy_m)[known, 0]))
     up = estimate_up(rotations, centres)[0]
     placed = place_by_gps(centres, target, up, GeoreferenceSettings(True, accuracy_m), seed, sd_m)
@@ -81,11 +88,28 @@ def pose_by_gps(
     there = target[placed.inliers, :2]
     off = placed.local_from_model.apply(centres[placed.inliers])[:, :2] - there
     each = max(sd_m, float(np.sqrt((off**2).mean())))
-    extent = float(np.sqrt(((there - there.mean(0)) ** 2).sum()))
-    # The scene's own positions err as those of the object, and neither error is averaged out by more photos.
-    return GpsPose(
-        placed.local_from_model, len(there), each * np.sqrt(ERR_ALIKE) / max(extent, 1e-12), each * np.sqrt(2)
-    )
+    of_scene = _accuracy_of(scene_photos, accuracy_m)
+    turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(ERR_ALIKE)
+    # What all positions of a flight have in common is not averaged out by more photos.
+    return GpsPose(placed.local_from_model, len(there), float(turn), float(np.hypot(each, of_scene)))
+
+
+def _cameras(landmarks: Landmarks) -> tuple[Array, Array]:
+    """World-from-camera rotations (V, 3, 3) and centres (V, 3) of a model's photos."""
+    rotations = landmarks.cam_from_model[:, :, :3].transpose(0, 2, 1)
+    return rotations, -np.einsum("nij,nj->ni", rotations, landmarks.cam_from_model[:, :, 3])
+
+
+def _extent(points: Array) -> float:
+    """Root of the summed squared distances of points (N, 2) from their mean."""
+    return max(float(np.sqrt(((points - points.mean(0)) ** 2).sum())), 1e-12)
+
+
+def _accuracy_of(photos: Path | None, otherwise_m: float) -> float:
+    """Standard error of a side's positions, in metres; also where control points placed it: GPS need not share its
+    datum."""
+    stated = gps_accuracies([] if photos is None else read_photos(photos), otherwise_m)
+    return float(np.median(stated[:, 0])) if len(stated) else otherwise_m
 
 
 def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> dict[str, Any]:
@@ -97,8 +121,8 @@ def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> 
         about = f"the GPS of {gps.photos} of its photos"
         if pose is None:
             notes.append(
-                f"{about} says that it stands at ({place[0]:.1f}, {place[1]:.1f}) in the scene, give or take"
-                f" {gps.shift_sd:.2g}: click on it there (column fiducials)"
+                f"{about} says that it stands {place[0]:.1f} m east and {place[1]:.1f} m north of the scene's"
+                f" origin, give or take {gps.shift_sd:.1f} m: click on it there (column fiducials)"
             )
         else:
             scale, heading, shift = gps.differences(pose, at)
@@ -106,18 +130,18 @@ def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> 
             if miss > CONTRADICTED:
                 notes.append(
                     f"{about} contradicts the pose: {np.expm1(abs(scale)):.1%} of scale, {abs(heading):.1f} degrees and"
-                    f" {shift:.3g} in the plane apart, and GPS is known to {gps.turn_sd:.1%},"
-                    f" {np.degrees(gps.turn_sd):.1f} degrees and {gps.shift_sd:.2g}; see in before_after.png whether it"
+                    f" {shift:.1f} m in the plane apart, and GPS is known to {gps.turn_sd:.1%},"
+                    f" {np.degrees(gps.turn_sd):.1f} degrees and {gps.shift_sd:.1f} m; see in before_after.png if it"
                     " is the object, or its like"
                 )
     return {
         "gps_photos": quantity(0 if gps is None else gps.photos, "1"),
-        "gps_place": quantity(place, "scene units"),
+        "gps_place": quantity(place, "m"),
         "gps_turn_sd": quantity(None if gps is None else gps.turn_sd, "log scale, radians"),
-        "gps_shift_sd": quantity(None if gps is None else gps.shift_sd, "scene units"),
+        "gps_shift_sd": quantity(None if gps is None else gps.shift_sd, "m"),
         "gps_scale_apart": quantity(scale, "log"),
         "gps_heading_apart_deg": quantity(heading, "deg"),
-        "gps_shift_apart": quantity(shift, "scene units"),
+        "gps_shift_apart": quantity(shift, "m"),
         "gps_miss": quantity(miss, "standard deviations"),
         "notes": quantity(notes, ""),
     }
