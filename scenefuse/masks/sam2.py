@@ -274,10 +274,11 @@ def check_weights(path: Path, expected_sha256: str, shipped: bool) -> str:
         StageError: no such file, or another one at the shipped path.
     """
     if not path.is_file():
+        why = why_unavailable(path, path)
+        advice = "have rule fetch_sam2_weights fetch them" if shipped else "correct the path"
         raise StageError(
-            f"the SAM 2 weights {path} do not exist ({why_unavailable(path, path) or 'never fetched'}); delete"
-            f" {path.parent} and run again to fetch the shipped ones, correct the path, or set object.masks.method:"
-            " grabcut"
+            f"the SAM 2 weights {path} do not exist{why and f' ({why})'};"
+            f" {f'delete {path.parent} and run again' if why else advice}, or set object.masks.method: grabcut"
         )
     found = sha256(path)
     if found == expected_sha256:

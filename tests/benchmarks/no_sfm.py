@@ -1,7 +1,7 @@
 """The demo's objects without any structure from motion: poses, stages 1 to 4 and the cloud from frames and masks.
 
 snakemake --configfile config/demo.yaml config/examples/ideal_camera.yaml --cores 2
-PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --out results/bench/no_sfm
+PYTHONPATH=. python tests/benchmarks/no_sfm.py --results results --settings config/demo.yaml --out results/bench/no_sfm
 
 Without SfM nothing calibrates a lens, so the demo has to be the one of the ideal camera.
 Taken from a finished demo are the frames and, as a person's own, the masks. The focal length is the one in the photos'

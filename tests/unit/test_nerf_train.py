@@ -196,7 +196,7 @@ def test_depth_maps_confirm_each_other_and_give_normals(sphere):
 
 
 def test_comparing_depth_maps_is_what_it_says(sphere):
-    """Point by point, in plain Python, beside what comes out for all at once, with any number of threads."""
+    """Point by point, in plain Python, beside what comes out for all at once."""
     _, masks, k, poses, depths = sphere
     rng = np.random.default_rng(0)
     depths = (depths * rng.normal(1, 0.01, depths.shape)).astype(np.float32)

@@ -156,7 +156,7 @@ def align_landmarks(
     if consensus is None or not consensus.inliers.any():
         return _report(None, len(pairs)) | gps_quantities(gps, None, obj.looked_at())
     if gps is not None:
-        consensus = _by_gps(seen, consensus, gps, obj.looked_at())
+        consensus = _by_gps(seen, consensus, gps, obj.looked_at(), seed)
     inliers = seen.subset(consensus.inliers)
     near = nearest(inliers, obj.looked_at(), settings.nearest_points)
     pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2, ROUNDS)
@@ -188,14 +188,14 @@ def find_consensus(seen: Observations, seed: int) -> Consensus | None:
     return Consensus(pose, error <= MAX_ERROR_PX, rival, other)
 
 
-def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array) -> Consensus:
+def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, seed: int) -> Consensus:
     """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
     poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
     other, rival = consensus.other, consensus.rival
     while other is not None and rival > least and len(poses) < MOST_ALIKE:
         poses.append(other)
         rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
-        other = _most_supported(rest, 0)
+        other = _most_supported(rest, seed)
         rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
     allowed = [pose for pose in poses if gps.miss(pose, at) <= CONTRADICTED]
     if len(poses) == 1 or len(allowed) != 1 or len(poses) == MOST_ALIKE:
