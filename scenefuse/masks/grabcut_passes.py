@@ -63,7 +63,12 @@ def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mappin
 
 
 def ask_grabcut(
-    width_px: int, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+    width_px: int,
+    view: View,
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    box_px: Array | None,
+    likely_px: Array | None,
 ) -> tuple[list[Mask], Array]:
     """One mask (H, W) of a photo by GrabCut, and its quality: 1, or 0 where it is empty or all of the photo.
 
@@ -73,6 +78,7 @@ def ask_grabcut(
         inside: (N, 2) pixels clicked on the object and (M, 2) carried on to it; what they span is likely object.
         outside: the same off the object.
         box_px: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
+        likely_px: the same of a box in which the object probably is; of no use here, as colours would fill it.
     """
     on, off = np.concatenate(inside), np.concatenate(outside)
     trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)

@@ -214,10 +214,16 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
 
 
 def ask_sam2(
-    network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+    network: Sam2,
+    view: View,
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    box_px: Array | None,
+    likely_px: Array | None,
 ) -> tuple[list[Mask], Array]:
     """SAM 2's masks (H, W) of a photo and its own opinion of them (M,): three from pixels all over the object, and
-    where there are more than ten of these, three from four in its middle and the box around all.
+    where there are more than ten of these, three from four in its middle and the box around all; the same once more
+    with the box in which the object probably is, where none was drawn.
 
     Args:
         network: SAM 2.
@@ -225,7 +231,17 @@ def ask_sam2(
         inside: (N, 2) pixels clicked on the object, and (M, 2) carried on to it, of which a few far apart count.
         outside: the same off the object; of those carried on, the near ones.
         box_px: (2, 2) corners of a box around it, upper left first, or None.
+        likely_px: the same of a box in which it probably is, or None.
     """
+    boxes = [box_px] if box_px is not None or likely_px is None else [None, likely_px]
+    asked = [_ask_in_box(network, view, inside, outside, box) for box in boxes]
+    return [mask for masks, _ in asked for mask in masks], np.concatenate([quality for _, quality in asked])
+
+
+def _ask_in_box(
+    network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+) -> tuple[list[Mask], Array]:
+    """See `ask_sam2`, for one box."""
     features, size = network.encode(view.pixels), (view.height, view.width)
     around = np.concatenate(inside) if box_px is None else box_px
     low, high = around.min(0), around.max(0)

@@ -12,6 +12,8 @@ from support.photographed_plane import photographs
 from scenefuse.masks.clicked.carry import carry, one_photo
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.space import Space, beyond
+from scenefuse.masks.clicked.votes import voter_of
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.prompted import masks_from_prompts
@@ -82,7 +84,7 @@ class PlantedNetwork:
     def __init__(self, wrong=(), quality=0.9):
         self.wrong, self.quality, self.asked = dict.fromkeys(wrong, 0), quality, []
 
-    def __call__(self, view, inside, outside, box):
+    def __call__(self, view, inside, outside, box, likely):
         self.asked.append(view.name)
         mask = true_mask(view)
         if view.name in self.wrong:
@@ -116,7 +118,7 @@ def test_a_mask_that_is_bad_or_disagrees_does_not_vote_and_the_round_goes_on(pho
 
 
 def test_a_bad_mask_of_low_quality_does_not_vote_although_it_holds_its_prompts(photos):
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         mask = true_mask(view)
         return ([mask], np.array([0.9])) if view.name != "f04.png" else ([mask], np.array([0.3]))
 
@@ -125,7 +127,7 @@ def test_a_bad_mask_of_low_quality_does_not_vote_although_it_holds_its_prompts(p
 
 
 def test_parts_without_a_prompt_are_not_the_object(photos):
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         mask = true_mask(view)
         mask[5:25, 5:25] = True
         return [mask], np.ones(1)
@@ -153,7 +155,7 @@ def test_too_few_clicks_left_is_an_error_that_names_them(photos):
 def test_clicks_in_a_further_photo_prompt_that_photo(photos):
     told = {}
 
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         told[view.name] = inside[0], outside[0]
         return [true_mask(view)], np.ones(1)
 
@@ -168,7 +170,7 @@ def hat(view):
     return np.hypot(u - 100, v - 20) < 8
 
 
-def ask_for_the_clearest(view, inside, outside, box):
+def ask_for_the_clearest(view, inside, outside, box, likely):
     """The ball if anything on it prompts, else the disc, else everything around both."""
     mask, part, at = true_mask(view), hat(view), np.concatenate(inside).astype(int)
     there = mask if mask[at[:, 1], at[:, 0]].any() else part if part[at[:, 1], at[:, 0]].any() else ~(mask | part)
@@ -190,7 +192,7 @@ def test_a_click_that_missed_the_outline_is_no_part(photos):
     view = photos.views[0]
     edge = int(np.flatnonzero(true_mask(view)[45]).max())
 
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         at = np.concatenate(inside).astype(int)
         beside = np.zeros_like(true_mask(view))
         beside[43:48, edge + 1 : edge + 6] = True
@@ -210,7 +212,7 @@ def test_a_click_on_a_part_beats_what_other_photos_say_of_it(photos):
 def test_the_first_photo_gets_the_part_that_only_the_others_know(photos):
     cap = (np.arange(HEIGHT) < 31)[:, None]
 
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         at = np.concatenate(inside).astype(int)
         if view.name != "f03.png":
             return [true_mask(view)], np.array([0.9])
@@ -225,6 +227,53 @@ def test_a_photo_with_clicks_comes_as_soon_as_enough_is_known_of_it(photos):
     network = PlantedNetwork()
     carry(network, photos, {3: clicks([MIDDLE, (70, 45)]), 6: clicks([MIDDLE])}, 2)
     assert network.asked.index("f06.png") <= 2
+
+
+def test_what_has_no_sparse_points_is_found_by_the_space_that_the_first_masks_leave(photos):
+    """The upper half has none; without the space's box the network takes the lower half from the sides not clicked."""
+    low = [photos.points[rows, 2] < 0 for rows in photos.seen]
+    bare = replace(
+        photos,
+        seen=[rows[keep | (rows >= 600)] for rows, keep in zip(photos.seen, low)],
+        seen_at=[at[keep | (rows >= 600)] for rows, at, keep in zip(photos.seen, photos.seen_at, low)],
+    )
+    near = {"f02.png", "f03.png", "f04.png", "f05.png"}
+    bottom = (np.arange(HEIGHT) > HEIGHT / 2)[:, None]
+
+    def ask(view, inside, outside, box, likely):
+        whole, half = true_mask(view), true_mask(view) & bottom
+        if view.name in near:
+            return [whole], np.array([0.8])
+        leaking = whole.copy()
+        leaking[:, 55:65] = True
+        if likely is None:
+            return [half], np.array([0.9])
+        (left, top), (right, low_end) = likely
+        assert left < 45 and right > 75 and top < 30 and low_end > 60
+        return [half, whole, leaking], np.array([0.9, 0.8, 0.95])
+
+    carried = carry(ask, bare, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
+
+
+def test_the_space_is_bounded_by_the_masks_that_vote_and_one_that_is_wrong_does_not_end_it(photos):
+    def voter(k, mask):
+        return voter_of(photos, k, mask, 0.9, 1.0, clicks([]))
+
+    made = {k: voter(k, true_mask(photos.views[k])) for k in (0, 2, 4, 6)}
+    made[4] = voter(4, np.zeros((HEIGHT, WIDTH), dtype=bool))
+    space, true = Space(photos), true_mask(photos.views[1])
+    outline = space.outline(1, made)
+    assert (outline & true).sum() > 0.99 * true.sum() and outline.sum() < 2 * true.sum()
+    assert beyond(true, outline) < 0.01 and beyond(np.ones_like(true), outline) > 0.5 and beyond(true, None) == 0
+    # A mask that is made anew counts as it is now, and the share that may err is not used up; those that do not vote, and
+    # the photo's own, do not count.
+    made[4] = voter(4, true_mask(photos.views[4]))
+    assert space.outline(1, made).sum() > outline.sum()
+    assert space.outline(1, {k: made[k] for k in (0, 2)}) is None
+    assert space.outline(0, {k: made[k] for k in (0, 2, 4)}) is None
+    made[2].quality = made[4].quality = 0.1
+    assert space.outline(1, made) is None
 
 
 @pytest.mark.parametrize(
@@ -249,7 +298,7 @@ def test_sam2_is_told_every_click_and_a_few_carried_points_near_the_object(photo
     network, generator = Network(), np.random.default_rng(0)
     clicked, carried = generator.uniform(40, 60, (12, 2)), generator.uniform(40, 60, (50, 2))
     off = np.concatenate([generator.uniform(62, 64, (20, 2)), [[119.0, 89.0]]])
-    answers, qualities = ask_sam2(network, photos.views[0], (clicked, carried), (NONE, off), None)
+    answers, qualities = ask_sam2(network, photos.views[0], (clicked, carried), (NONE, off), None, None)
     assert np.array_equal(network.told[0][0], clicked) and network.told[0][1] is None
     assert len(network.told[0][2]) == 6 and network.told[0][2].max() < 65
     # Once more from a few in the middle and the box: on all ends of an object the network is sure of nothing.
@@ -257,9 +306,9 @@ def test_sam2_is_told_every_click_and_a_few_carried_points_near_the_object(photo
     assert (network.told[1][1][0] < everywhere.min(0)).all() and (network.told[1][1][1] > everywhere.max(0)).all()
     assert answers == [12, 4] and len(qualities) == 2
     assert np.abs(network.told[1][0] - 50).max() < np.abs(network.told[0][0] - 50).max()
-    ask_sam2(network, photos.views[0], (clicked[:3], carried), (NONE, off), None)
+    ask_sam2(network, photos.views[0], (clicked[:3], carried), (NONE, off), None, None)
     assert len(network.told[2][0]) == 10 and np.array_equal(network.told[2][0][:3], clicked[:3])
-    assert ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), None)[0] == [3]
+    assert ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), None, None)[0] == [3]
 
 
 def test_far_apart_points_stop_when_all_are_chosen():
@@ -320,7 +369,7 @@ def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, pho
     up = np.array([0, 0, 1.0])
     found = masks_from_prompts(marked, model, SIZES, photos, up, network, MaskSettings(), 0)
     # Its quality is low, so it is segmented again in the end; the last answer has the same part in the corner.
-    assert [name for name, *_ in network.told].count("f06.png") == 5
+    assert [name for name, *_ in network.told].count("f06.png") == 9
     assert not found.masks[6][:8, :8].any() and mask_iou(found.masks[6], true_mask(photos.views[6])) > 0.95
 
 
@@ -341,7 +390,7 @@ def test_a_click_has_the_depth_at_which_the_other_photos_show_the_same():
 def test_what_was_clicked_in_one_photo_prompts_the_others_though_no_sparse_point_is_there(photos):
     told = {}
 
-    def ask(view, inside, outside, box):
+    def ask(view, inside, outside, box, likely):
         told[view.name] = inside[1]
         return [true_mask(view)], np.ones(1)
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
 from scenefuse.masks.clicked.pixels import distance_to, pixel_of
+from scenefuse.masks.clicked.space import Space, beyond
 from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
     LEAST_QUALITY,
@@ -20,13 +21,15 @@ from scenefuse.masks.clicked.votes import (
     voter_of,
 )
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.mvs.visual_hull import Mask
+from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
 
 QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
+FILL_WEIGHT = 0.5
+"""Of how well it fills the space that the others leave, likewise."""
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
@@ -70,17 +73,21 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     """
     made: dict[int, Voter] = {}
     left_out: dict[int, list[str]] = {}
-    left = list(range(len(photos.views)))
+    left, space = list(range(len(photos.views))), Space(photos)
     while (k := _next(photos, made, left, clicked)) is not None:
         left.remove(k)
-        made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px)
+        made[k], left_out[k] = _make(
+            ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px, space.outline(k, made)
+        )
         _tell(photos.views[k].name, made[k])
     if not any(voter.votes for voter in made.values()):
         _refuse(photos, made, left_out)
     for k in range(len(photos.views)):
         others = {row: voter for row, voter in made.items() if row != k}
         if k not in made or not made[k].votes or agreement_of(photos, k, made[k].mask, others) < LEAST_AGREEMENT:
-            made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px)
+            made[k], left_out[k] = _make(
+                ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px, space.outline(k, made)
+            )
             _tell(f"{photos.views[k].name} again", made[k])
     for k in [k for k in range(len(photos.views)) if made[k].votes]:
         others = {row: voter for row, voter in made.items() if row != k}
@@ -105,7 +112,7 @@ def one_photo(ask: Ask, view: View, clicks: PhotoClicks, tolerance_px: float) ->
     """The mask (H, W) of a photo from its own clicks alone, with which `carry` begins; its quality, its agreement with
     the clicks, and the clicks that contradict it, a sentence each. Arguments as of `carry`; the view has RGB pixels."""
     nothing = np.zeros((0, 3)), [np.zeros(0, dtype=np.int64)], [np.zeros((0, 2))]
-    voter, left_out = _make(ask, Workspace(Path(), [view], *nothing), 0, clicks, {}, tolerance_px)
+    voter, left_out = _make(ask, Workspace(Path(), [view], *nothing), 0, clicks, {}, tolerance_px, None)
     return voter.mask, voter.quality, voter.agreement, left_out
 
 
@@ -114,9 +121,16 @@ def _tell(name: str, voter: Voter) -> None:
 
 
 def _make(
-    ask: Ask, photos: Workspace, k: int, clicks: PhotoClicks, others: dict[int, Voter], tolerance_px: float
+    ask: Ask,
+    photos: Workspace,
+    k: int,
+    clicks: PhotoClicks,
+    others: dict[int, Voter],
+    tolerance_px: float,
+    space: Mask | None,
 ) -> tuple[Voter, list[str]]:
-    """A photo's mask from its clicks and the others' votes, and the clicks left out as they contradict it."""
+    """A photo's mask from its clicks, the others' votes and the space that they leave; and the clicks left out as they
+    contradict it."""
     inside, outside = known_pixels(photos, k, others)
     keep, view = np.ones(len(clicks.pixels), dtype=bool), photos.views[k]
     notes: list[str] = []
@@ -125,7 +139,7 @@ def _make(
         kept = clicks.only(keep)
         if len(inside) < LEAST_KNOWN and not kept.prompt:
             break
-        found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px)
+        found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px, space)
         voter = voter_of(photos, k, *found, kept)
         x, y = pixel_of(clicks.pixels, voter.mask)
         miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
@@ -161,15 +175,31 @@ def _asked(
     outside: tuple[Array, Array],
     box: Array | None,
     tolerance_px: float,
+    space: Mask | None,
 ) -> tuple[Mask, float, float]:
-    """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement."""
-    masks, quality = ask(view, inside, outside, box)
+    """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
+
+    The space (H, W) that other photos leave bounds what has no sparse points: its box is a hint, and of masks that
+    agree as well that one is best which fills it and is not beyond it.
+    """
+    masks, quality = ask(view, inside, outside, box, None if space is None else _box_of(space))
     on, off = np.concatenate(inside), np.concatenate(outside)
     masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
     agreement = [agrees(mask, inside, outside, tolerance_px) for mask in masks]
-    best = int(np.argmax([a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]))
+    fills = [0.0 if space is None else mask_iou(mask, space) for mask in masks]
+    scores = [
+        a - beyond(m, space) + QUALITY_WEIGHT * q + FILL_WEIGHT * f - 2 * (not m.any())
+        for m, a, q, f in zip(masks, agreement, quality, fills)
+    ]
+    best = int(np.argmax(scores))
     mask = with_parts(ask, view, masks[best], inside, outside, tolerance_px)
     return mask, float(quality[best]) * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
+
+
+def _box_of(space: Mask) -> Array:
+    """(2, 2) corners of the box around a mask, upper left first."""
+    pixels = np.argwhere(space)[:, ::-1]
+    return np.stack([pixels.min(0), pixels.max(0) + 1.0]).astype(np.float64)
 
 
 def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[str]]) -> None:

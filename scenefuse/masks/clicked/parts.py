@@ -25,9 +25,9 @@ PART_REACH = 0.1
 NEAR_MISS = 0.015
 """A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part."""
 
-Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None], tuple[list[Mask], Array]]
+Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None, Array | None], tuple[list[Mask], Array]]
 """Masks (H, W) of a photo with RGB pixels and their qualities, from pixels on the object, pixels off it, each (N, 2)
-clicked and (M, 2) carried on, and a box (2, 2) or None."""
+clicked and (M, 2) carried on, a box (2, 2) that was drawn or None, and one in which the object probably is or None."""
 
 
 def with_parts(
@@ -51,7 +51,7 @@ def with_parts(
         off = np.concatenate([certain, voted])
         # Far from a part, they say nothing of it and mislead the network.
         reach = cKDTree(on), PART_REACH * max(mask.shape)
-        masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None)
+        masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None, None)
         for row in np.argsort(-quality):
             part = prompted_parts(cleaned(masks[row]), on, off)
             own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate(inside), off))
