@@ -10,6 +10,7 @@ from scenefuse.fusion.missing import CLASSES
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.diagnosis import diagnose
+from scenefuse.report.disk import disk_line
 from scenefuse.report.tables import (
     BESIDE,
     COMPLETION,
@@ -38,6 +39,7 @@ def summary_text(
     lines: list[str] = []
     for name, row in zip(scenes, records(tables["scenes"])):
         lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
+        lines += _line("disk", disk_line(tables["disk"], f"scenes/{name}"))
     statuses = [status_of(item, variants[0]) for item in objects]
     joined = sum(not item.alone for item in objects)
     alone = f"in no scene: {', '.join(item.name for item in objects if item.alone)}"
@@ -46,6 +48,7 @@ def summary_text(
     done += f", {statuses.count('ungated')} fused without a check of the pose" if "ungated" in statuses else ""
     for item, row in zip(objects, records(tables["objects"])):
         lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
+        lines += _line("disk", disk_line(tables["disk"], f"objects/{item.name}"))
     lines += _heading(done) + _runtime_lines(tables["runtime"]) + _line("scenefuse", VERSION)
     return "\n".join(lines) + "\n"
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 from scenefuse.job_records import JobRecords
 from scenefuse.report.collected import Collected, collect, collect_scene, read_fields, status_of
+from scenefuse.report.disk import disk_table
 from scenefuse.report.summary_text import summary_text
 from scenefuse.report.tables import (
     ablation_table,
@@ -31,7 +32,8 @@ def write_summary(
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
-    Writes registration.tsv, completion.tsv, ablation.tsv, runtime.tsv, scenes.tsv, objects.tsv and, last, summary.txt.
+    Writes registration.tsv, completion.tsv, ablation.tsv, runtime.tsv, scenes.tsv, objects.tsv, disk.tsv and,
+    last, summary.txt.
     A value that does not exist is '-'. An object without results is named with the last error of its logs. What an
     earlier run left behind a step that failed since is not shown.
 
@@ -78,6 +80,7 @@ def write_summary(
         "runtime": runtime_table(jobs.benchmarks),
         "scenes": scenes_table(scene_fields, jobs),
         "objects": objects_table(found),
+        "disk": disk_table([*scenes, *objects]),
     }
     for name, table in tables.items():
         with atomic_file(summary / f"{name}.tsv") as temporary:

@@ -266,8 +266,8 @@ def test_the_space_is_bounded_by_the_masks_that_vote_and_one_that_is_wrong_does_
     outline = space.outline(1, made)
     assert (outline & true).sum() > 0.99 * true.sum() and outline.sum() < 2 * true.sum()
     assert beyond(true, outline) < 0.01 and beyond(np.ones_like(true), outline) > 0.5 and beyond(true, None) == 0
-    # A mask that is made anew counts as it is now, and the share that may err is not used up; those that do not vote, and
-    # the photo's own, do not count.
+    # A mask that is made anew counts as it is now, and the share that may err is not used up; those that do not vote,
+    # and the photo's own, do not count.
     made[4] = voter(4, true_mask(photos.views[4]))
     assert space.outline(1, made).sum() > outline.sum()
     assert space.outline(1, {k: made[k] for k in (0, 2)}) is None

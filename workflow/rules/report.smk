@@ -8,7 +8,7 @@
 include: "../functions/report.smk"
 
 
-TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects"]
+TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects", "disk"]
 
 
 rule draw_scene:
@@ -224,6 +224,17 @@ rule write_report:
     shell:
         "exec python {params.script} --summary results/summary {params.folders}"
         " --title scenefuse --report {output} &> {log}"
+
+
+onstart:
+    from scenefuse.report.disk import forecast, forecast_note
+
+    needed = [
+        forecast(kind, row, PROJECT.of(kind, name))
+        for kind, rows in (("scene", SCENES), ("object", OBJECTS))
+        for name, row in rows.items()
+    ]
+    print(forecast_note(sum(needed), Path("results")), file=sys.stderr)
 
 
 onerror:
