@@ -236,10 +236,9 @@ def cleaned(mask: Mask, smallest_share: float = 0.02) -> Mask:
     """The mask without specks and pinholes: parts smaller than a share of the mask's area change side."""
     area = np.count_nonzero(mask)
     for side in (True, False):
-        labels, count = ndimage.label(mask == side)
-        if count > 1:
-            sizes = np.bincount(labels.ravel(), minlength=count + 1)
-            small = sizes < smallest_share * area
+        count, labels, parts, _ = cv2.connectedComponentsWithStats((mask == side).astype(np.uint8), connectivity=4)
+        if count > 2:
+            small = parts[:, cv2.CC_STAT_AREA] < smallest_share * area
             small[0] = False
             mask = np.where(small[labels], not side, mask)
     return mask

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
-from scenefuse.masks.clicked.pixels import distance_to, pixel_of
+from scenefuse.masks.clicked.pixels import distance_to, held, pixel_of
 from scenefuse.masks.clicked.space import Space, beyond
 from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
@@ -141,11 +141,11 @@ def _make(
             break
         found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px, space)
         voter = voter_of(photos, k, *found, kept)
-        x, y = pixel_of(clicks.pixels, voter.mask)
-        miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
-        wrong = keep & (miss > tolerance_px)
+        wrong = keep & ~_agreeing(voter.mask, clicks, tolerance_px)
         if not wrong.any():
             break
+        x, y = pixel_of(clicks.pixels, voter.mask)
+        miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
         notes += [
             f"the click {'inside' if clicks.inside[row] else 'outside'} at ({x[row]}, {y[row]}) of the undistorted"
             f" {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
@@ -153,6 +153,11 @@ def _make(
         ]
         keep &= ~wrong
     return voter, notes
+
+
+def _agreeing(mask: Mask, clicks: PhotoClicks, tolerance_px: float) -> NDArray[np.bool_]:
+    """(N,) which clicks are on their side of a mask's outline, or no farther off than the tolerance."""
+    return np.where(clicks.inside, held(mask, clicks.pixels, tolerance_px), held(~mask, clicks.pixels, tolerance_px))
 
 
 def _extended(

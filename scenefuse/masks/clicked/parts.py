@@ -2,8 +2,8 @@
 
 from collections.abc import Callable, Iterator
 
+import cv2
 import numpy as np
-from scipy import ndimage
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -89,12 +89,10 @@ def _groups(clicked: Array, carried: Array, gap_px: float) -> Iterator[tuple[Arr
 def prompted_parts(mask: Mask, inside: Array, outside: Array) -> Mask:
     """The connected parts of a mask (H, W) that hold one of (N, 2) pixels inside, and not as many of (M, 2) outside;
     all of it where no pixel inside is known."""
-    labels, count = ndimage.label(mask)
-    if not count or not len(inside):
+    if not len(inside):
         return mask
-    on, off = (
-        np.bincount(labels[v, u], minlength=count + 1) for u, v in (pixel_of(p, mask) for p in (inside, outside))
-    )
+    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
+    on, off = (np.bincount(labels[v, u], minlength=count) for u, v in (pixel_of(p, mask) for p in (inside, outside)))
     wanted = on > off
     wanted[0] = False
     return wanted[labels]

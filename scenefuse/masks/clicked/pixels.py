@@ -1,8 +1,8 @@
 """Pixels in and around masks."""
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from scenefuse.mvs.visual_hull import Mask
 from scenefuse.transforms import Array
@@ -11,7 +11,14 @@ from scenefuse.transforms import Array
 def held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:
     """(N,) whether (N, 2) pixels lie in a mask, or no farther off it than the tolerance."""
     u, v = pixel_of(pixels, mask)
-    return mask[v, u] if tolerance_px == 0 or not len(pixels) else distance_to(mask)[v, u] <= tolerance_px
+    if tolerance_px == 0 or not len(pixels):
+        return mask[v, u]
+    # A few windows: distances of all of a photo's pixels take far longer.
+    reach = int(tolerance_px)
+    dy, dx = np.mgrid[-reach : reach + 1, -reach : reach + 1]
+    disc, padded = np.hypot(dx, dy) <= tolerance_px, np.pad(mask, reach)
+    side = 2 * reach + 1
+    return np.array([(padded[y : y + side, x : x + side] & disc).any() for x, y in zip(u, v)])
 
 
 def share_in(mask: Mask, pixels: Array, of_none: float) -> float:
@@ -25,6 +32,9 @@ def pixel_of(pixels: Array, mask: Mask) -> NDArray[np.intp]:
     return np.clip(pixels.astype(np.intp), 0, np.array(mask.shape[::-1]) - 1).T
 
 
-def distance_to(mask: Mask) -> Array:
+def distance_to(mask: Mask) -> NDArray[np.float32]:
     """(H, W) distance of the pixels off a mask to it, 0 on it; far away where it is empty."""
-    return ndimage.distance_transform_edt(~mask) if mask.any() else np.full(mask.shape, float(max(mask.shape)))
+    if not mask.any():
+        return np.full(mask.shape, max(mask.shape), dtype=np.float32)
+    away = cv2.distanceTransform((~mask).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.asarray(away, dtype=np.float32)

@@ -55,7 +55,8 @@ class Voter:
 def voter_of(photos: Workspace, k: int, mask: Mask, quality: float, agreement: float, clicks: PhotoClicks) -> Voter:
     """What a photo's mask says of the points that the photo sees, but for those next to its outline."""
     u, v = pixel_of(photos.seen_at[k], mask)
-    sure = (distance_to(mask) + distance_to(~mask))[v, u] > EDGE * max(mask.shape)
+    edge = EDGE * max(mask.shape)
+    sure = (distance_to(mask) + distance_to(~mask))[v, u] > edge if len(u) else np.zeros(0, dtype=bool)
     return Voter(mask, quality, agreement, photos.seen[k][sure], mask[v, u][sure], clicks)
 
 
