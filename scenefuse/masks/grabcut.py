@@ -10,6 +10,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
+from scenefuse.masks.pixels import distance_to
 from scenefuse.mvs.visual_hull import Mask
 
 Trimap = NDArray[np.uint8]
@@ -98,8 +99,7 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
         evidence: (H, W) log ratio of the colour's densities; where it is strong it overrules both.
         band_px: half width of the band along the outline that is never certain.
     """
-    inner = ndimage.distance_transform_edt(outline)
-    outer = ndimage.distance_transform_edt(~outline)
+    inner, outer = distance_to(~outline), distance_to(outline)
     # One pixel's colour is noise: its neighbours within half a band count too.
     colour = cv2.GaussianBlur(np.clip(evidence, -3, 3), (0, 0), band_px / 4)
     votes = colour + np.where(outline, 1, -1) + np.where(mask, 1, -1)
@@ -226,7 +226,7 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
 
 def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
     """A coarse mask (H, W) moved to the edges of its photo (H, W, 3): cut again, but only this near its outline."""
-    inner, outer = ndimage.distance_transform_edt(mask), ndimage.distance_transform_edt(~mask)
+    inner, outer = distance_to(~mask), distance_to(mask)
     trimap = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[inner > band_px], trimap[outer > band_px] = cv2.GC_FGD, cv2.GC_BGD
     return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask

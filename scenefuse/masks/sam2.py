@@ -234,15 +234,20 @@ def ask_sam2(
         likely_px: the same of a box in which it probably is, or None.
     """
     boxes = [box_px] if box_px is not None or likely_px is None else [None, likely_px]
-    asked = [_ask_in_box(network, view, inside, outside, box) for box in boxes]
+    features, size = network.encode(view.pixels), (view.height, view.width)
+    asked = [_ask_in_box(network, features, size, inside, outside, box) for box in boxes]
     return [mask for masks, _ in asked for mask in masks], np.concatenate([quality for _, quality in asked])
 
 
 def _ask_in_box(
-    network: Sam2, view: View, inside: tuple[Array, Array], outside: tuple[Array, Array], box_px: Array | None
+    network: Sam2,
+    features: Any,
+    size: tuple[int, int],
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    box_px: Array | None,
 ) -> tuple[list[Mask], Array]:
-    """See `ask_sam2`, for one box."""
-    features, size = network.encode(view.pixels), (view.height, view.width)
+    """See `ask_sam2`, for one box and the features of a photo of a (height, width)."""
     around = np.concatenate(inside) if box_px is None else box_px
     low, high = around.min(0), around.max(0)
     reach = NEAR * (high - low).max()

@@ -158,6 +158,8 @@ def silhouette(hull: Hull, view: View) -> Mask:
         return drawn.astype(bool)
     pixels, depth = view.project(hull.shell)
     front = depth > 1e-6
+    if not front.any():
+        return drawn.astype(bool)
     u, v = np.floor(pixels[front]).astype(int).T
     inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
     drawn[v[inside], u[inside]] = 255

@@ -1,5 +1,7 @@
 """The room that results take on the disk: what a run will need, before it begins, and what it has taken."""
 
+import math
+import os
 import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -7,6 +9,7 @@ from typing import Any
 
 import pandas as pd
 from PIL import Image
+from PIL.ExifTags import Base
 
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
@@ -22,11 +25,14 @@ OBJECT_BYTES = 60
 """A pixel of an object's maps of stages 1 to 4, its share of the registration and the pictures."""
 LARGEST = 4
 """Parts that the summary names."""
+SIDEWAYS = (5, 6, 7, 8)
+"""EXIF orientations of photos that are turned by a quarter."""
+TEMPORARY = ".tmp-"
 
 
-def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> int:
-    """Bytes that a scene or an object will take; 0 where it is a cloud, or a video, or its photos cannot be read: then
-    its own stage says why.
+def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> int | None:
+    """Bytes that a scene or an object from photos will take; None where that cannot be told: a cloud, a video, photos
+    that are yet to be made or cannot be read.
 
     Args:
         kind: `scene` or `object`.
@@ -34,46 +40,55 @@ def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> 
         settings: its settings.
     """
     if row.get("cloud") or not row.get("photos"):
-        return 0
+        return None
     try:
         photos = photo_files(Path(row["photos"]))
         with Image.open(photos[0]) as first:
-            width, height = first.size
-    except (OSError, StageError):
-        return 0
-    own, longest = settings[kind], max(width, height)
+            turned = first.getexif().get(Base.Orientation) in SIDEWAYS
+            width, height = reversed(first.size) if turned else first.size
+    except (OSError, StageError, Image.DecompressionBombError):
+        return None
+    own, longest, count = settings[kind], max(width, height), len(photos)
     if kind == "scene":
         photo = min(1.0, own["undistort"]["max_size_px"] / longest)
         maps = SCENE_BYTES * min(photo, own["depth_maps"]["max_image_size_px"] / longest) ** 2
     else:
         photo = min(1.0, own["frames"]["max_width_px"] / width)
         maps = OBJECT_BYTES * min(photo, own["nerf"]["width_px"] / width) ** 2
+        count = math.ceil(count / own["frames"]["frame_step"])
+        count = min(count, own["frames"]["max_frames"] or count)
     pixels = width * height * (PHOTO_BYTES * photo**2 + maps)
-    return round(len(photos) * (pixels + FEATURE_BYTES * own["features"]["max_features"]))
+    return round(count * (pixels + FEATURE_BYTES * own["features"]["max_features"]))
 
 
-def forecast_note(needed: int, results: Path) -> str:
-    """What a run needs beside what is free, in a sentence.
+def forecast_note(needed: Mapping[Path, int | None]) -> str:
+    """What a run needs beside what is free, in a sentence; "" where nothing of it can be told.
 
     Args:
-        needed: bytes of all scenes and objects.
-        results: the folder of the results; it need not exist.
+        needed: bytes by folder of results, which need not exist; None where they are unknown.
     """
-    there = next(path for path in (results, *results.absolute().parents) if path.exists())
-    taken, free = sum(parts_of(results).values()), shutil.disk_usage(there).free
-    note = (
-        f"disk: {results} will take about {_gigabytes(needed)} ({_gigabytes(taken)} now), {_gigabytes(free)} are free"
+    known = {folder: size for folder, size in needed.items() if size is not None}
+    if not known:
+        return ""
+    there = next(path for path in next(iter(known)).absolute().parents if path.exists())
+    taken = {folder: sum(parts_of(folder).values()) for folder in known}
+    free, more = shutil.disk_usage(there).free, sum(max(0, size - taken[folder]) for folder, size in known.items())
+    unknown = [folder.name for folder in needed if folder not in known]
+    return (
+        f"disk: scenes and objects will take about {_size(sum(known.values()))} ({_size(sum(taken.values()))} now),"
+        f" {_size(free)} are free"
+        + (f"; not counted: {', '.join(unknown)}" if unknown else "")
+        + ("; that is too little: free some space" if more > free else "")
     )
-    return note + ("; that is too little: free some space" if needed - taken > free else "")
 
 
 def disk_table(folders: Iterable[Path]) -> pd.DataFrame:
-    """Room that the parts of result folders take: columns name (`scenes/{scene}` for instance), part,
-    megabytes; the largest part of each first."""
+    """Room that the parts of result folders take: columns name (`scenes/{scene}` for instance), part, megabytes; the
+    largest part of each first."""
     rows = [
         {"name": f"{folder.parent.name}/{folder.name}", "part": part, "megabytes": size / 1e6}
         for folder in folders
-        for part, size in sorted(parts_of(folder).items(), key=lambda item: -item[1])
+        for part, size in sorted(parts_of(folder).items(), key=lambda item: (-item[1], item[0]))
     ]
     return pd.DataFrame(rows, columns=["name", "part", "megabytes"])
 
@@ -82,19 +97,28 @@ def disk_line(table: pd.DataFrame, name: str) -> str:
     """All of `scenes/{scene}` or `objects/{object}`, and its largest parts; "" where all are below a megabyte."""
     own = table[table["name"] == name]
     large = own[own["megabytes"] >= 1].head(LARGEST)
-    parts = [f"{part} {_gigabytes(1e6 * size)}" for part, size in zip(large["part"], large["megabytes"])]
-    return ": ".join([_gigabytes(1e6 * own["megabytes"].sum()), ", ".join(parts)]) if parts else ""
+    parts = [f"{part} {_size(1e6 * megabytes)}" for part, megabytes in zip(large["part"], large["megabytes"])]
+    return ": ".join([_size(1e6 * own["megabytes"].sum()), ", ".join(parts)]) if parts else ""
 
 
 def parts_of(folder: Path) -> dict[str, int]:
-    """Bytes of the files in a folder, and of those below each folder in it; links take no room."""
+    """Bytes of the files in a folder, and of those below each folder in it; links take no room. What comes and goes
+    meanwhile, as jobs write it, is left out."""
     parts: dict[str, int] = {}
-    for path in sorted(folder.rglob("*")):
-        if path.is_file() and not path.is_symlink():
-            part = path.relative_to(folder).parts[0]
-            parts[part] = parts.get(part, 0) + path.stat().st_size
+    for place, folders, names in os.walk(folder):
+        folders[:] = [name for name in folders if TEMPORARY not in name]
+        below = Path(place).relative_to(folder).parts
+        for name in names:
+            try:
+                status = os.lstat(os.path.join(place, name))
+            except OSError:
+                continue
+            if TEMPORARY not in name and not os.path.islink(os.path.join(place, name)):
+                part = below[0] if below else name
+                parts[part] = parts.get(part, 0) + status.st_size
     return parts
 
 
-def _gigabytes(size: float) -> str:
-    return f"{size / 1e9:.3g} GB" if size >= 1e8 else f"{size / 1e6:.3g} MB"
+def _size(size: float) -> str:
+    unit, name = next((u, n) for u, n in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB")) if size >= 0.1 * u or n == "MB")
+    return f"{size / unit:.3g} {name}"

@@ -12,7 +12,7 @@ from support.photographed_plane import photographs
 from scenefuse.masks.clicked.carry import carry, one_photo
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
-from scenefuse.masks.clicked.space import Space, beyond
+from scenefuse.masks.clicked.space import Space
 from scenefuse.masks.clicked.votes import voter_of
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
@@ -256,24 +256,92 @@ def test_what_has_no_sparse_points_is_found_by_the_space_that_the_first_masks_le
     assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
 
 
-def test_the_space_is_bounded_by_the_masks_that_vote_and_one_that_is_wrong_does_not_end_it(photos):
-    def voter(k, mask):
-        return voter_of(photos, k, mask, 0.9, 1.0, clicks([]))
+def voters(photos, masks):
+    return {k: voter_of(photos, k, mask, 0.9, 1.0, clicks([])) for k, mask in masks.items()}
 
-    made = {k: voter(k, true_mask(photos.views[k])) for k in (0, 2, 4, 6)}
-    made[4] = voter(4, np.zeros((HEIGHT, WIDTH), dtype=bool))
+
+def test_the_space_is_bounded_by_the_masks_that_vote_and_one_that_is_wrong_does_not_end_it(photos):
+    made = voters(photos, {k: true_mask(photos.views[k]) for k in (0, 2, 4, 6)})
+    made |= voters(photos, {4: np.zeros((HEIGHT, WIDTH), dtype=bool)})
     space, true = Space(photos), true_mask(photos.views[1])
-    outline = space.outline(1, made)
-    assert (outline & true).sum() > 0.99 * true.sum() and outline.sum() < 2 * true.sum()
-    assert beyond(true, outline) < 0.01 and beyond(np.ones_like(true), outline) > 0.5 and beyond(true, None) == 0
+    left = space.left(1, made)
+    assert (left.mask & true).sum() > 0.99 * true.sum() and left.mask.sum() < 2 * true.sum()
+    assert left.beyond(true) < 0.01 and left.beyond(np.ones_like(true)) > 0.3 and left.filled(true) > 0.5
+    (x0, y0), (x1, y1) = left.box
+    assert left.mask[int(y0) : int(y1), int(x0) : int(x1)].sum() == left.mask.sum()
     # A mask that is made anew counts as it is now, and the share that may err is not used up; those that do not vote,
     # and the photo's own, do not count.
-    made[4] = voter(4, true_mask(photos.views[4]))
-    assert space.outline(1, made).sum() > outline.sum()
-    assert space.outline(1, {k: made[k] for k in (0, 2)}) is None
-    assert space.outline(0, {k: made[k] for k in (0, 2, 4)}) is None
+    made |= voters(photos, {4: true_mask(photos.views[4])})
+    assert space.left(1, made).mask.sum() > left.mask.sum()
+    assert space.left(1, {k: made[k] for k in (0, 2)}) is None
+    assert space.left(0, {k: made[k] for k in (0, 2, 4)}) is None
     made[2].quality = made[4].quality = 0.1
-    assert space.outline(1, made) is None
+    assert space.left(1, made) is None
+
+
+def test_of_masks_that_agree_as_well_that_one_is_best_which_fills_the_space(photos):
+    def ask(view, inside, outside, box, likely):
+        whole = true_mask(view)
+        at = np.concatenate(inside).astype(int)
+        cut = whole & (np.arange(WIDTH)[None] > WIDTH / 2 - 16) if likely is not None else whole
+        # Whatever prompts, both hold.
+        cut[at[:, 1], at[:, 0]] = whole[at[:, 1], at[:, 0]]
+        return [cut, whole], np.array([0.85, 0.8])
+
+    left = [at[:, 0] > WIDTH / 2 - 12 for at in photos.seen_at]
+    few = replace(
+        photos,
+        seen=[rows[keep] for rows, keep in zip(photos.seen, left)],
+        seen_at=[at[keep] for at, keep in zip(photos.seen_at, left)],
+    )
+    carried = carry(ask, few, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert all(mask_iou(m, true_mask(v)) == 1 for m, v in zip(carried.masks, photos.views))
+
+
+def test_nothing_is_held_against_what_lies_beyond_the_grid(photos):
+    """A pole without a sparse point, four times as high as what has some."""
+    v = np.arange(HEIGHT) + 0.5
+    pole = (np.abs(np.arange(WIDTH) + 0.5 - WIDTH / 2) < 5)[None] & (v < HEIGHT / 2)[:, None]
+    small = replace(photos, points=np.where(np.arange(1200)[:, None] < 600, 0.3 * photos.points, photos.points))
+    seen_at = [small.views[k].project(small.points[rows])[0] for k, rows in enumerate(small.seen)]
+    small = replace(small, seen_at=seen_at)
+    u = np.arange(WIDTH) + 0.5
+    ball = np.hypot(u[None] - WIDTH / 2, v[:, None] - HEIGHT / 2) < 8
+    made = voters(small, {k: ball | pole for k in (0, 2, 4, 6)})
+    left = Space(small).left(1, made)
+    assert left.told[44, 60] and not left.told[2, 60] and left.beyond(ball | pole) < 0.05
+    assert left.filled(ball | pole) > left.filled(ball)
+
+
+def test_the_grid_is_laid_anew_when_the_voters_have_doubled(photos):
+    space, top = Space(photos), photos.points[:, 2] > 0.5
+    masks = {k: true_mask(photos.views[k]) for k in (0, 1, 2, 3, 4, 5, 6)}
+    seen = [rows[top[rows]] for rows in photos.seen]
+    high = replace(photos, seen=seen, seen_at=[at[top[r]] for r, at in zip(photos.seen, photos.seen_at)])
+    first = space.left(7, voters(high, {k: masks[k] for k in (0, 2, 4)}))
+    again = space.left(7, voters(photos, masks))
+    assert not first.told.all() and again.told.sum() > 1.2 * first.told.sum()
+
+
+def test_points_that_span_nothing_leave_no_space(photos):
+    empty = replace(photos, seen=[rows[:0] for rows in photos.seen], seen_at=[at[:0] for at in photos.seen_at])
+    made = voters(empty, {k: true_mask(photos.views[k]) for k in (0, 2, 4, 6)})
+    assert Space(empty).left(1, made) is None
+    spot = clicks([MIDDLE])
+    spot = replace(spot, points=np.zeros((1, 3)))
+    for voter in made.values():
+        voter.clicks = spot
+    assert Space(empty).left(1, made) is None
+
+
+def test_a_photo_that_looks_away_is_named_and_does_not_end_the_round(photos):
+    turned = photos.views[9].cam_from_world.copy()
+    turned[:3] = np.diag([1.0, -1.0, -1.0]) @ turned[:3]
+    views = [replace(view, cam_from_world=turned) if k == 9 else view for k, view in enumerate(photos.views)]
+    rows = [r[:0] if k == 9 else r for k, r in enumerate(photos.seen)]
+    away = replace(photos, views=views, seen=rows, seen_at=[at[: len(r)] for r, at in zip(rows, photos.seen_at)])
+    carried = carry(PlantedNetwork(), away, {3: clicks([MIDDLE, (70, 45)])}, 2)
+    assert list(carried.reasons) == ["f09.png"] and mask_iou(carried.masks[8], true_mask(photos.views[8])) == 1
 
 
 @pytest.mark.parametrize(
@@ -309,6 +377,14 @@ def test_sam2_is_told_every_click_and_a_few_carried_points_near_the_object(photo
     ask_sam2(network, photos.views[0], (clicked[:3], carried), (NONE, off), None, None)
     assert len(network.told[2][0]) == 10 and np.array_equal(network.told[2][0][:3], clicked[:3])
     assert ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), None, None)[0] == [3]
+    # A box in which the object probably is prompts besides; one that was drawn is certain.
+    drawn, likely = np.array([[30.0, 20], [90, 70]]), np.array([[20.0, 10], [100, 80]])
+    del network.told[:]
+    ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), None, likely)
+    assert [box if box is None else box.tolist() for _, box, _ in network.told] == [None, likely.tolist()]
+    del network.told[:]
+    ask_sam2(network, photos.views[0], (clicked[:3], NONE), (NONE, off), drawn, likely)
+    assert [box.tolist() for _, box, _ in network.told] == [drawn.tolist()]
 
 
 def test_far_apart_points_stop_when_all_are_chosen():

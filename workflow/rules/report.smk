@@ -8,7 +8,15 @@
 include: "../functions/report.smk"
 
 
-TABLES = ["registration", "completion", "ablation", "runtime", "scenes", "objects", "disk"]
+TABLES = [
+    "registration",
+    "completion",
+    "ablation",
+    "runtime",
+    "scenes",
+    "objects",
+    "disk",
+]
 
 
 rule draw_scene:
@@ -229,12 +237,17 @@ rule write_report:
 onstart:
     from scenefuse.report.disk import forecast, forecast_note
 
-    needed = [
-        forecast(kind, row, PROJECT.of(kind, name))
-        for kind, rows in (("scene", SCENES), ("object", OBJECTS))
-        for name, row in rows.items()
-    ]
-    print(forecast_note(sum(needed), Path("results")), file=sys.stderr)
+    note = forecast_note(
+        {
+            Path(f"results/{kind}s/{name}"): forecast(
+                kind, row, PROJECT.of(kind, name)
+            )
+            for kind, rows in (("scene", SCENES), ("object", OBJECTS))
+            for name, row in rows.items()
+        }
+    )
+    if note:
+        print(note, file=sys.stderr)
 
 
 onerror:

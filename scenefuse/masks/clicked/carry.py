@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
-from scenefuse.masks.clicked.pixels import distance_to, held, pixel_of
-from scenefuse.masks.clicked.space import Space, beyond
+from scenefuse.masks.clicked.space import Left, Space
 from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
     LEAST_QUALITY,
@@ -21,7 +20,8 @@ from scenefuse.masks.clicked.votes import (
     voter_of,
 )
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.mvs.visual_hull import Mask, mask_iou
+from scenefuse.masks.pixels import distance_to, held, pixel_of
+from scenefuse.mvs.visual_hull import Mask
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
@@ -76,9 +76,7 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
     left, space = list(range(len(photos.views))), Space(photos)
     while (k := _next(photos, made, left, clicked)) is not None:
         left.remove(k)
-        made[k], left_out[k] = _make(
-            ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px, space.outline(k, made)
-        )
+        made[k], left_out[k] = _make(ask, photos, k, clicked.get(k, NO_CLICKS), made, tolerance_px, space.left(k, made))
         _tell(photos.views[k].name, made[k])
     if not any(voter.votes for voter in made.values()):
         _refuse(photos, made, left_out)
@@ -86,7 +84,7 @@ def carry(ask: Ask, photos: Workspace, clicked: dict[int, PhotoClicks], toleranc
         others = {row: voter for row, voter in made.items() if row != k}
         if k not in made or not made[k].votes or agreement_of(photos, k, made[k].mask, others) < LEAST_AGREEMENT:
             made[k], left_out[k] = _make(
-                ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px, space.outline(k, made)
+                ask, photos, k, clicked.get(k, NO_CLICKS), others, tolerance_px, space.left(k, made)
             )
             _tell(f"{photos.views[k].name} again", made[k])
     for k in [k for k in range(len(photos.views)) if made[k].votes]:
@@ -127,7 +125,7 @@ def _make(
     clicks: PhotoClicks,
     others: dict[int, Voter],
     tolerance_px: float,
-    space: Mask | None,
+    space: Left | None,
 ) -> tuple[Voter, list[str]]:
     """A photo's mask from its clicks, the others' votes and the space that they leave; and the clicks left out as they
     contradict it."""
@@ -180,31 +178,23 @@ def _asked(
     outside: tuple[Array, Array],
     box: Array | None,
     tolerance_px: float,
-    space: Mask | None,
+    space: Left | None,
 ) -> tuple[Mask, float, float]:
     """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
 
     The space (H, W) that other photos leave bounds what has no sparse points: its box is a hint, and of masks that
     agree as well that one is best which fills it and is not beyond it.
     """
-    masks, quality = ask(view, inside, outside, box, None if space is None else _box_of(space))
+    masks, quality = ask(view, inside, outside, box, None if space is None else space.box)
     on, off = np.concatenate(inside), np.concatenate(outside)
     masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
     agreement = [agrees(mask, inside, outside, tolerance_px) for mask in masks]
-    fills = [0.0 if space is None else mask_iou(mask, space) for mask in masks]
-    scores = [
-        a - beyond(m, space) + QUALITY_WEIGHT * q + FILL_WEIGHT * f - 2 * (not m.any())
-        for m, a, q, f in zip(masks, agreement, quality, fills)
-    ]
+    scores = [a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]
+    if space is not None:
+        scores = [s + FILL_WEIGHT * space.filled(m) - space.beyond(m) for s, m in zip(scores, masks)]
     best = int(np.argmax(scores))
     mask = with_parts(ask, view, masks[best], inside, outside, tolerance_px)
     return mask, float(quality[best]) * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
-
-
-def _box_of(space: Mask) -> Array:
-    """(2, 2) corners of the box around a mask, upper left first."""
-    pixels = np.argwhere(space)[:, ::-1]
-    return np.stack([pixels.min(0), pixels.max(0) + 1.0]).astype(np.float64)
 
 
 def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[str]]) -> None:

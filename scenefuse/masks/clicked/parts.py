@@ -7,9 +7,9 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.masks.clicked.pixels import held, pixel_of, share_in
 from scenefuse.masks.clicked.votes import LEAST_QUALITY, SURE
 from scenefuse.masks.grabcut import cleaned
+from scenefuse.masks.pixels import held, pixel_of, share_in
 from scenefuse.mvs.visual_hull import Mask
 from scenefuse.transforms import Array
 from scenefuse.workspace import View

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
-from scenefuse.masks.clicked.pixels import distance_to, pixel_of, share_in
+from scenefuse.masks.pixels import distance_to, pixel_of, share_in
 from scenefuse.mvs.visual_hull import Mask
 from scenefuse.transforms import Array
 from scenefuse.workspace import Workspace
