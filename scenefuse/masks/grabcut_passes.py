@@ -78,8 +78,10 @@ def ask_grabcut(
         inside: (N, 2) pixels clicked on the object and (M, 2) carried on to it; what they span is likely object.
         outside: the same off the object.
         box_px: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
-        likely_px: the same of a box in which the object probably is; of no use here, as colours would fill it.
+        likely_px: the same of a box in which the object probably is: nothing comes of it, as colours would fill it.
     """
+    if likely_px is not None:
+        return [], np.zeros(0)
     on, off = np.concatenate(inside), np.concatenate(outside)
     trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)
     if box_px is not None:

@@ -124,11 +124,15 @@ class Sam2Transformers:
             raise StageError(f"{checkpoint} is no folder of a SAM 2 checkpoint for transformers: {reason}") from None
         self._device = "cuda" if torch.cuda.is_available() else "cpu"
         self._network = network.to(self._device).eval()
+        self._last: tuple[NDArray[np.uint8], list[torch.Tensor]] | None = None
 
     def encode(self, image: NDArray[np.uint8]) -> list[torch.Tensor]:
-        """See Sam2."""
-        with torch.inference_mode():
-            return self._network.get_image_embeddings(torch.from_numpy(_blob(image)).to(self._device))
+        """See Sam2. The last photo's are kept."""
+        if self._last is None or self._last[0] is not image:
+            with torch.inference_mode():
+                blob = torch.from_numpy(_blob(image)).to(self._device)
+                self._last = image, self._network.get_image_embeddings(blob)
+        return self._last[1]
 
     def masks(
         self,
@@ -222,8 +226,7 @@ def ask_sam2(
     likely_px: Array | None,
 ) -> tuple[list[Mask], Array]:
     """SAM 2's masks (H, W) of a photo and its own opinion of them (M,): three from pixels all over the object, and
-    where there are more than ten of these, three from four in its middle and the box around all; the same once more
-    with the box in which the object probably is, where none was drawn.
+    where there are more than ten of these, three from four in its middle and the box around all.
 
     Args:
         network: SAM 2.
@@ -231,23 +234,10 @@ def ask_sam2(
         inside: (N, 2) pixels clicked on the object, and (M, 2) carried on to it, of which a few far apart count.
         outside: the same off the object; of those carried on, the near ones.
         box_px: (2, 2) corners of a box around it, upper left first, or None.
-        likely_px: the same of a box in which it probably is, or None.
+        likely_px: the same of a box in which it probably is, that prompts in its place; or None.
     """
-    boxes = [box_px] if box_px is not None or likely_px is None else [None, likely_px]
     features, size = network.encode(view.pixels), (view.height, view.width)
-    asked = [_ask_in_box(network, features, size, inside, outside, box) for box in boxes]
-    return [mask for masks, _ in asked for mask in masks], np.concatenate([quality for _, quality in asked])
-
-
-def _ask_in_box(
-    network: Sam2,
-    features: Any,
-    size: tuple[int, int],
-    inside: tuple[Array, Array],
-    outside: tuple[Array, Array],
-    box_px: Array | None,
-) -> tuple[list[Mask], Array]:
-    """See `ask_sam2`, for one box and the features of a photo of a (height, width)."""
+    box_px = likely_px if box_px is None else box_px
     around = np.concatenate(inside) if box_px is None else box_px
     low, high = around.min(0), around.max(0)
     reach = NEAR * (high - low).max()

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +22,7 @@ from scenefuse.masks.clicked.votes import (
 )
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.pixels import distance_to, held, pixel_of
-from scenefuse.mvs.visual_hull import Mask
+from scenefuse.mvs.visual_hull import Mask, mask_iou
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
@@ -30,6 +31,8 @@ QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
 FILL_WEIGHT = 0.5
 """Of how well it fills the space that the others leave, likewise."""
+SAME = 0.9
+"""IoU from which two masks are the same but for their seams, of which the space says nothing: it is coarse."""
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
@@ -182,19 +185,41 @@ def _asked(
 ) -> tuple[Mask, float, float]:
     """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
 
-    The space (H, W) that other photos leave bounds what has no sparse points: its box is a hint, and of masks that
-    agree as well that one is best which fills it and is not beyond it.
+    The space that other photos leave bounds what has no sparse points. Its box prompts once more, and what comes of it
+    is taken if it agrees as well, fills the space better and is not beyond it; but not for another seam alone.
     """
-    masks, quality = ask(view, inside, outside, box, None if space is None else space.box)
+    found = _candidates(ask(view, inside, outside, box, None), inside, outside, tolerance_px)
+    best = max(found, key=lambda one: one.score)
+    if space is not None and box is None:
+        more = _candidates(ask(view, inside, outside, None, space.box), inside, outside, tolerance_px)
+        other = max(
+            [best, *more], key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask)
+        )
+        best = other if mask_iou(other.mask, best.mask) < SAME else best
+    mask = with_parts(ask, view, best.mask, inside, outside, tolerance_px)
+    return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
+
+
+class _Candidate(NamedTuple):
+    """A mask (H, W), its quality, and how good it is by this and its agreement with what prompts it."""
+
+    mask: Mask
+    quality: float
+    score: float
+
+
+def _candidates(
+    asked: tuple[list[Mask], Array], inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float
+) -> list[_Candidate]:
+    """What a method answers, without specks and parts that nothing prompts."""
     on, off = np.concatenate(inside), np.concatenate(outside)
-    masks = [prompted_parts(cleaned(mask), on, off) for mask in masks]
-    agreement = [agrees(mask, inside, outside, tolerance_px) for mask in masks]
-    scores = [a + QUALITY_WEIGHT * q - 2 * (not m.any()) for m, a, q in zip(masks, agreement, quality)]
-    if space is not None:
-        scores = [s + FILL_WEIGHT * space.filled(m) - space.beyond(m) for s, m in zip(scores, masks)]
-    best = int(np.argmax(scores))
-    mask = with_parts(ask, view, masks[best], inside, outside, tolerance_px)
-    return mask, float(quality[best]) * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
+    masks = [prompted_parts(cleaned(mask), on, off) for mask in asked[0]]
+    return [
+        _Candidate(
+            m, float(q), agrees(m, inside, outside, tolerance_px) + QUALITY_WEIGHT * float(q) - 2 * (not m.any())
+        )
+        for m, q in zip(masks, asked[1])
+    ]
 
 
 def _refuse(photos: Workspace, made: dict[int, Voter], left_out: dict[int, list[str]]) -> None:

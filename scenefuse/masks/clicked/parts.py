@@ -27,7 +27,8 @@ NEAR_MISS = 0.015
 
 Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None, Array | None], tuple[list[Mask], Array]]
 """Masks (H, W) of a photo with RGB pixels and their qualities, from pixels on the object, pixels off it, each (N, 2)
-clicked and (M, 2) carried on, a box (2, 2) that was drawn or None, and one in which the object probably is or None."""
+clicked and (M, 2) carried on, a box (2, 2) that was drawn or None, and one in which the object probably is or None:
+what comes of that, if anything, is told by itself."""
 
 
 def with_parts(
