@@ -2,13 +2,15 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from scenefuse.stage import StageError
 
-Kind = Literal["labels", "points"]
-"""Labels say inside, outside or box; points have names and are clicked in several photos."""
+Kind = Literal["labels", "points", "lengths"]
+"""Labels say inside, outside or box; points have names and are clicked in several photos, so are ends of lengths."""
+ENDS = ("a", "b")
+"""Of a length that is new."""
 Sizes = Mapping[str, tuple[int, int]]
 """Photo name -> (width, height), the pixels that clicks in it are in."""
 
@@ -22,7 +24,7 @@ class Click:
     """One row of a table.
 
     Attributes:
-        label: inside, outside or box; or the name of a point.
+        label: inside, outside or box; or the name of a point; or name, metres and end of a length, tabs between them.
         photo: name of the photo.
         x, y: pixels of the original photo, as people see it.
     """
@@ -100,12 +102,56 @@ def with_point(rows: Rows, name: str, photo: str, x: float, y: float, sizes: Siz
     Raises:
         StageError: it lies outside the photo, or the name is empty or cannot stand in a table.
     """
-    name = name.strip()
-    if not name or not name.isprintable() or name.startswith("#"):
-        raise StageError("a point needs a name of printable characters that does not begin with #")
-    click = _checked(name, photo, x, y, sizes)
-    place = next((k for k, row in enumerate(rows) if (row.label, row.photo) == (name, photo)), len(rows))
+    return with_end(rows, _name(name, "point"), photo, x, y, sizes)
+
+
+def with_end(rows: Rows, label: str, photo: str, x: float, y: float, sizes: Sizes) -> Rows:
+    """The rows with an end of a length in a photo, moved where it was there already.
+
+    Raises:
+        StageError: it lies outside the photo.
+    """
+    click = _checked(label, photo, x, y, sizes)
+    place = next((k for k, row in enumerate(rows) if (row.label, row.photo) == (label, photo)), len(rows))
     return (*rows[:place], click, *rows[place + 1 :])
+
+
+def with_length(rows: Rows, text: str) -> tuple[Rows, tuple[str, str]]:
+    """The rows, where those of a length that is there already get its new metres, and the labels of its two ends.
+
+    Args:
+        rows: of the table.
+        text: name and metres, as a person writes them: `bar 1.5` or `bar 1,5 m`.
+
+    Raises:
+        StageError: there is no name, or no positive number.
+    """
+    name, _, number = text.strip().removesuffix("m").strip().rpartition(" ")
+    try:
+        metres = float(number.replace(",", "."))
+        if not 0 < metres < float("inf"):
+            raise ValueError
+    except ValueError:
+        raise StageError("write a name and a length in metres: bar 1.5") from None
+    name = _name(name, "length")
+    cells = [row.label.split("\t") for row in rows]
+    ends = list(dict.fromkeys([cell[2] for cell in cells if cell[0] == name] + list(ENDS)))
+    changed = [
+        replace(row, label=length_label(name, metres, cell[2])) if cell[0] == name else row
+        for row, cell in zip(rows, cells)
+    ]
+    return tuple(changed), (length_label(name, metres, ends[0]), length_label(name, metres, ends[1]))
+
+
+def length_label(name: str, metres: float, end: str) -> str:
+    """The label of an end: the first cells of its line in the table."""
+    return f"{name}\t{metres:.10g}\t{end}"
+
+
+def spoken(label: str) -> str:
+    """A label for a person: the end of a length as `bar, 1.5 m: a`."""
+    name, *length = label.split("\t")
+    return f"{name}, {length[0]} m: {length[1]}" if length else name
 
 
 def without_nearest(rows: Rows, photo: str, x: float, y: float, within_px: float) -> Rows:
@@ -154,7 +200,14 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, least_inside: int = 1) -> lis
         width, height = sizes.get(row.photo, (row.x, row.y))
         if not (0 <= row.x <= width and 0 <= row.y <= height):
             found.append(f"{row.label} at ({row.x:g}, {row.y:g}) lies outside {row.photo}: remove it.")
-    return found + (_label_problems(rows, least_inside) if kind == "labels" else _point_problems(rows))
+    if kind == "labels":
+        return found + _label_problems(rows, least_inside)
+    found += [
+        f"{spoken(label)} is marked in one photo: click it in another one, too."
+        for label, count in Counter(row.label for row in rows).items()
+        if count < 2
+    ]
+    return found + (_point_problems(rows) if kind == "points" else _length_problems(rows))
 
 
 def _label_problems(rows: Rows, least_inside: int) -> list[str]:
@@ -168,11 +221,20 @@ def _label_problems(rows: Rows, least_inside: int) -> list[str]:
 
 
 def _point_problems(rows: Rows) -> list[str]:
-    photos = Counter(row.label for row in rows)
-    found = [f"{name} is marked in one photo: click it in another one, too." for name, n in photos.items() if n < 2]
-    if len(photos) < LEAST_POINTS:
-        found.append(f"{len(photos)} of at least {LEAST_POINTS} points are marked.")
-    return found
+    count = len({row.label for row in rows})
+    return [f"{count} of at least {LEAST_POINTS} points are marked."] if count < LEAST_POINTS else []
+
+
+def _length_problems(rows: Rows) -> list[str]:
+    ends = Counter(label.split("\t")[0] for label in {row.label for row in rows})
+    return [f"{name} has one end: click the other one, too." for name, count in sorted(ends.items()) if count < 2]
+
+
+def _name(name: str, what: str) -> str:
+    name = name.strip()
+    if not name or not name.isprintable() or name.startswith("#"):
+        raise StageError(f"a {what} needs a name of printable characters that does not begin with #")
+    return name
 
 
 def _checked(label: str, photo: str, x: float, y: float, sizes: Sizes) -> Click:

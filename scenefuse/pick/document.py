@@ -7,15 +7,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, merged
+from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, length_label, merged
 from scenefuse.sfm.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
+from scenefuse.sfm.survey.lengths import COLUMNS, read_end_clicks
 from scenefuse.stage import StageError, atomic_file
 
-HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS}
+HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS, "lengths": COLUMNS}
 
 
 class FileChanged(Exception):
     """The file is no longer what was read; the message says what differs."""
+
+
+class NotClicked(StageError):
+    """The file holds what is not clicked."""
 
 
 class Document:
@@ -142,9 +147,8 @@ class Document:
         if not self._draft.is_file() or self.fixed:
             return
         try:
-            marked = read_points(self._draft)
-            self.kind = "labels" if isinstance(marked, Labels) else "points"
-            self.history.change(_rows_of(marked))
+            self.kind, rows = _read(self._draft, self.kind)
+            self.history.change(rows)
         except StageError:
             self.history.change(())  # a draft without rows: everything was removed
 
@@ -153,15 +157,15 @@ class Document:
             return ()
         if not self._holds_rows():
             return ()
-        marked = read_points(self.path)
+        try:
+            self.kind, rows = _read(self.path, self.kind)
+        except NotClicked as error:
+            self.fixed = str(error)
+            return ()
         self._comments = [
             line for line in self.path.read_text(encoding="utf-8-sig").splitlines() if line.startswith("#")
         ]
-        if not isinstance(marked, Labels | Clicks):
-            self.fixed = f"{self.path} holds points by their coordinates, which are not clicked; edit it as text"
-            return ()
-        self.kind = "labels" if isinstance(marked, Labels) else "points"
-        return _rows_of(marked)
+        return rows
 
     def _holds_rows(self) -> bool:
         """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
@@ -187,10 +191,22 @@ def digest(path: Path) -> str:
         return ""
 
 
-def _rows_of(marked: object) -> Rows:
-    names = marked.labels if isinstance(marked, Labels) else marked.points  # type: ignore[attr-defined]
-    pixels = marked.pixels.tolist()  # type: ignore[attr-defined]
-    return tuple(Click(n, p, *xy) for n, p, xy in zip(names, marked.photos, pixels))  # type: ignore[attr-defined]
+def _read(path: Path, kind: Kind) -> tuple[Kind, Rows]:
+    """The rows of a table, and what they are; a table of lengths holds nothing else.
+
+    Raises:
+        NotClicked: points by their coordinates.
+        StageError: it cannot be read.
+    """
+    if kind == "lengths":
+        clicks = read_end_clicks(path)
+        return kind, tuple(Click(length_label(c.length, c.metres, c.end), c.photo, c.x_px, c.y_px) for c in clicks)
+    marked = read_points(path)
+    if not isinstance(marked, Labels | Clicks):
+        raise NotClicked(f"{path} holds points by their coordinates, which are not clicked; edit it as text")
+    names = marked.labels if isinstance(marked, Labels) else marked.points
+    rows = tuple(Click(n, p, *xy) for n, p, xy in zip(names, marked.photos, marked.pixels.tolist()))
+    return "labels" if isinstance(marked, Labels) else "points", rows
 
 
 def _line(click: Click) -> str:

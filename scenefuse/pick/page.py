@@ -7,7 +7,7 @@ from typing import Any
 
 from nicegui import ui
 
-from scenefuse.pick.clicks import Kind, Rows, with_box, with_label, with_point, without_nearest
+from scenefuse.pick.clicks import Kind, Rows, with_box, with_end, with_label, with_length, with_point, without_nearest
 from scenefuse.pick.document import FileChanged
 from scenefuse.pick.overlays import CARRIED, CLICKED, overlay
 from scenefuse.pick.photo_map import PhotoMap
@@ -50,7 +50,7 @@ KEYS = {
     "+ − 0": "zoom in, out, whole photo (or the wheel)",
     "m": "show or hide masks",
     "a": "accept the workflow's mask, next one",
-    "t": "other table",
+    "t": "next table",
     "s": "save",
 }
 POLL_S = 0.5
@@ -64,6 +64,7 @@ class Page:
         """Build the page."""
         self.session, self.board_number = session, 0
         self.tool, self.point, self.shows_masks = "inside", "", True
+        self.chosen: tuple[str, ...] = ()
         self.picture: Picture | None = None
         self.seen_version = -1
         self.mask_asked: Any = None
@@ -121,7 +122,8 @@ class Page:
         """Go over to another table."""
         self.board_number = number
         document = self.board.document
-        self.tool, self.point = "inside", next((r.label for r in document.rows if document.kind == "points"), "")
+        self.tool, self.chosen = "inside", ()
+        self.point = next((r.label for r in document.rows if document.kind != "labels"), "")
         self.strip.open(number)
         clicked = {row.photo for row in document.rows}
         order = self.strip.order
@@ -156,10 +158,14 @@ class Page:
         tool = "outside" if self.tool == "outside" else "inside"
         if document.kind == "labels":
             self.edit(lambda: with_label(document.rows, tool, name, x, y, sizes))
-        elif self.point:
+        elif not self.point:
+            what = "Write a length" if document.kind == "lengths" else "Name a point"
+            self.say(f"{what} first, at the right; then click it.")
+        elif document.kind == "points":
             self.edit(lambda: with_point(document.rows, self.point, name, x, y, sizes))
         else:
-            self.say("Name a point first, at the right; then click it.")
+            self.edit(lambda: with_end(document.rows, self.point, name, x, y, sizes))
+            self._take_other_end(name)
 
     def remove(self, x: float, y: float) -> None:
         """Remove the click under the pointer."""
@@ -176,7 +182,7 @@ class Page:
 
     def choose(self, tool: str) -> None:
         """Take another tool."""
-        if self.board.document.kind == "points":
+        if self.board.document.kind != "labels":
             return
         self.tool = tool
         self.map.stop_drawing()
@@ -192,10 +198,32 @@ class Page:
             self.say(str(error))
         self.refresh()
 
-    def choose_point(self, name: str) -> None:
-        """Take another point, or a new one."""
-        self.point = name.strip()
+    def choose_point(self, text: str) -> None:
+        """Take a point, which may be new, or a length with its metres, by what a person writes."""
+        document = self.board.document
+        try:
+            if document.kind == "lengths":
+                rows, self.chosen = with_length(document.rows, text)
+                document.change(rows)
+            else:
+                self.chosen = (text.strip(),) if text.strip() else ()
+        except StageError as error:
+            self.say(str(error))
+        self.take_point(self.chosen[0] if self.chosen else "")
+
+    def take_point(self, label: str) -> None:
+        """Take a point or an end that is listed."""
+        self.point = label
         self.refresh()
+
+    def _take_other_end(self, photo: str) -> None:
+        """After one end of a length comes the other, where the photo does not have it yet."""
+        rows, length = self.board.document.rows, self.point.split("\t")[0]
+        listed = dict.fromkeys([row.label for row in rows] + list(self.chosen))
+        here = {row.label for row in rows if row.photo == photo}
+        left = [label for label in listed if label.split("\t")[0] == length and label not in here]
+        if left:
+            self.take_point(left[0])
 
     def step(self, by: int) -> None:
         """Go to a photo farther on in the strip."""

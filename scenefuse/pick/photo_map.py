@@ -9,7 +9,7 @@ import numpy as np
 from nicegui import ui
 from nicegui.elements.leaflet.leaflet_layer import Layer
 
-from scenefuse.pick.clicks import Click
+from scenefuse.pick.clicks import Click, spoken
 from scenefuse.pick.pictures import Picture
 from scenefuse.transforms import Array
 
@@ -156,7 +156,7 @@ class PhotoMap:
 
     def draw_point(self, click: Click, active: bool) -> None:
         """Draw a named point."""
-        self._dot(click, ACTIVE if active else POINT, click.label)
+        self._dot(click, ACTIVE if active else POINT, spoken(click.label))
 
     def draw_expected(self, pixels: Array, name: str) -> None:
         """Draw where a point is to be expected: a cross-hair for one pixel, a line for more."""

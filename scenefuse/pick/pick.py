@@ -17,8 +17,9 @@ def pick(
 ) -> None:
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 
-    The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects. Run
-    it in the working directory of the workflow, with the same settings file; Ctrl-C ends it.
+    The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, column
+    `lengths` of the table of scenes. Run it in the working directory of the workflow, with the same settings file;
+    Ctrl-C ends it.
 
     Args:
         object: name of the object, as in the table of objects.

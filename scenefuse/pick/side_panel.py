@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from scenefuse.pick.clicks import problems
+from scenefuse.pick.clicks import problems, spoken
 from scenefuse.pick.next_run import as_text, command, planned_rules
 
 if TYPE_CHECKING:
@@ -33,7 +33,7 @@ class SidePanel:
         ui.label(board.source.advice[document.kind]).classes("text-sm text-gray-700")
         for text in filter(None, (document.trouble, document.fixed, *board.notes[:3])):
             ui.label(text).classes("text-xs text-red-700")
-        if self._page.board_number and not document.rows:
+        if board.source.column == "fiducials" and not document.rows:
             kinds = {"labels": "In one photo", "points": "Named points"}
             kind = ui.toggle(kinds, value=document.kind, on_change=lambda e: self._page.choose_kind(e.value))
             kind.props("no-caps dense unelevated spread padding='3px 8px'").classes("w-full")
@@ -80,19 +80,19 @@ class SidePanel:
 
     def _fill_points(self) -> None:
         document, cameras = self._page.board.document, self._page.board.cameras
-        entry = ui.input("New point: a name, then Enter").props("dense outlined").classes("w-full")
+        lengths = document.kind == "lengths"
+        asked = "New length: a name and metres (bar 1.5)" if lengths else "New point: a name, then Enter"
+        entry = ui.input(asked).props("dense outlined").classes("w-full")
         entry.on("keydown.enter", lambda: self._page.choose_point(entry.value))
-        names = list(dict.fromkeys(row.label for row in document.rows))
-        if self._page.point and self._page.point not in names:
-            names.append(self._page.point)
-        for name in names:
+        names = [row.label for row in document.rows]
+        for name in dict.fromkeys([*names, *self._page.chosen]):
             rows = [row for row in document.rows if row.label == name]
             off = cameras.residuals(rows) if cameras else {}
             worst = f" · {max(off.values()):.1f} px" if off else ""
             plural = "photo" if len(rows) == 1 else "photos"
             look = "unelevated color=amber-6 text-color=black" if name == self._page.point else "flat color=grey-9"
             button = ui.button(
-                f"{name} · {len(rows)} {plural}{worst}", on_click=lambda name=name: self._page.choose_point(name)
+                f"{spoken(name)} · {len(rows)} {plural}{worst}", on_click=lambda name=name: self._page.take_point(name)
             )
             button.props(f"dense {look} align=left padding='1px 8px'").classes("w-full")
             if name == self._page.point:
@@ -113,10 +113,10 @@ class SidePanel:
         if any(row.photo not in board.source.pictures for row in document.rows):
             ui.button("Remove clicks in missing photos", on_click=self._page.remove_lost).props("dense outline")
         if document.rows and not board.source.listed:
-            text = f"Write {document.path} into the column {board.source.column} of the table of objects."
+            source = board.source
+            text = f"Write {document.path} into the column {source.column} of the table of {source.listed_in}."
             ui.label(text).classes("text-xs text-orange-900")
-        target = "masks.png" if board.source.column == "prompts" else "fused.ply"
-        words = command(self._page.session.configfile, f"results/objects/{self._page.session.name}/{target}")
+        words = command(self._page.session.configfile, str(board.source.result))
         ui.label(as_text(words)).classes("code w-full").mark("command")
         ui.button("What will run?", icon="playlist_play", on_click=self.plan).props("dense outline padding='2px 10px'")
         self._planned = ui.label().classes("text-xs")

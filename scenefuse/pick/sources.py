@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from scenefuse.io.project import Project
 from scenefuse.pick.clicks import Kind, Sizes
@@ -23,6 +23,10 @@ OF_SCENE: dict[Kind, str] = {
     "labels": ONLY_IF + "Click the object's ends, top and foot in one photo, and what it touches as outside.",
     "points": ONLY_IF + "Mark at least four points that bound the object, each in two or more photos.",
 }
+OF_LENGTHS: dict[Kind, str] = {
+    "lengths": "Needed only where a scene without GPS and control points shall be in metres. Write the name and the"
+    " metres of a length that you know, and click its two ends, each in two or more photos.",
+}
 
 
 @dataclass(frozen=True)
@@ -30,14 +34,15 @@ class Source:
     """A table that can be clicked, and the photos to click in.
 
     Attributes:
-        column: of the table of objects.
+        column: of the table of objects, or of scenes.
         title: for the page.
         advice: what to do, by the kind of the table.
         path: of the table, which need not exist.
         kind: what a new table holds.
         pictures: the photos, by name.
         models: folders where a COLMAP model of these photos may lie, the best first.
-        listed: whether the table of objects names the path.
+        listed: whether that table names the path.
+        result: what the workflow makes of it.
         least_inside: labels: fewest clicks inside.
     """
 
@@ -49,7 +54,13 @@ class Source:
     pictures: dict[str, Picture]
     models: tuple[Path, ...]
     listed: bool
+    result: Path
     least_inside: int = 1
+
+    @property
+    def listed_in(self) -> str:
+        """The table that names the path."""
+        return "scenes" if self.kind == "lengths" else "objects"
 
     @property
     def sizes(self) -> Sizes:
@@ -58,7 +69,7 @@ class Source:
 
 
 def sources_of(project: Project, name: str) -> list[Source]:
-    """The tables of an object: its prompts, and fiducials in the scene's photos where it has any.
+    """The tables of an object: its prompts, and fiducials and known lengths in the scene's photos where it has any.
 
     Raises:
         StageError: there is no such object, or no photos.
@@ -70,16 +81,20 @@ def sources_of(project: Project, name: str) -> list[Source]:
     if row.get("photos"):
         results = Path("results/objects") / name
         pictures = object_pictures(Path(row["photos"]), results, project.of("object", name)["object"]["frames"])
-        path, listed = _table(project, row, name, "prompts")
+        path, listed = _table(project, "objects", name, "prompts")
         models: tuple[Path, ...] = (results / "sparse",)
-        found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed))
+        made = results / "masks.png"
+        found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed, made))
     scene = project.scenes[row["scene"]] if row.get("scene") else {}
     if scene.get("photos"):
-        results = Path("results/scenes") / row["scene"]
+        results, made = Path("results/scenes") / row["scene"], Path("results/objects") / name / "fused.ply"
         pictures = scene_pictures(Path(scene["photos"]), results)
-        path, listed = _table(project, row, name, "fiducials")
+        path, listed = _table(project, "objects", name, "fiducials")
         models = (results / "georeferenced", results / "sparse")
-        found.append(Source("fiducials", "In the scene", OF_SCENE, path, "labels", pictures, models, listed, 3))
+        found.append(Source("fiducials", "In the scene", OF_SCENE, path, "labels", pictures, models, listed, made, 3))
+        path, listed = _table(project, "scenes", row["scene"], "lengths")
+        made = results / "residuals.tsv"
+        found.append(Source("lengths", "Known lengths", OF_LENGTHS, path, "lengths", pictures, models, listed, made))
     if not found:
         raise StageError(f"object '{name}' and its scene are clouds: there are no photos to click in")
     return found
@@ -129,8 +144,9 @@ def _pictures(files: Iterable[tuple[str, Path]]) -> dict[str, Picture]:
         return {found.name: found for found in pool.map(picture, files)}
 
 
-def _table(project: Project, row: dict[str, str], name: str, column: str) -> tuple[Path, bool]:
-    """The path of a table, and whether the table of objects names it; a new one lies beside that."""
-    if row.get(column):
-        return Path(row[column]), True
-    return Path(project.settings["objects"]).parent / f"{name}_{column}.tsv", False
+def _table(project: Project, kind: Literal["scenes", "objects"], name: str, column: str) -> tuple[Path, bool]:
+    """The path of a table, and whether the table of objects or scenes names it; a new one lies beside that."""
+    rows = project.scenes if kind == "scenes" else project.objects
+    if rows[name].get(column):
+        return Path(rows[name][column]), True
+    return Path(project.settings[kind]).parent / f"{name}_{column}.tsv", False

@@ -16,6 +16,7 @@ from support.user_project import Project
 
 from scenefuse.pick.pictures import Picture
 from scenefuse.sfm.fiducials import read_points
+from scenefuse.sfm.survey.lengths import read_ends
 
 ROOT = Path(__file__).resolve().parents[2]
 # The page comes from this machine, and from nowhere else.
@@ -334,6 +335,28 @@ def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
     marked = page.save()
     assert marked.points == ["chimney"] * 2 and len(set(marked.photos)) == 2
     assert np.abs(marked.pixels - (30, 20)).max() < 0.5
+
+
+def test_a_known_length_is_clicked_in_two_photos_end_after_end(page, yard):
+    page.button("Known lengths")
+    page.until_text("New length")
+    page.browser.find(".side input").send_keys("bar 1.5\n")
+    page.until_text("bar, 1.5 m: b · 0 photos")
+    for _ in range(2):
+        for count, x in ((1, 20), (2, 40)):
+            action = page.mouse()
+            action.pointer_action.move_to_location(*page.point(x, 20, 64, 48)).click()
+            action.perform()
+            page.marks(count)
+        page.key("n")
+    page.until_text("bar, 1.5 m: b · 2 photos")
+    page.until_text("into the column lengths of the table of scenes")
+    page.until_text("results/scenes/yard/residuals.tsv")
+    page.key("s")
+    page.until_text("rows saved in")
+    metres, ends, clicks = read_ends(yard.path / "yard_lengths.tsv")
+    assert metres == {"bar": 1.5} and ends == {"bar": ["a", "b"]}
+    assert np.abs(clicks.pixels - [(20, 20), (40, 20)] * 2).max() < 0.5 and len(set(clicks.photos)) == 2
 
 
 def test_the_page_fits_a_laptop_s_screen_and_says_what_comes_next(page):

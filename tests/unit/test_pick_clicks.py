@@ -8,8 +8,11 @@ from scenefuse.pick.clicks import (
     difference,
     merged,
     problems,
+    spoken,
     with_box,
+    with_end,
     with_label,
+    with_length,
     with_point,
     without_nearest,
 )
@@ -112,6 +115,8 @@ def test_a_difference_is_said_in_numbers():
         ((HEAD, Click("inside", "a.jpg", 300, 1)), "labels", "outside a.jpg"),
         ((Click("hat", "a.jpg", 1, 1),), "points", "hat is marked in one photo"),
         ((Click("hat", "a.jpg", 1, 1),), "points", "1 of at least 4 points"),
+        ((Click("bar\t2\ta", "a.jpg", 1, 1),), "lengths", "bar, 2 m: a is marked in one photo"),
+        ((Click("bar\t2\ta", "a.jpg", 1, 1),), "lengths", "bar has one end"),
     ],
 )
 def test_what_the_workflow_would_refuse_is_said(rows, kind, expected):
@@ -123,6 +128,29 @@ def test_nothing_is_said_where_the_workflow_would_go_on():
     assert problems(BOX, "labels", SIZES) == []
     photos = [(name, photo) for name in "abcd" for photo in SIZES]
     assert problems(tuple(Click(*p, 1, 1) for p in photos), "points", SIZES) == []
+    ends = tuple(Click(f"bar\t2\t{end}", photo, 1, 1) for end in "ab" for photo in SIZES)
+    assert problems(ends, "lengths", SIZES) == []
+
+
+@pytest.mark.parametrize("text", ["bar 1.5", "  bar 1,5 m ", "bar 1.50m"])
+def test_a_length_is_written_as_people_do(text):
+    assert with_length((), text) == ((), ("bar\t1.5\ta", "bar\t1.5\tb"))
+    assert with_length((), "north door 2")[1][0] == "north door\t2\ta"
+
+
+@pytest.mark.parametrize("text", ["", "bar", "1.5", "bar 0", "bar -2", "bar inf", "#bar 2", "b\tar 2"])
+def test_a_length_without_a_name_or_metres_is_refused(text):
+    with pytest.raises(StageError, match="metres|needs a name"):
+        with_length((), text)
+
+
+def test_a_length_that_is_there_keeps_its_clicks_and_ends_and_gets_the_new_metres():
+    rows = (Click("bar\t1.5\tleft", "a.jpg", 1, 2), Click("door\t2\ta", "a.jpg", 3, 4))
+    changed, ends = with_length(rows, "bar 1.6")
+    assert changed == (Click("bar\t1.6\tleft", "a.jpg", 1, 2), rows[1])
+    assert ends == ("bar\t1.6\tleft", "bar\t1.6\ta") and spoken(ends[0]) == "bar, 1.6 m: left"
+    moved = with_end(changed, ends[0], "a.jpg", 7, 8, SIZES)
+    assert moved == (Click("bar\t1.6\tleft", "a.jpg", 7, 8), rows[1])
 
 
 def test_clicks_in_the_scene_have_to_be_three():

@@ -2,9 +2,10 @@
 
 import pytest
 
-from scenefuse.pick.clicks import Click
+from scenefuse.pick.clicks import Click, with_end, with_length
 from scenefuse.pick.document import Document, FileChanged
 from scenefuse.sfm.fiducials import read_points
+from scenefuse.sfm.survey.lengths import read_ends
 from scenefuse.stage import StageError
 
 HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
@@ -29,6 +30,31 @@ def test_saved_clicks_are_read_back_by_the_page_and_by_the_workflow(path):
     marked = read_points(path)
     assert marked.photos == ["Füße 2.jpg", "a b.jpg"] and marked.pixels.tolist() == [[10.5, 20], [3, 4]]
     assert names(path) == ["prompts.tsv"]
+
+
+def test_known_lengths_are_read_back_by_the_page_and_by_the_workflow_one_end_or_two(path):
+    document = Document(path, "lengths")
+    first = with_end((), with_length((), "north door 2.05")[1][0], "a b.jpg", 3, 4, {"a b.jpg": (9, 9)})
+    document.change(first)
+    document.save()
+    again = Document(path, "lengths")
+    assert again.rows == first and not again.trouble
+    again.change((*first, Click("north door\t2.05\tb", "a b.jpg", 5, 6)))
+    again.keep_draft()
+    draft = Document(path, "lengths")
+    assert draft.unsaved and draft.rows == again.rows
+    draft.save()
+    metres, ends, clicks = read_ends(path)
+    assert metres == {"north door": 2.05} and ends == {"north door": ["a", "b"]}
+    assert clicks.pixels.tolist() == [[3, 4], [5, 6]]
+
+
+def test_a_table_of_lengths_that_is_none_is_kept_beside(path):
+    path.write_text(f"{TEXT}inside\ta.jpg\t1\t2\n")
+    document = Document(path, "lengths")
+    assert document.trouble and document.rows == ()
+    document.change((Click("bar\t2\ta", "a.jpg", 5, 6),))
+    assert "prompts.kept-1.tsv" in document.save()
 
 
 def test_a_file_of_points_is_edited_as_such_whatever_was_expected(path):

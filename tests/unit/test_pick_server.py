@@ -95,7 +95,7 @@ def test_a_websocket_needs_the_cookie_and_its_own_site(client):
         "/overlay/..%2fsecret.jpg",
         "/thumbnail/0/-1",
         "/thumbnail/0/4",
-        "/thumbnail/2/0",
+        "/thumbnail/3/0",
         "/thumbnail/-1/0",
         "/tile/0/0/0/1/0",
         "/overlay/1",

@@ -7,7 +7,7 @@ from support.user_project import HEADER, Project
 
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.mvs.visual_hull import mask_iou
-from scenefuse.pick.clicks import Click
+from scenefuse.pick.clicks import Click, spoken
 from scenefuse.pick.next_run import as_text, command
 from scenefuse.pick.pictures import Picture
 from scenefuse.pick.segmenter import Segmenter
@@ -31,7 +31,7 @@ def opened(project, name="shed"):
 
 
 def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
-    first, second = opened(yard).boards
+    first, second, _ = opened(yard).boards
     assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "clicks.tsv")
     assert list(first.source.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.source.pictures) == 3
     assert first.source.sizes["0.jpg"] == (64, 48) and first.source.listed and first.cameras is None
@@ -39,9 +39,24 @@ def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
 
 def test_without_cells_tables_lie_beside_the_table_of_objects_and_it_is_said(yard):
     yard.objects = HEADER + "shed\tyard\tclose\t\t\t\t\n"
-    first, second = opened(yard).boards
-    assert (first.source.path.name, second.source.path.name) == ("shed_prompts.tsv", "shed_fiducials.tsv")
-    assert not first.source.listed and not second.source.listed
+    boards = opened(yard).boards
+    assert [board.source.path.name for board in boards] == [
+        "shed_prompts.tsv",
+        "shed_fiducials.tsv",
+        "yard_lengths.tsv",
+    ]
+    assert not any(board.source.listed for board in boards)
+
+
+def test_known_lengths_are_clicked_in_the_scene_s_photos(yard):
+    (yard.path / "bars.tsv").write_text(
+        "length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1.5\tleft\t0.jpg\t10\t20\nbar\t1.5\tright\t1.jpg\t30\t20\n"
+    )
+    yard.scenes = "scene\tphotos\tlengths\nyard\tflight\tbars.tsv\n"
+    board = opened(yard).boards[2]
+    assert board.document.kind == "lengths" and board.source.listed and not board.document.trouble
+    assert [spoken(row.label) for row in board.document.rows] == ["bar, 1.5 m: left", "bar, 1.5 m: right"]
+    assert board.source.pictures.keys() == opened(yard).boards[1].source.pictures.keys()
 
 
 def test_photos_have_the_names_that_the_workflow_gives_them(yard):

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pycolmap
@@ -16,6 +17,17 @@ from scenefuse.transforms import Array
 COLUMNS = ["length", "metres", "end", "photo", "x_px", "y_px"]
 # Lengths that differ by more from one scale say that one of them is wrong.
 MOST_OFF = 0.05
+
+
+class EndClick(NamedTuple):
+    """A line of lengths.tsv: a click on one end of a known length, in pixels of the original photo."""
+
+    length: str
+    metres: float
+    end: str
+    photo: str
+    x_px: float
+    y_px: float
 
 
 @dataclass(frozen=True)
@@ -71,29 +83,41 @@ def read_ends(path: Path) -> tuple[dict[str, float], dict[str, list[str]], Click
         StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
             different values, an end that is missing.
     """
+    clicks = read_end_clicks(path)
+    ends: dict[str, list[str]] = {}
+    for click in clicks:
+        known = ends.setdefault(click.length, [])
+        known += [] if click.end in known else [click.end]
+    odd = next((name for name, two in ends.items() if len(two) != 2), None)
+    if odd is not None:
+        raise StageError(f"{path}: {odd} has the ends {', '.join(ends[odd])}; click two, each in two photos or more")
+    points, pixels = [f"{c.length} {c.end}" for c in clicks], np.array([[c.x_px, c.y_px] for c in clicks])
+    return {c.length: c.metres for c in clicks}, ends, Clicks(path, points, [c.photo for c in clicks], pixels)
+
+
+def read_end_clicks(path: Path) -> list[EndClick]:
+    """The lines of lengths.tsv, whether both ends are there or not.
+
+    Raises:
+        StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
+            different values.
+    """
     rows = [(number, [cell.strip() for cell in line.split("\t")]) for number, line in read_lines(path)]
     if not rows or rows[0][1] != COLUMNS or len(rows) == 1:
         raise StageError(
             f"{path} has to begin with the tab-separated header '{' '.join(COLUMNS)}', and to go on with clicks"
         )
     metres: dict[str, float] = {}
-    ends: dict[str, list[str]] = {}
-    found: list[tuple[str, str, list[float]]] = []
+    found = []
     for number, cells in rows[1:]:
         try:
             name, end, photo = cells[0], cells[2], cells[3]
-            long, *pixel = (float(cell) for cell in (cells[1], *cells[4:6]))
-            if len(cells) != 6 or not np.isfinite([long, *pixel]).all():
+            long, x, y = (float(cell) for cell in (cells[1], *cells[4:6]))
+            if len(cells) != 6 or not np.isfinite([long, x, y]).all():
                 raise ValueError
         except (ValueError, IndexError):
             raise StageError(f"{path}, line {number}: expected {' '.join(COLUMNS)}, got '{' '.join(cells)}'") from None
         if long <= 0 or metres.setdefault(name, long) != long:
             raise StageError(f"{path}, line {number}: {name} is {long:g} m here; give one positive length, in metres")
-        ends.setdefault(name, [])
-        ends[name] += [] if end in ends[name] else [end]
-        found.append((f"{name} {end}", photo, pixel))
-    odd = next((name for name, two in ends.items() if len(two) != 2), None)
-    if odd is not None:
-        raise StageError(f"{path}: {odd} has the ends {', '.join(ends[odd])}; click two, each in two photos or more")
-    pixels = np.array([pixel for _, _, pixel in found])
-    return metres, ends, Clicks(path, [point for point, _, _ in found], [photo for _, photo, _ in found], pixels)
+        found.append(EndClick(name, long, end, photo, x, y))
+    return found
