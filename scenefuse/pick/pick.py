@@ -17,7 +17,7 @@ def pick(
 ) -> None:
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 
-    The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, column
+    The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, and
     `lengths` of the table of scenes. Run it in the working directory of the workflow, with the same settings file;
     Ctrl-C ends it.
 
