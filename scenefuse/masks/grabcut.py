@@ -15,6 +15,12 @@ from scenefuse.mvs.visual_hull import Mask
 
 Trimap = NDArray[np.uint8]
 COLOUR_BINS = 32
+PINHOLE_SHARE = 0.0005
+"""Holes smaller than this share of a mask say nothing: a network's are as coarse."""
+GAP_EVIDENCE = 0.7
+"""A hole is one if its colours are twice as frequent around the mask as on it."""
+AROUND = 0.1
+"""What is around a mask: so far, as a share of its longer side."""
 EDGE_WIDTH_PX = 1024
 """Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each."""
 STEP_BLUR_PX, STEP_PX = 0.7, 0.15
@@ -232,16 +238,36 @@ def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
     return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask
 
 
-def cleaned(mask: Mask, smallest_share: float = 0.02) -> Mask:
-    """The mask without specks and pinholes: parts smaller than a share of the mask's area change side."""
+def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None, smallest_share: float = 0.02) -> Mask:
+    """The mask (H, W) without specks and holes: parts smaller than a share of the mask's area change side.
+
+    With the photo (H, W, 3), holes through which one sees what is around the mask stay: pinholes aside, those whose
+    colours are rather those around it than its own.
+    """
     area = np.count_nonzero(mask)
     for side in (True, False):
         count, labels, parts, _ = cv2.connectedComponentsWithStats((mask == side).astype(np.uint8), connectivity=4)
         if count > 2:
             small = parts[:, cv2.CC_STAT_AREA] < smallest_share * area
             small[0] = False
+            gaps = small & (parts[:, cv2.CC_STAT_AREA] >= PINHOLE_SHARE * area)
+            if image is not None and not side and gaps.any():
+                evidence = _around(image, mask, small[labels])
+                means = np.bincount(labels.ravel(), evidence.ravel(), minlength=count) / parts[:, cv2.CC_STAT_AREA]
+                small &= ~(gaps & (means < -GAP_EVIDENCE))
             mask = np.where(small[labels], not side, mask)
     return mask
+
+
+def _around(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> NDArray[np.float32]:
+    """(H, W) log ratios of the colours of a mask over those around it."""
+    low, high = (edge(np.argwhere(mask), axis=0) for edge in (np.min, np.max))
+    grow = int(AROUND * (high - low).max())
+    near = tuple(slice(max(0, a - grow), b + grow + 1) for a, b in zip(low, high))
+    colours = learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
+    found = np.zeros(mask.shape, dtype=np.float32)
+    found[near] = colours.evidence(image[near])
+    return found
 
 
 def fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int) -> None:

@@ -214,7 +214,7 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
     u, v = on.astype(int).T
     if outline is not None:
         quality = np.array([mask_iou(m, outline) for m in found])
-    return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))])
+    return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))], view.pixels)
 
 
 def ask_sam2(

@@ -116,7 +116,7 @@ def segment_again(
                 masks[k] = again
             print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
     return [
-        cleaned(along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX))
+        cleaned(along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX), view.pixels)
         for view, mask in zip(photos.views, masks)
     ]
 

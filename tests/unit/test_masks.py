@@ -480,6 +480,22 @@ def test_cleaned_turns_specks_and_pinholes():
     assert (cleaned(mask) == expected).all()
 
 
+def test_a_hole_through_which_one_sees_the_surroundings_stays_and_a_dark_one_is_filled():
+    rng = np.random.default_rng(0)
+    mask = np.zeros((200, 200), dtype=bool)
+    mask[40:160, 40:160] = True
+    image = np.where(mask[..., None], [60, 90, 80], [230, 232, 235]) + rng.normal(0, 8, (200, 200, 3))
+    image[60:110, 50:150] = rng.normal(25, 8, (50, 100, 3))  # folds, as dark on the mask as in one of the holes
+    image[130:140, 130:140] = rng.normal(231, 8, (10, 10, 3))
+    image = image.clip(0, 255).astype(np.uint8)
+    gap, fold = np.s_[130:140, 130:140], np.s_[80:90, 60:70]
+    whole = mask.copy()
+    mask[gap] = mask[fold] = mask[50, 50] = False
+    found = cleaned(mask, image)
+    assert not found[gap].any() and found[fold].all() and found[50, 50]
+    assert (cleaned(mask) == whole).all()
+
+
 def test_labels_where_hull_mask_and_seeds_meet():
     outline = np.zeros((60, 60), dtype=bool)
     outline[10:50, 10:50] = True

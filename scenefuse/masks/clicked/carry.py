@@ -188,10 +188,10 @@ def _asked(
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and what comes of it
     is taken if it agrees as well, fills the space better and is not beyond it; but not for another seam alone.
     """
-    found = _candidates(ask(view, inside, outside, box, None), inside, outside, tolerance_px)
+    found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
     best = max(found, key=lambda one: one.score)
     if space is not None and box is None:
-        more = _candidates(ask(view, inside, outside, None, space.box), inside, outside, tolerance_px)
+        more = _candidates(ask(view, inside, outside, None, space.box), view.pixels, inside, outside, tolerance_px)
         other = max(
             [best, *more], key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask)
         )
@@ -209,11 +209,15 @@ class _Candidate(NamedTuple):
 
 
 def _candidates(
-    asked: tuple[list[Mask], Array], inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float
+    asked: tuple[list[Mask], Array],
+    image: NDArray[np.uint8],
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    tolerance_px: float,
 ) -> list[_Candidate]:
     """What a method answers, without specks and parts that nothing prompts."""
     on, off = np.concatenate(inside), np.concatenate(outside)
-    masks = [prompted_parts(cleaned(mask), on, off) for mask in asked[0]]
+    masks = [prompted_parts(cleaned(mask, image), on, off) for mask in asked[0]]
     return [
         _Candidate(
             m, float(q), agrees(m, inside, outside, tolerance_px) + QUALITY_WEIGHT * float(q) - 2 * (not m.any())

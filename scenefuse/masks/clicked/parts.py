@@ -54,7 +54,7 @@ def with_parts(
         reach = cKDTree(on), PART_REACH * max(mask.shape)
         masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None, None)
         for row in np.argsort(-quality):
-            part = prompted_parts(cleaned(masks[row]), on, off)
+            part = prompted_parts(cleaned(masks[row], view.pixels), on, off)
             own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate(inside), off))
             holds = part.any() and share_in(part, on, 1.0) >= SURE
             if quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign) and part.sum() <= mask.sum():
