@@ -19,6 +19,8 @@ PINHOLE_SHARE = 0.0005
 """Holes smaller than this share of a mask say nothing: a network's are as coarse."""
 GAP_EVIDENCE = 0.7
 """A hole is one if its colours are twice as frequent around the mask as on it."""
+COLOURS_WIDTH_PX = 300
+"""Pixels along a mask's longer side of which its colours are learnt."""
 AROUND = 0.1
 """What is around a mask: so far, as a share of its longer side."""
 EDGE_WIDTH_PX = 1024
@@ -252,22 +254,22 @@ def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None, smallest_share: 
             small[0] = False
             gaps = small & (parts[:, cv2.CC_STAT_AREA] >= PINHOLE_SHARE * area)
             if image is not None and not side and gaps.any():
-                evidence = _around(image, mask, small[labels])
-                means = np.bincount(labels.ravel(), evidence.ravel(), minlength=count) / parts[:, cv2.CC_STAT_AREA]
-                small &= ~(gaps & (means < -GAP_EVIDENCE))
+                colours = _colours_of(image, mask, small[labels])
+                for gap in np.flatnonzero(gaps):
+                    x, y, width, height = parts[gap, : cv2.CC_STAT_AREA]
+                    window = np.s_[y : y + height, x : x + width]
+                    small[gap] = colours.evidence(image[window])[labels[window] == gap].mean() >= -GAP_EVIDENCE
             mask = np.where(small[labels], not side, mask)
     return mask
 
 
-def _around(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> NDArray[np.float32]:
-    """(H, W) log ratios of the colours of a mask over those around it."""
-    low, high = (edge(np.argwhere(mask), axis=0) for edge in (np.min, np.max))
-    grow = int(AROUND * (high - low).max())
-    near = tuple(slice(max(0, a - grow), b + grow + 1) for a, b in zip(low, high))
-    colours = learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
-    found = np.zeros(mask.shape, dtype=np.float32)
-    found[near] = colours.evidence(image[near])
-    return found
+def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> Colours:
+    """The colours of a mask (H, W), beside those around it; some thousands of pixels of each are enough."""
+    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    longest = max(width, height)
+    grow, step = int(AROUND * longest), max(1, longest // COLOURS_WIDTH_PX)
+    near = np.s_[max(0, y - grow) : y + height + grow : step, max(0, x - grow) : x + width + grow : step]
+    return learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
 
 
 def fill_hull(canvas: NDArray[np.uint8], points: NDArray[np.float64], value: int) -> None:

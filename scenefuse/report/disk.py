@@ -3,6 +3,7 @@
 import math
 import os
 import shutil
+import stat
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from PIL.ExifTags import Base
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.stage import StageError
 
-# Of the demo, the statue and the dragon (docs/results.md, The room on the disk).
+# Fitted by hand to what the demo took (docs/results.md, The room on the disk).
 FEATURE_BYTES = 450
 """A feature, in both databases of a model, with its matches."""
 PHOTO_BYTES = 2
@@ -113,7 +114,7 @@ def parts_of(folder: Path) -> dict[str, int]:
                 status = os.lstat(os.path.join(place, name))
             except OSError:
                 continue
-            if TEMPORARY not in name and not os.path.islink(os.path.join(place, name)):
+            if TEMPORARY not in name and not stat.S_ISLNK(status.st_mode):
                 part = below[0] if below else name
                 parts[part] = parts.get(part, 0) + status.st_size
     return parts
