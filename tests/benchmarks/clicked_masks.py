@@ -27,6 +27,10 @@ from scenefuse.transforms import Array
 from scenefuse.workspace import Workspace, read_workspace
 
 
+RIGHT = 0.97
+"""IoU from which a mask is right."""
+
+
 class Remembering:
     """A network that encodes every photo once."""
 
@@ -105,7 +109,7 @@ def clicked_masks(
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.4f")
     failed = int(table.error.astype(bool).sum())
-    for column in ("median", "mean", "least", "kept"):
+    for column in ("median", "mean", "least", "right", "kept"):
         print(f"{column}: worst {table[column].min():.3f}, median {table[column].median():.3f}", flush=True)
     print(f"{len(table)} choices, {failed} without masks; {len(thing.truth)} photos")
 
@@ -139,7 +143,7 @@ def _trial(
         )
         scored = score_masks(found.masks, found.target, thing.photos.views, settings)
     except StageError as error:
-        return row | dict.fromkeys(("median", "mean", "least", "kept", "left_out"), 0) | {"error": str(error)}
+        return row | dict.fromkeys(("median", "mean", "least", "right", "kept", "left_out"), 0) | {"error": str(error)}
     iou = {
         photo: mask_iou(mask, thing.truth[photo])
         for photo, mask in scored.masks.items()
@@ -151,6 +155,7 @@ def _trial(
         "median": round(float(np.median(values)), 4),
         "mean": round(float(values.mean()), 4),
         "least": round(float(values.min()), 4),
+        "right": int((values >= RIGHT).sum()),
         "kept": len(iou),
         "left_out": len(found.left_out),
         "error": "",
