@@ -26,7 +26,6 @@ from scenefuse.stage import StageError, read_json, run, value
 from scenefuse.transforms import Array
 from scenefuse.workspace import Workspace, read_workspace
 
-
 RIGHT = 0.97
 """IoU from which a mask is right."""
 
