@@ -114,7 +114,7 @@ class SidePanel:
             ui.button("Remove clicks in missing photos", on_click=self._page.remove_lost).props("dense outline")
         if document.rows and not board.source.listed:
             source = board.source
-            text = f"Write {document.path} into the column {source.column} of the table of {source.listed_in}."
+            text = f"Write {document.path} into the column {source.column} of the table of {source.of}."
             ui.label(text).classes("text-xs text-orange-900")
         words = command(self._page.session.configfile, str(board.source.result))
         ui.label(as_text(words)).classes("code w-full").mark("command")

@@ -1,6 +1,6 @@
 """What an object's tables and photos are, by the settings and results of the workflow."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,10 @@ OF_SCENE: dict[Kind, str] = {
     "labels": ONLY_IF + "Click the object's ends, top and foot in one photo, and what it touches as outside.",
     "points": ONLY_IF + "Mark at least four points that bound the object, each in two or more photos.",
 }
+OF_OWN_LENGTHS: dict[Kind, str] = {
+    "lengths": "Needed only if the object shall be in metres. Write the name and the metres of a length that you know,"
+    " a scale bar's, and click its two ends, each in two or more photos.",
+}
 OF_LENGTHS: dict[Kind, str] = {
     "lengths": "Needed only where a scene without GPS and control points shall be in metres. Write the name and the"
     " metres of a length that you know, and click its two ends, each in two or more photos.",
@@ -43,6 +47,7 @@ class Source:
         models: folders where a COLMAP model of these photos may lie, the best first.
         listed: whether that table names the path.
         result: what the workflow makes of it.
+        of: which table that is.
         least_inside: labels: fewest clicks inside.
     """
 
@@ -55,12 +60,8 @@ class Source:
     models: tuple[Path, ...]
     listed: bool
     result: Path
+    of: Literal["scenes", "objects"] = "objects"
     least_inside: int = 1
-
-    @property
-    def listed_in(self) -> str:
-        """The table that names the path."""
-        return "scenes" if self.kind == "lengths" else "objects"
 
     @property
     def sizes(self) -> Sizes:
@@ -69,7 +70,8 @@ class Source:
 
 
 def sources_of(project: Project, name: str) -> list[Source]:
-    """The tables of an object: its prompts, and fiducials and known lengths in the scene's photos where it has any.
+    """The tables of an object: its prompts, and fiducials in the scene's photos where it has any; known lengths in
+    these, or in the photos of an object by itself.
 
     Raises:
         StageError: there is no such object, or no photos.
@@ -77,27 +79,40 @@ def sources_of(project: Project, name: str) -> list[Source]:
     if name not in project.objects:
         known = ", ".join(project.objects) or "none"
         raise StageError(f"unknown object '{name}'; {project.settings['objects']} lists: {known}")
-    row, found = project.objects[name], []
-    if row.get("photos"):
-        results = Path("results/objects") / name
-        pictures = object_pictures(Path(row["photos"]), results, project.of("object", name)["object"]["frames"])
-        path, listed = _table(project, "objects", name, "prompts")
-        models: tuple[Path, ...] = (results / "sparse",)
-        made = results / "masks.png"
-        found.append(Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed, made))
-    scene = project.scenes[row["scene"]] if row.get("scene") else {}
-    if scene.get("photos"):
-        results, made = Path("results/scenes") / row["scene"], Path("results/objects") / name / "fused.ply"
-        pictures = scene_pictures(Path(scene["photos"]), results)
-        path, listed = _table(project, "objects", name, "fiducials")
-        models = (results / "georeferenced", results / "sparse")
-        found.append(Source("fiducials", "In the scene", OF_SCENE, path, "labels", pictures, models, listed, made, 3))
-        path, listed = _table(project, "scenes", row["scene"], "lengths")
-        made = results / "residuals.tsv"
-        found.append(Source("lengths", "Known lengths", OF_LENGTHS, path, "lengths", pictures, models, listed, made))
+    found = [*_in_the_object_s_photos(project, name), *_in_the_scene_s_photos(project, name)]
     if not found:
         raise StageError(f"object '{name}' and its scene are clouds: there are no photos to click in")
     return found
+
+
+def _in_the_object_s_photos(project: Project, name: str) -> Iterator[Source]:
+    row, results = project.objects[name], Path("results/objects") / name
+    if not row.get("photos"):
+        return
+    pictures = object_pictures(Path(row["photos"]), results, project.of("object", name)["object"]["frames"])
+    models: tuple[Path, ...] = (results / "sparse",)
+    path, listed = _table(project, "objects", name, "prompts")
+    made = results / "masks.png"
+    yield Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed, made)
+    if row.get("lengths") or not row.get("scene"):
+        path, listed = _table(project, "objects", name, "lengths")
+        made = results / "sparse.json"
+        yield Source("lengths", "Lengths on it", OF_OWN_LENGTHS, path, "lengths", pictures, models, listed, made)
+
+
+def _in_the_scene_s_photos(project: Project, name: str) -> Iterator[Source]:
+    scene = project.objects[name].get("scene")
+    if not scene or not project.scenes[scene].get("photos"):
+        return
+    results = Path("results/scenes") / scene
+    pictures = scene_pictures(Path(project.scenes[scene]["photos"]), results)
+    models = (results / "georeferenced", results / "sparse")
+    path, listed = _table(project, "objects", name, "fiducials")
+    made = Path("results/objects") / name / "fused.ply"
+    yield Source("fiducials", "In the scene", OF_SCENE, path, "labels", pictures, models, listed, made, least_inside=3)
+    path, listed = _table(project, "scenes", scene, "lengths")
+    made = results / "residuals.tsv"
+    yield Source("lengths", "Known lengths", OF_LENGTHS, path, "lengths", pictures, models, listed, made, of="scenes")
 
 
 def object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dict[str, Picture]:

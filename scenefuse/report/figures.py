@@ -15,7 +15,7 @@ from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
-from scenefuse.stage import atomic_directory
+from scenefuse.stage import atomic_directory, read_json
 from scenefuse.transforms import Array, box_corners
 from scenefuse.workspace import read_views
 
@@ -72,13 +72,21 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
 
 
 def draw_lone_object(
-    *, name: str, object_cloud: Path, workspace: Path, masks: Path, stages: tuple[Path, ...], figures: Path
+    *,
+    name: str,
+    object_cloud: Path,
+    sparse_json: Path,
+    workspace: Path,
+    masks: Path,
+    stages: tuple[Path, ...],
+    figures: Path,
 ) -> None:
     """Draw an object that lies in no scene: object.png (as `draw_object` does), and its cloud for the page's 3D view.
 
     Args:
         name: the object's, for the titles.
         object_cloud: its cloud (PLY), in its own frame.
+        sparse_json: says whether that is in metres.
         workspace: its undistorted COLMAP workspace.
         masks: folder of its masks, {photo}.png.
         stages: folders of its four training stages.
@@ -89,7 +97,8 @@ def draw_lone_object(
     framed = inner(cloud.points)
     low, high = framed.min(0), framed.max(0)
     points = thin(merge(cloud, cloud), VIEW_POINTS)
-    view = View(points, {0: name}, "object units", low, high, SIDES_DEG[0], 18.0, len(cloud), len(cloud))
+    unit = read_json(sparse_json).get("length_unit", {}).get("value", "object units")
+    view = View(points, {0: name}, unit, low, high, SIDES_DEG[0], 18.0, len(cloud), len(cloud))
     with atomic_directory(figures) as folder:
         save_png(folder / "object.png", sheet)
         write_view(folder, view)

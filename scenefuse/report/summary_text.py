@@ -96,6 +96,20 @@ def _survey_lines(fields: Fields) -> list[str]:
     return lines + _line("lengths", _pairs(long))
 
 
+def _own_lengths(stages: Fields, fields: Fields) -> str:
+    """How well an object's own known lengths agree with each other and, once it is placed, with the scene; or ""."""
+    off = find(stages, "sparse.lengths_off_m")
+    if not off:
+        return ""
+    told = "in metres by known lengths; off one scale by " + ", ".join(f"{n} {o:+.2g} m" for n, o in off.items())
+    scale = find(fields, "fine.scale")
+    if not isinstance(scale, float):
+        return told
+    if fields["crop.diagonal"]["unit"] == "m":
+        return f"{told}; in the scene's metres its size differs by {100 * (scale - 1):+.2g} %"
+    return f"{told}; a metre is {scale:.4g} scene units"
+
+
 def _beside(measure: str, column: str) -> str:
     """The column of scenes.tsv for a completion metric itself, its null, before or after."""
     return measure if column == "value" else f"{measure}_{column}"
@@ -145,6 +159,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
     lines += _line("given", _given(item.stages, "object"))
     if row["registered"] is not None and row["registered"] == row["registered"]:
         lines += _line("cameras", _cameras(row, "frames"))
+    lines += _line("lengths", _own_lengths(item.stages, fields))
     lines += _line("masks", _pairs([("masks", row["masks"], ""), ("IoU with truth", row["mask_iou"], "")]))
     for stage in (1, 2, 3, 4):
         names = {

@@ -72,15 +72,16 @@ def georegister(
     up, cue = estimate_up(rotations, centres)
     surveyed = None if control is None else read_sighted(control, model, listed)
     found = georeference(gps, surveyed, up, settings, seed)
+    sizes = {p.name: (p.width, p.height) for p in listed}
     if lengths is not None and not found.metric:
-        known = read_lengths(lengths, model, listed)
+        known = read_lengths(lengths, model, sizes)
         found = replace(found, placement=scaled(found.placement, known.scale, len(known.names)))
     transform = found.placement.local_from_model
     model.transform(pycolmap.Sim3d(transform.scale, pycolmap.Rotation3d(transform.rotation), transform.translation))
     adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
     with atomic_directory(georeferenced) as temporary:
         model.write(temporary)
-    left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, listed))
+    left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, sizes))
     write_residuals(residuals, found, left)
     _, turned, _ = camera_poses(model)
     write_json(report, georeference_report(found, left, cue, roll_spread_deg(turned, UP)) | adjustment)

@@ -4,10 +4,12 @@ He et al. 2026, section on the scene: bundle adjustment with 100 iterations, 200
 """
 
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pycolmap
 
 from scenefuse.sfm.bundle.adjustment import (
@@ -19,10 +21,21 @@ from scenefuse.sfm.bundle.adjustment import (
     drop_outliers,
 )
 from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
+from scenefuse.sfm.frames import original_sizes
 from scenefuse.sfm.given.cameras import triangulated
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import read_photos
-from scenefuse.stage import StageError, atomic_directory, quantity, scratch_directory, setting, threads, write_json
+from scenefuse.sfm.survey.lengths import read_lengths
+from scenefuse.stage import (
+    StageError,
+    atomic_directory,
+    quantity,
+    read_json,
+    scratch_directory,
+    setting,
+    threads,
+    write_json,
+)
 
 # Fewest matches of the first pair of photos; COLMAP's own.
 INIT_MIN_INLIERS = 100
@@ -47,6 +60,7 @@ def map_photos(
     report: Path,
     calibrated: bool = False,
     cameras: Path | None = None,
+    lengths: Path | None = None,
     settings: MappingSettings,
     seed: int,
 ) -> None:
@@ -60,16 +74,51 @@ def map_photos(
         report: output, JSON: photos registered, errors, the lens and why, models left out.
         calibrated: whether the database holds a known calibration; it is held then.
         cameras: cameras that another program found, see `triangulated`; nothing is mapped or adjusted then.
+        lengths: known lengths between clicked points (`read_lengths`), which bring the model into metres.
         settings: mapping settings.
         seed: of RANSAC and of the choice of the first pair.
 
     Raises:
-        StageError: too small a share of the photos is registered; what `triangulated` says.
+        StageError: too small a share of the photos is registered; what `triangulated` and `read_lengths` say.
     """
     names = [p.name for p in read_photos(photos)]
     if cameras is not None:
-        _take_cameras(cameras, folder, names, database, sparse, report, settings, seed)
-        return
+        model, content = _taken(cameras, folder, names, database, sparse, settings, seed)
+    else:
+        model, content = _mapped(names, folder, database, sparse, calibrated, settings, seed)
+    content |= in_metres(model, lengths, original_sizes(read_json(photos)))
+    with atomic_directory(sparse) as temporary:
+        model.write(temporary)
+    write_json(report, content | {"seed": quantity(seed, "1")})
+
+
+def in_metres(
+    model: pycolmap.Reconstruction, lengths: Path | None, sizes: Mapping[str, tuple[int, int]]
+) -> dict[str, Any]:
+    """Scale a model in place by known lengths, where there are any; its unit and how far they are off, as quantities.
+
+    Raises:
+        StageError: what `read_lengths` says.
+    """
+    if lengths is None:
+        return {}
+    known = read_lengths(lengths, model, sizes)
+    model.transform(pycolmap.Sim3d(known.scale, pycolmap.Rotation3d(), np.zeros(3)))
+    off = dict(zip(known.names, known.off_m.tolist()))
+    print("in metres by known lengths, off by " + ", ".join(f"{n} {o:+.3g} m" for n, o in off.items()), flush=True)
+    return {"length_unit": quantity("m", ""), "lengths_off_m": quantity(off, "m")}
+
+
+def _mapped(
+    names: list[str],
+    folder: Path,
+    database: Path,
+    sparse: Path,
+    calibrated: bool,
+    settings: MappingSettings,
+    seed: int,
+) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
+    """The model of photos by name, and what it is, as quantities."""
     ranked = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
     _check_registered(ranked, names, settings.min_registered_share)
     before_px = ranked[0].compute_mean_reprojection_error()
@@ -102,40 +151,26 @@ def map_photos(
         print(f"note: {note}", flush=True)
     for entry in left_out:
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
-    with atomic_directory(sparse) as temporary:
-        model.write(temporary)
-    content = {
+    return model, {
         **summary,
         "mean_reprojection_error_before_last_adjustment_px": quantity(before_px, "px"),
         "models_left_out": quantity(left_out, ""),
         "notes": quantity(notes, ""),
-        "seed": quantity(seed, "1"),
     }
-    write_json(report, content)
 
 
-def _take_cameras(
-    cameras: Path,
-    folder: Path,
-    names: list[str],
-    database: Path,
-    sparse: Path,
-    report: Path,
-    settings: MappingSettings,
-    seed: int,
-) -> None:
-    """The same outputs from given cameras."""
+def _taken(
+    cameras: Path, folder: Path, names: list[str], database: Path, sparse: Path, settings: MappingSettings, seed: int
+) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
+    """The same from given cameras."""
     work = sparse.with_name(f"{sparse.name}-given")
     model = triangulated(cameras, folder, database, work, _mapper_options(len(names), True, seed))
     _check_registered([model], names, settings.min_registered_share)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
     print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
-    with atomic_directory(sparse) as temporary:
-        model.write(temporary)
     notes = [f"cameras are those of {cameras.name}, held"]
-    content = {"models_left_out": quantity([], ""), "notes": quantity(notes, ""), "seed": quantity(seed, "1")}
-    write_json(report, summary | content)
+    return model, summary | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 
 
 def _models(

@@ -119,6 +119,7 @@ def test_a_failed_object_does_not_block_the_other_and_is_named(project, refused)
         ("scenes", "cameras", "results/scenes/yard/sparse.json"),
         ("scenes", "control", "results/scenes/yard/georeference.json"),
         ("scenes", "lengths", "results/scenes/yard/georeference.json"),
+        ("objects", "lengths", "results/objects/shed/sparse.json"),
         ("objects", "prompts", "results/objects/shed/masks.json"),
         ("objects", "fiducials", "results/objects/shed/registration/full/crop.json"),
     ],
@@ -134,6 +135,18 @@ def test_a_file_in_a_table_that_is_not_there_is_one_sentence(project, refused, t
         project.objects = "\t".join(["object", *cells]) + "\n" + "\t".join(["shed", *cells.values()]) + "\n"
     name = "scene 'yard'" if table == "scenes" else "object 'shed'"
     assert f"{table}.tsv, {name}: mine.x in the column {column} does not exist" in refused("-n", target)
+
+
+def test_known_lengths_in_unknown_photos_of_an_object_stop_before_anything_runs(project, refused):
+    project.photos("close")
+    project.objects = "object\tphotos\tprompts\tlengths\nshed\tclose\tprompts.tsv\tbar.tsv\n"
+    (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t1\t2\n")
+    rows = [f"bar\t1.5\t{end}\t{photo}.jpg\t10\t10" for end in "ab" for photo in (0, 7)]
+    (project.path / "bar.tsv").write_text("\n".join(["length\tmetres\tend\tphoto\tx_px\ty_px", *rows]) + "\n")
+    output = refused("-n", "results/objects/shed/sparse.json")
+    assert (
+        "object 'shed': bar.tsv: point bar a is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)" in output
+    )
 
 
 def test_control_points_in_unknown_photos_stop_before_anything_runs(project, refused):

@@ -59,6 +59,14 @@ def test_known_lengths_are_clicked_in_the_scene_s_photos(yard):
     assert board.source.pictures.keys() == opened(yard).boards[1].source.pictures.keys()
 
 
+def test_an_object_by_itself_has_known_lengths_in_its_own_photos(yard):
+    yard.objects = "object\tphotos\tprompts\nshed\tclose\tprompts.tsv\n"
+    first, second = opened(yard).boards
+    assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "shed_lengths.tsv")
+    assert second.source.kind == "lengths" and second.source.of == "objects"
+    assert second.source.result.as_posix() == "results/objects/shed/sparse.json"
+
+
 def test_photos_have_the_names_that_the_workflow_gives_them(yard):
     (yard.path / "close/ring").mkdir()
     (yard.path / "close/0.jpg").rename(yard.path / "close/ring/0.jpg")

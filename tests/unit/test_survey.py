@@ -13,6 +13,7 @@ from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
+from scenefuse.sfm.mapping import in_metres
 from scenefuse.sfm.photos import gps_accuracies, list_photos, read_photos
 from scenefuse.sfm.survey.control_file import read_control
 from scenefuse.sfm.survey.placement import GeoreferenceSettings
@@ -348,6 +349,19 @@ def test_known_lengths_give_metres_without_gps(tmp_path, model):
     beside, _, _ = georeferenced(tmp_path / "gps", model, FLIGHT.photos(sd_m=0.02), lengths=path)
     assert value(beside, "status") == "georeferenced" and not value(beside, "lengths_used")
     assert value(beside, "length_rms_m") < 0.2
+
+
+def test_known_lengths_bring_an_object_s_model_into_metres(tmp_path, model):
+    path, own = tmp_path / "lengths.tsv", pycolmap.Reconstruction(model)
+    path.write_text("\n".join(length_lines()) + "\n")
+    sizes = {photo.name: (photo.width, photo.height) for photo in without_gps()}
+    before = camera_poses(own)[2]
+    content = in_metres(own, path, sizes)
+    centres = camera_poses(own)[2]
+    size = [np.linalg.norm(c - c.mean(0), axis=1).mean() for c in (centres, FLIGHT.centres, before)]
+    assert size[0] / size[1] == pytest.approx(1, abs=0.01) and abs(size[2] / size[1] - 1) > 0.1
+    assert value(content, "length_unit") == "m" and abs(value(content, "lengths_off_m")["door"]) < 0.2
+    assert in_metres(own, None, sizes) == {} and np.array_equal(camera_poses(own)[2], centres)
 
 
 @pytest.mark.parametrize(

@@ -225,7 +225,10 @@ def draw(capture, fine, figures):
 def test_an_object_by_itself_is_drawn_and_can_be_turned(capture, tmp_path):
     stages = tuple(capture / f"stage{stage}" for stage in (1, 2, 3, 4))
     places = {"object_cloud": capture / "object.ply", "workspace": capture / "undistorted", "masks": capture / "masks"}
+    write_json(tmp_path / "sparse.json", {"length_unit": quantity("m", "")})
+    places["sparse_json"] = tmp_path / "sparse.json"
     draw_lone_object(name="box", **places, stages=stages, figures=tmp_path / "figures")
+    assert read_view(tmp_path / "figures").unit == "m"
     assert {p.name for p in (tmp_path / "figures").iterdir()} == {"object.png", "view.ply", "view.json"}
     view = read_view(tmp_path / "figures")
     assert len(view.cloud) == 6000 and not view.cloud.fields["shown"].any()

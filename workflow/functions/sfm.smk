@@ -81,13 +81,14 @@ def surveyed(scene):
 @cache
 def check_survey(scene):
     """Stop before hours of mapping where a survey's file cannot be read or names photos that the scene lacks."""
+    from scenefuse.sfm.photos import photo_names
     from scenefuse.sfm.survey.check import check_files
 
     row, files = scene_row(scene), surveyed(scene)
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
     if own and not made_here(row["photos"]):
         try:
-            check_files(Path(row["photos"]), **own)
+            check_files(photo_names(Path(row["photos"])), **own)
         except StageError as error:
             raise WorkflowError(
                 f"{config['scenes']}, scene '{scene}': {error}"
@@ -103,3 +104,37 @@ def survey_of(wildcards):
 def survey_flags(wildcards):
     """The same as command-line options."""
     return flags(surveyed(wildcards.scene))
+
+
+def lengths_flag(wildcards):
+    """Known lengths in an object's photos, where the table has them, as a command-line option."""
+    return flags(
+        dict(zip(["lengths"], own_file("object", wildcards.object, "lengths")))
+    )
+
+
+@cache
+def check_lengths(name):
+    """Stop before hours of matching where their file cannot be read or names photos that the object lacks."""
+    from scenefuse.sfm.photos import photo_names
+    from scenefuse.sfm.survey.check import check_files
+
+    photos = object_row(name)["photos"]
+    for file in own_file("object", name, "lengths"):
+        if Path(photos).is_dir() and not made_here(file):
+            try:
+                names = [photo.replace("/", "_") for photo in photo_names(Path(photos))]
+                check_files(names, lengths=Path(file))
+            except StageError as error:
+                raise WorkflowError(
+                    f"{config['objects']}, object '{name}': {error}"
+                ) from None
+
+
+def given_of(wildcards):
+    """Input function: what a user gives an object's cameras: other programs' files, known lengths."""
+    check_lengths(wildcards.object)
+    return [
+        *cameras_of("object")(wildcards),
+        *own_file("object", wildcards.object, "lengths"),
+    ]

@@ -111,6 +111,7 @@ rule draw_lone_object:
     """An object that lies in no scene: its photos, masks, stages and cloud."""
     input:
         cloud="results/objects/{object}/object.ply",
+        sparse="results/objects/{object}/sparse.json",
         workspace="results/objects/{object}/undistorted",
         masks="results/objects/{object}/masks",
         stages=expand(
@@ -143,7 +144,7 @@ rule draw_lone_object:
     message:
         "{wildcards.object}: figures"
     shell:
-        "exec python {params.script} --name {wildcards.object} --object-cloud {input.cloud} --workspace {input.workspace}"
+        "exec python {params.script} --name {wildcards.object} --object-cloud {input.cloud} --sparse-json {input.sparse} --workspace {input.workspace}"
         " --masks {input.masks} --stages {input.stages} --figures {output} &> {log}"
 
 

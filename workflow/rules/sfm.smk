@@ -209,6 +209,7 @@ rule map_scene_photos:
         options=settings("scene.sparse"),
         calibrated=calibrated("scene"),
         cameras=cameras_flag("scene"),
+        lengths="",
         files=state_of(cameras_of("scene")),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
@@ -217,12 +218,13 @@ rule map_scene_photos:
         "Scene {wildcards.scene}: cameras and sparse points"
     shell:
         "exec python {params.script} --folder {input.folder} --photos {input.photos} --database {input.database}"
-        " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} {params.cameras} --seed {params.seed} {params.options} &> {log}"
+        " --sparse {output.model} --report {output.report} --calibrated {params.calibrated} {params.cameras} {params.lengths} --seed {params.seed}"
+        " {params.options} &> {log}"
 
 
 use rule map_scene_photos as map_object_photos with:
     input:
-        cameras_of("object"),
+        given_of,
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
@@ -242,7 +244,8 @@ use rule map_scene_photos as map_object_photos with:
         options=settings("object.sparse"),
         calibrated=calibrated("object"),
         cameras=cameras_flag("object"),
-        files=state_of(cameras_of("object")),
+        lengths=lengths_flag,
+        files=state_of(given_of),
         seed=config["seed"],
         script=script("sfm/map_photos.py"),
         code=code("sfm/map_photos.py"),

@@ -2,18 +2,16 @@
 
 from pathlib import Path
 
-from scenefuse.sfm.photos import photo_names
 from scenefuse.sfm.survey.control_file import read_control, unknown_photo
 from scenefuse.sfm.survey.lengths import read_ends
 
 
-def check_files(folder: Path, control: Path | None = None, lengths: Path | None = None) -> None:
-    """Check that the files of a survey can be read, and that their clicks are in photos of the folder.
+def check_files(names: list[str], control: Path | None = None, lengths: Path | None = None) -> None:
+    """Check that the files of a survey can be read, and that their clicks are in photos of these names.
 
     Raises:
         StageError: what `read_control` and `read_ends` say; a click in a photo that does not exist.
     """
-    names = photo_names(folder)
     clicked: list[tuple[Path, str, str]] = []
     if control is not None:
         clicked += [(control, point.name, photo) for point in read_control(control).points for photo, _ in point.clicks]

@@ -1,5 +1,6 @@
 """Known lengths in photos: scale bars, which bring a model into metres where there is neither GPS nor control."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +10,6 @@ import pycolmap
 
 from scenefuse.io.tables import read_lines
 from scenefuse.sfm.fiducials import Clicks, triangulate
-from scenefuse.sfm.photos import Photo
 from scenefuse.sfm.survey.control import CLICK_LIMIT
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -49,17 +49,26 @@ class Lengths:
         """Metres in a unit of the model, by least squares."""
         return float(self.metres @ self.in_model / (self.in_model @ self.in_model))
 
+    @property
+    def off_m(self) -> Array:
+        """(L,) metres that they are too long in the model once it is scaled."""
+        return self.scale * self.in_model - self.metres
 
-def read_lengths(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]) -> Lengths:
+
+def read_lengths(path: Path, model: pycolmap.Reconstruction, sizes: Mapping[str, tuple[int, int]]) -> Lengths:
     """Read lengths.tsv, a line a click: name of the length, metres, end (any two words), photo, pixel. Both ends are
     clicked in two photos or more.
+
+    Args:
+        path: of the file.
+        model: cameras of the photos.
+        sizes: photo name -> (width, height) of the photos clicked in.
 
     Raises:
         StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
             different values, an end that is missing, clicks that contradict each other, lengths that do.
     """
     metres, ends, clicks = read_ends(path)
-    sizes = {p.name: (p.width, p.height) for p in photos}
     limit_px = CLICK_LIMIT * max(max(camera.width, camera.height) for camera in model.cameras.values())
     names, places, _ = triangulate(clicks, model, limit_px, sizes)
     at = dict(zip(names, places))
