@@ -226,8 +226,13 @@ def _point_problems(rows: Rows) -> list[str]:
 
 
 def _length_problems(rows: Rows) -> list[str]:
-    ends = Counter(label.split("\t")[0] for label in {row.label for row in rows})
-    return [f"{name} has one end: click the other one, too." for name, count in sorted(ends.items()) if count < 2]
+    metres: dict[str, set[str]] = {}
+    ends: dict[str, set[str]] = {}
+    for name, long, end in (row.label.split("\t") for row in rows):
+        metres.setdefault(name, set()).add(long)
+        ends.setdefault(name, set()).add(end)
+    found = [f"{name} has one end: click the other one, too." for name in ends if len(ends[name]) < 2]
+    return found + [f"{name} is {' and '.join(m)} m: write it again." for name, m in metres.items() if len(m) > 1]
 
 
 def _name(name: str, what: str) -> str:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 from scenefuse.io.project import Project
 from scenefuse.pick.clicks import Kind, Sizes
 from scenefuse.pick.pictures import Picture, upright_size
-from scenefuse.sfm.frames import thin_out
+from scenefuse.sfm.frames import frame_name, thin_out
 from scenefuse.sfm.photos import photo_names
 from scenefuse.stage import StageError, read_json
 
@@ -130,7 +130,7 @@ def object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dict
         return _video_pictures(source, results)
     names = photo_names(source)
     chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
-    return _pictures((name.replace("/", "_"), source / name) for name in chosen)
+    return _pictures((frame_name(name), source / name) for name in chosen)
 
 
 def scene_pictures(source: Path, results: Path) -> dict[str, Picture]:

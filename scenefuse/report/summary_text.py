@@ -103,7 +103,7 @@ def _own_lengths(stages: Fields, fields: Fields) -> str:
         return ""
     told = "in metres by known lengths; off one scale by " + ", ".join(f"{n} {o:+.2g} m" for n, o in off.items())
     scale = find(fields, "fine.scale")
-    if not isinstance(scale, float):
+    if scale is None or find(fields, "fine.status") != "registered":
         return told
     if fields["crop.diagonal"]["unit"] == "m":
         return f"{told}; in the scene's metres its size differs by {100 * (scale - 1):+.2g} %"

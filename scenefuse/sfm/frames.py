@@ -70,6 +70,11 @@ def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:
     return {name: (entry["width"], entry["height"]) for name, entry in content["origin"]["value"].items()}
 
 
+def frame_name(photo: str) -> str:
+    """The name of the frame that is made of a photo, by its path in the folder of photos."""
+    return photo.replace("/", "_")
+
+
 def thin_out(count: int, step: int, limit: int) -> list[int]:
     """Indices 0, step, 2 step, ... below count; spread evenly over the same range where more than `limit` (0: none)."""
     chosen = list(range(0, count, max(step, 1)))
@@ -90,14 +95,14 @@ def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[st
     names = photo_names(source)
     flat: dict[str, str] = {}
     for name in (names[i] for i in thin_out(len(names), settings.frame_step, settings.max_frames)):
-        stem = Path(name.replace("/", "_")).stem
+        stem = Path(frame_name(name)).stem
         if stem in flat:
             raise StageError(f"{flat[stem]} and {name} in {source} would share the mask {stem}.png; rename one of them")
         flat[stem] = name
 
     def copy(name: str) -> tuple[str, dict[str, Any]]:
         photo = inspect_photo(source, name)
-        target = output / name.replace("/", "_")
+        target = output / frame_name(name)
         width, height = photo.width, photo.height
         if photo.orientation == 1 and width <= settings.max_width_px:
             shutil.copyfile(source / name, target)

@@ -237,6 +237,19 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
 
 
+def test_the_text_says_what_the_scene_makes_of_an_object_s_known_lengths(results):
+    known = {"length_unit": quantity("m", ""), "lengths_off_m": quantity({"bar": 0.002, "edge": -0.001}, "m")}
+    for name in ("house", "balloon"):
+        write_json(results / f"objects/{name}/sparse.json", known)
+        folder = results / f"objects/{name}/registration/full"
+        fine = json.loads((folder / "fine.json").read_text())
+        write_json(folder / "fine.json", fine | {"scale": quantity(1.02, "scene units per object unit")})
+    text = " ".join((summarise(results) / "summary.txt").read_text().split())
+    said = "in metres by known lengths; off one scale by bar +0.002 m, edge -0.001 m"
+    assert f"{said}; in the scene's metres its size differs by +2 %" in text
+    assert text.count(said) == 2 and text.count("its size differs") == 1  # the balloon is not registered
+
+
 def test_the_text_says_where_shared_features_put_the_object(results):
     said = {"found": quantity(True, ""), "reason": quantity("9 of 12 points agree", ""), "scale": quantity(2.5, "")}
     write_json(results / "objects/house/alignment.json", said | {"scale_sd_log": quantity(0.0123, "1")})

@@ -116,6 +116,7 @@ def lengths_flag(wildcards):
 @cache
 def check_lengths(name):
     """Stop before hours of matching where their file cannot be read or names photos that the object lacks."""
+    from scenefuse.sfm.frames import frame_name
     from scenefuse.sfm.photos import photo_names
     from scenefuse.sfm.survey.check import check_files
 
@@ -123,7 +124,7 @@ def check_lengths(name):
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
             try:
-                names = [photo.replace("/", "_") for photo in photo_names(Path(photos))]
+                names = [frame_name(photo) for photo in photo_names(Path(photos))]
                 check_files(names, lengths=Path(file))
             except StageError as error:
                 raise WorkflowError(
