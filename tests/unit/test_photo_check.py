@@ -93,10 +93,11 @@ def test_two_photos_are_not_enough(photos):
 
 def test_another_frame_and_unit_change_nothing(photos):
     b_from_a = Sim3(3.0, np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]), np.array([5.0, -2, 7]))
-    points = grid(-1, 1, step=0.2)
+    # Off the symmetry axes of the ring of cameras: on them photos are equally good, and rounding would choose.
+    points = grid(-1, 1, step=0.2) + [0.03, 0.017, 0]
     here = match_in(points, up(points), photos)
     there = match_in(b_from_a.apply(points), b_from_a.rotate(up(points)), moved_photos(photos, b_from_a))
-    assert np.array_equal(here.photos, there.photos) and np.allclose(here.match, there.match, atol=1e-3)
+    assert np.array_equal(here.photos, there.photos) and np.allclose(here.match, there.match, atol=1e-6)
     assert np.median(there.deviation / here.deviation) == pytest.approx(3, rel=0.01)
 
 
