@@ -183,7 +183,8 @@ def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     thinned = thin(points, VIEW_POINTS)
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
     sources = {0: "scene"} | {number: f"added from {name}" for number in found}
-    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, len(join.before), len(join.after))
+    counts = len(join.before), len(join.after)
+    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, *counts, join.brighter)
 
 
 def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:

@@ -1,7 +1,7 @@
 """One object's part of the scene before and after fusion, turned upright: what figures and the 3D view show."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,9 @@ from scenefuse.transforms import Array, Sim3, box_around, rotation_between
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
 REACH = (0.35, 0.35, 0.15)
+DARK, BRIGHT, MOST_BRIGHTER = 100.0, 160.0, 4.0
+"""Surroundings of which nine points in ten are darker than the first (0..255) are shown brighter, so that the tenth has
+the second, by a factor of at most the third: a place in the shade would be a black picture."""
 
 
 @dataclass(frozen=True)
@@ -35,6 +38,7 @@ class Surroundings:
         unit: of the scene's lengths.
         missing: cells of the object's surface that the completed scene lacks; None where they were not looked for.
         stations: (S, 3) places to photograph these from, best first.
+        brighter: factor on the colours of all clouds, for pictures; those of the files are darker by it.
     """
 
     before: Cloud
@@ -47,6 +51,7 @@ class Surroundings:
     unit: str
     missing: Cloud | None
     stations: Array
+    brighter: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -111,12 +116,28 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
         )
     unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
-    missing = _missing(inputs)
+    missing, brighter = _missing(inputs), how_much_brighter(after)
+    decision = _decision(fine, scores) + ("" if brighter == 1 else f"; colours {brighter:.1f} x as bright as measured")
     return Surroundings(
-        before, after, crop, placed, inner(shown.points), fused, _decision(fine, scores), unit,
-        None if missing is None else missing.transformed(level),
-        level.apply(read_stations(inputs.next_photos)),
+        with_brighter(before, brighter), with_brighter(after, brighter), crop, placed, inner(shown.points), fused,
+        decision, unit, None if missing is None else missing.transformed(level),
+        level.apply(read_stations(inputs.next_photos)), brighter,
     )  # fmt: skip
+
+
+def how_much_brighter(cloud: Cloud) -> float:
+    """The factor by which a cloud's colours are shown brighter; 1 where they are bright enough, or it has none."""
+    if cloud.colors is None or not len(cloud):
+        return 1.0
+    upper = float(np.percentile(cloud.colors @ np.array([0.299, 0.587, 0.114]), 90))
+    return 1.0 if upper >= DARK else round(min(BRIGHT / max(upper, 1.0), MOST_BRIGHTER), 1)
+
+
+def with_brighter(cloud: Cloud, factor: float) -> Cloud:
+    """The cloud with its colours brighter by a factor."""
+    if cloud.colors is None or factor == 1:
+        return cloud
+    return replace(cloud, colors=np.minimum(np.rint(cloud.colors * factor), 255).astype(np.uint8))
 
 
 def _missing(inputs: FigureInputs) -> Cloud | None:

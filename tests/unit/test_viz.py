@@ -1,5 +1,7 @@
 """The renderer, the sheets and the figures of planted clouds."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pycolmap
@@ -285,6 +287,22 @@ def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path
     assert view.after_points - view.before_points == (shown == AFTER).sum()
     assert (view.unit, view.sources[1]) == ("m", "added from box")
     np.testing.assert_allclose([view.low, view.high], [[-1, -0.5, 0], [1, 0.5, 1]], atol=0.05)
+
+
+def test_a_place_in_the_shade_is_shown_brighter_and_says_so(capture, tmp_path):
+    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
+    kept = {name: (capture / name).read_bytes() for name in ("dense.ply", "fused.ply")}
+    for name in kept:
+        cloud = read_cloud(capture / name)
+        write_cloud(capture / name, replace(cloud, colors=(cloud.colors // 8).astype(np.uint8)))
+    dark = read_cloud(capture / "dense.ply").colors.max()
+    draw(capture, fine, tmp_path / "figures")
+    for name, content in kept.items():
+        (capture / name).write_bytes(content)
+    view = read_view(tmp_path / "figures")
+    assert view.brighter == 4 and view.cloud.colors.max() == 4 * dark
+    assert "Colours of the photos, 4.0 x as bright" in view_section("object-box", "box", view)
 
 
 def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(capture, tmp_path):

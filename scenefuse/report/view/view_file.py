@@ -45,6 +45,7 @@ class View:
         low, high: (3,) corners of the box that the first picture shows.
         azimuth_deg, elevation_deg: where it is seen from, counter-clockwise from x and above the horizontal.
         before_points, after_points: how many points there were before thinning.
+        brighter: factor by which the colours are brighter than measured.
     """
 
     cloud: Cloud
@@ -56,6 +57,7 @@ class View:
     elevation_deg: float
     before_points: int
     after_points: int
+    brighter: float = 1.0
 
 
 def write_view(folder: Path, view: View) -> None:
@@ -69,6 +71,7 @@ def write_view(folder: Path, view: View) -> None:
         "elevation_deg": quantity(view.elevation_deg, "deg"),
         "before_points": quantity(view.before_points, "points"),
         "after_points": quantity(view.after_points, "points"),
+        "brighter": quantity(view.brighter, "1"),
     }
     write_json(folder / "view.json", about)
 
@@ -94,6 +97,7 @@ def read_view(folder: Path) -> View | None:
             value(about, "elevation_deg"),
             value(about, "before_points"),
             value(about, "after_points"),
+            value(about, "brighter"),
         )
     except KeyError as error:
         raise StageError(f"{path} lacks {error}; delete it and rerun the stage that writes it") from None
