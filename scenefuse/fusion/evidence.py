@@ -32,6 +32,8 @@ MARGIN = 0.01
 """Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden."""
 LEAST_THROUGH = 2
 """Photos that must see through a point."""
+MOST_CONFIRM = 0.5
+"""A measured point of the scene that more than this share of the photos asked confirm is not seen through."""
 LEAST_VIEWS = 3
 """Photos that must have a point in their picture for it to count as enclosed."""
 SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
@@ -240,10 +242,12 @@ def _surer(one: Matches, two: Matches) -> Matches:
 def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(N,) points where photos see a surface behind them; of measured ones, shares of photos speak against each other.
 
-    All photos are held against a surface, only the best are matched: their numbers cannot be compared.
+    All photos are held against a surface, only the best are matched: their numbers cannot be compared. A measured point
+    that most of the photos asked confirm stays: all photos of a pot before a wall have the wall behind it.
     """
     confirming = matches.photos / (matches.tested + 1.0)  # the reference is among both
     least = np.where(measured, confirming * (seen.in_view - seen.hidden), 0)
+    least = np.where(measured & (confirming > MOST_CONFIRM), np.inf, least)
     return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
 
 
@@ -294,7 +298,9 @@ def _compare(
     worse &= ~on_scene | (_beside(scene.points, first[partner]) <= coarse)
     if len(second):
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
+        # A better point of a sparser side stands for what lies within a spacing of the object's.
         there = same(distance, mine, other[partner], SAME_SPACINGS * coarse)
+        there &= _beside(first.points, second[partner]) <= fine
         if outnumbered:
             # Of equals the object's points stay in the holes of a denser scene.
             hole = np.where(mine > CLEARLY * other[partner], np.inf, SAME_SPACINGS * spacing(second.points))

@@ -7,6 +7,8 @@ from scenefuse.workspace import View
 
 BLANK = 1.5
 """Where x is larger, the plane has no texture."""
+PANEL = 0.15
+"""Half a side of a panel before the plane."""
 
 
 def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -19,8 +21,13 @@ def paint(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return np.where(x > BLANK, 128.0, np.clip(128 + 12 * grey, 0, 255))
 
 
-def photographs(count: int, height: float, size: int = 320, radius: float = 2.0, noise: float = 1.0) -> list[View]:
-    """Views from a ring of cameras at a height over the plane that look at the origin; `pixels` (H, W) uint8."""
+def photographs(
+    count: int, height: float, size: int = 320, radius: float = 2.0, noise: float = 1.0, panel: float | None = None
+) -> list[View]:
+    """Views from a ring of cameras at a height over the plane that look at the origin; `pixels` (H, W) uint8.
+
+    panel: height of a painted panel of 2 PANEL x 2 PANEL above the origin, if there is one.
+    """
     rng = np.random.default_rng(0)
     views = []
     for k in range(count):
@@ -38,8 +45,12 @@ def photographs(count: int, height: float, size: int = 320, radius: float = 2.0,
         rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics).T @ pose[:3, :3]
         with np.errstate(divide="ignore"):
             ground = centre + rays * (-centre[2] / rays[..., 2:])
-        grey = cv2.resize(np.where(rays[..., 2] < 0, paint(ground[..., 0], ground[..., 1]), 255.0), (size, size),
-                          interpolation=cv2.INTER_AREA)  # fmt: skip
+        seen = paint(ground[..., 0], ground[..., 1])
+        if panel is not None:
+            before = centre + rays * ((panel - centre[2]) / rays[..., 2:])
+            on_panel = (np.abs(before[..., :2]) <= PANEL).all(-1)
+            seen = np.where(on_panel, paint(before[..., 1] - 3, before[..., 0] - 7), seen)
+        grey = cv2.resize(np.where(rays[..., 2] < 0, seen, 255.0), (size, size), interpolation=cv2.INTER_AREA)
         pixels = np.clip(np.rint(grey + rng.normal(0, noise, grey.shape)), 0, 255).astype(np.uint8)
         views.append(View(f"{k}.png", intrinsics, pose, size, size, pixels))
     return views

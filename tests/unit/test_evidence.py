@@ -235,6 +235,27 @@ def test_a_measured_point_goes_where_a_larger_share_of_photos_sees_through_than_
     assert is_seen_through(seen, matches, measured).tolist() == [False, True, True]
 
 
+def test_a_pot_before_a_wall_stays_where_most_photos_confirm_it():
+    photos, flight = pack(photographs(8, 3.0, panel=0.3)), pack(photographs(8, 6.0, radius=4.0, panel=0.3))
+    pot, middle = sheet(-0.13, 0.13, 0.02, z=0.3), 0.13
+    pot = pot[np.abs(pot.points[:, 1]) < middle]
+    scene = concatenate([sheet(-0.8, 0.8, 0.04), pot])
+    # The object is the wall and a sill as high as the pot, so that the pot lies in its box.
+    obj = concatenate([sheet(-0.8, 0.8, 0.03), sheet(0.7, 0.8, 0.03, z=0.32)])
+    found = weigh(Side(obj, photos), Side(scene, flight), nerf_only=False)
+    assert (found.scene.fields["evidence"][-len(pot) :] == MEASURED).mean() > 0.95
+    assert (found.reason[-len(pot) :] == KEPT).mean() > 0.95
+
+
+def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.02), sheet(-0.8, 0.8, 0.12)
+    found = weigh(Side(obj, far), Side(scene, near), nerf_only=False)
+    inside = np.abs(obj.points[:, :2]).max(1) < 0.6
+    distance = np.linalg.norm(obj.points[inside, None, :2] - scene.points[:, :2], axis=2).min(1)
+    added = found.added[inside]
+    assert added[distance > 0.022].mean() > 0.95 and added[distance < 0.018].mean() < 0.5
+
+
 def test_of_equals_the_denser_side_stays(near, far):
     coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
     for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
