@@ -151,7 +151,7 @@ def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
 def _without_outermost(own: Array, up: Array) -> Array:
     """The (N, 3) points without the outermost half per cent at each side: some are mismatched."""
     x = upright_box(own, up, 0.0).to_box(own)
-    low, high = np.percentile(x, [0.5, 99.5], axis=0)
+    low, high = np.percentile(x, 0.5, axis=0, method="lower"), np.percentile(x, 99.5, axis=0, method="higher")
     return own[((x >= low) & (x <= high)).all(1)]
 
 

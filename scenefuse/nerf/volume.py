@@ -23,8 +23,9 @@ ROUGH_FACTOR = 1.5
 LEAST_PIXELS = 16
 # Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
 HALF_DIAGONAL = 0.87
-# A cell counts only where so large a share of the photos has it in the frame; an orbit has the object in all of them.
-LEAST_SHARE, LEAST_PHOTOS = 0.3, 2
+# A cell counts only where so large a share has it in the frame of the photos that have the object whole; details, whose
+# masks touch the border, may be many more (two thirds of all are taken to be such, at most).
+LEAST_SHARE, LEAST_WHOLE, LEAST_PHOTOS = 0.3, 1 / 3, 2
 # Photos that must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
 # have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
 LEAST_OPEN, BEYOND = 3, 0.05
@@ -172,6 +173,7 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
+    whole = max(sum(_is_whole(outline.view.pixels) for outline in outlines), LEAST_WHOLE * len(outlines))
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
@@ -180,7 +182,7 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
         found = count_silhouettes(points, grown, object_from_unit.scale * BEYOND)
         # Of a coarse cell that is hidden one part may be in sight.
         shown = found.shown + (found.hidden if count < size else 0)
-        kept = (found.missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * len(outlines)))
+        kept = (found.missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * whole))
         if count == size:
             kept &= (found.hidden == 0) | (found.open >= LEAST_OPEN)
         cells = cells[kept]
@@ -189,6 +191,11 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
             hull[tuple(cells.T)] = True
             return hull
         cells, count = (2 * cells[:, None] + children).reshape(-1, 3), 2 * count
+
+
+def _is_whole(mask: NDArray[np.bool_]) -> bool:
+    """Whether a mask (H, W) ends before the photo does."""
+    return bool(mask.any() and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()))
 
 
 def _corners(count: int) -> NDArray[np.int64]:

@@ -11,6 +11,7 @@ from scenefuse.registration.free_space import FreeSpace
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.surface import Surface, prepare
 from scenefuse.registration.uncertainty import Uncertainty
+from scenefuse.sfm.gravity import UNSURE_CUES
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
@@ -27,7 +28,7 @@ class Inputs:
     crop: Path
     """Scene crop (PLY) in the scene frame."""
     crop_json: Path
-    """JSON of the crop stage, for `up_in_scene` and the unit of lengths."""
+    """JSON of the crop stage, for `up_in_scene`, what says so, and the unit of lengths."""
     workspace_json: Path | None = None
     """JSON with `up_in_camera_frame`, the up direction in the object's frame; without it, or without the key, gravity
     is not used."""
@@ -44,9 +45,12 @@ class Inputs:
         return both
 
     def ups(self) -> tuple[Array, Array] | None:
-        """Unit up directions (3,) in the object's and in the scene's frame, or None when either is unknown."""
-        up_in_object = None if self.workspace_json is None else read_json(self.workspace_json).get("up_in_camera_frame")
-        up_in_scene = read_json(self.crop_json).get("up_in_scene")
+        """Unit up directions (3,) in the object's and in the scene's frame, or None when either is unknown or unsure."""
+        of_object = {} if self.workspace_json is None else read_json(self.workspace_json)
+        of_scene = read_json(self.crop_json)
+        if any(content.get("up_cue", {}).get("value") in UNSURE_CUES for content in (of_object, of_scene)):
+            return None
+        up_in_object, up_in_scene = of_object.get("up_in_camera_frame"), of_scene.get("up_in_scene")
         if not up_in_object or not up_in_scene or up_in_object["value"] is None or up_in_scene["value"] is None:
             return None
         a, b = np.array(up_in_object["value"], float), np.array(up_in_scene["value"], float)

@@ -71,7 +71,7 @@ def georegister(
     gps = gps_cameras(names, centres, listed, settings.gps_accuracy_m)
     up, cue = estimate_up(rotations, centres)
     surveyed = None if control is None else read_sighted(control, model, listed)
-    found = georeference(gps, surveyed, up, settings, seed)
+    found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
     sizes = {p.name: (p.width, p.height) for p in listed}
     if lengths is not None and not found.metric:
         known = read_lengths(lengths, model, sizes)
@@ -88,7 +88,12 @@ def georegister(
 
 
 def georeference(
-    gps: GpsCameras, control: Control | None, up: Array, settings: GeoreferenceSettings, seed: int
+    gps: GpsCameras,
+    control: Control | None,
+    up: Array,
+    settings: GeoreferenceSettings,
+    seed: int,
+    sure_up: bool = False,
 ) -> Georeference:
     """How a model is placed by what was surveyed; nothing is moved yet.
 
@@ -98,6 +103,7 @@ def georeference(
         up: (3,) the cameras' up direction in the model.
         settings: when GPS is used.
         seed: of RANSAC.
+        sure_up: whether `up` is a measurement (`estimate_up`: "headings"), better than inexact heights.
     """
     by_gps = settings.use_gps and len(gps.names) >= MIN_GPS_PHOTOS
     if control is not None:
@@ -112,7 +118,7 @@ def georeference(
     if by_gps:
         frame = local_frame(gps.positions)
         there, sd_m = frame.apply(gps.positions), float(np.median(gps.sd_m[:, 0]))
-        return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m), frame, gps)
+        return Georeference(place_by_gps(gps.centres, there, up, settings, seed, sd_m, sure_up), frame, gps)
     reason = f"{len(gps.names)} registered photos have a GPS position, {MIN_GPS_PHOTOS} are needed"
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 

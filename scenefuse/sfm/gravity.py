@@ -7,6 +7,14 @@ Array = NDArray[np.float64]
 
 # RMS sine (about 8 degrees) by which the cameras' x axes have to leave one line to fix the vertical on their own.
 MIN_AXIS_SPREAD = 0.15
+# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number: beyond
+# this, in degrees, they hardly do.
+MOST_HEADINGS_SD_DEG = 2.5
+# A hand rolls a camera by so many degrees at least, as far as a few photos can tell.
+LEAST_ROLL_DEG = 1.0
+MEDIAN_TO_SD = 1.48
+UNSURE_CUES = ("image up", "viewing direction", "few headings")
+"""Up by these is off by as much as the photos are not level, or not straight down: good enough for pictures."""
 
 
 def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
@@ -27,13 +35,15 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
         centres: (N, 3) camera centres, in any unit.
 
     Returns:
-        (3,) unit vector in the world frame, and "headings", "image up" or "viewing direction".
+        (3,) unit vector in the world frame, and "headings", "few headings", "image up" or "viewing direction".
     """
     x, y, z = (world_from_cam[:, :, k] for k in range(3))
     up, spread = _orthogonal_to_all(x)
     if spread >= MIN_AXIS_SPREAD:
         # Image-up sides and looking down both tell the sign; for nadir photos only the latter does.
-        return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings"
+        roll_deg = max(MEDIAN_TO_SD * roll_spread_deg(world_from_cam, up), LEAST_ROLL_DEG)
+        sure = roll_deg / (spread * np.sqrt(len(x))) <= MOST_HEADINGS_SD_DEG
+        return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings" if sure else "few headings"
     line = np.linalg.eigh(x.T @ x)[1][:, 2]
     candidates = {"image up": -y.mean(0), "viewing direction": -z.mean(0)}
     levelled = {cue: _unit(d - (d @ line) * line) for cue, d in candidates.items() if np.linalg.norm(d) > 0.1}

@@ -88,6 +88,15 @@ def test_clicks_have_the_depth_of_the_nearest_surface(crop):
     np.testing.assert_allclose(value(report, "fiducials"), CORNERS, atol=0.35)
 
 
+def test_a_stray_point_before_the_surface_does_not_say_where_a_click_is(crop):
+    stray = EYE + 0.4 * (np.array(CORNERS[0]) - EYE)
+    clicks = [("inside", corner) for corner in CORNERS]
+    kept, report = crop(clicks, np.concatenate([YARD, stray[None]]))
+    without, plain = crop(clicks)
+    assert value(report, "box_low") == pytest.approx(value(plain, "box_low"), abs=0.05)
+    assert kept[:-1][OWN].sum() == without[OWN].sum()
+
+
 def test_in_a_large_scene_clicks_find_the_object_in_the_tiles_along_their_rays(crop, monkeypatch):
     # Ground like the yard's as far as one sees, and a roof behind the photo's back.
     far = np.random.default_rng(5).uniform([-50, -50, 0], [50, 50, 0.02], (250_000, 3))

@@ -138,6 +138,26 @@ def test_unknown_heights_of_some_photos_take_no_part():
     assert fitted.scale == pytest.approx(PLANTED.scale, rel=1e-4)
 
 
+def test_a_phones_heights_do_not_tilt_a_walk_whose_cameras_say_which_way_is_up():
+    turns, leans = np.arange(32) * 2 * np.pi / 32, {}
+    walked = np.stack([25 * np.cos(turns), 25 * np.sin(turns), np.full(32, 1.6)], axis=1)
+    up = PLANTED.rotation.T @ np.array([0.0, 0.0, 1.0])
+    for seed in range(10):
+        # Errors that drift along the walk, 4 m in the plane and 6 m in height.
+        rng = np.random.default_rng(seed)
+        drift = [np.cos(turns[:, None] + rng.uniform(0, 6.3, 3)) * [4, 4, 6] + rng.normal(0, 0.5, (32, 3))]
+        for sure in (False, True):
+            there = PLANTED.inverse().apply(walked), walked + drift[0]
+            placement = place_by_gps(*there, up, GeoreferenceSettings(), seed=0, sure_up=sure)
+            turn = placement.local_from_model.rotation @ PLANTED.rotation.T
+            leans.setdefault(sure, []).append(np.degrees(np.arccos(np.clip(turn[2, 2], -1, 1))))
+            assert placement.levelled == sure and placement.status == "georeferenced"
+    assert np.median(leans[False]) > 8 and max(leans[True]) < 0.1
+    # Exact positions say it themselves.
+    exact = place_by_gps(PLANTED.inverse().apply(walked), walked, up, SETTINGS, seed=0, sd_m=0.05, sure_up=True)
+    assert not exact.levelled
+
+
 def test_without_any_height_the_cameras_level_the_model_and_heights_are_relative():
     target, placement = tilted(slice(None))
     assert placement.status == "georeferenced" and placement.heights == "relative" and placement.levelled

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
+from scenefuse.sfm.gravity import UNSURE_CUES, estimate_up, roll_spread_deg
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -79,3 +79,18 @@ def test_a_few_photos_on_their_side_do_no_harm():
 def test_roll_spread_is_the_median_tilt():
     rotations = np.array([camera(a, 0.0, 10.0) for a in range(0, 360, 30)])
     assert roll_spread_deg(rotations, UP) == pytest.approx(10.0)
+
+
+def test_a_short_walk_that_looks_up_does_not_say_surely_which_way_is_up():
+    def front(half_walk, count=10, seed=0):
+        x = np.linspace(-half_walk, half_walk, count)
+        headings = 90.0 - np.degrees(np.arctan2(-x, 12.0))
+        rolls = np.random.default_rng(seed).normal(0, 2.0, count)
+        centres = np.stack([x, np.full(count, -12.0), np.zeros(count)], axis=1)
+        return np.array([camera(h, 26.0, roll) for h, roll in zip(headings, rolls)]), centres
+
+    assert estimate_up(*front(2.0))[1] in UNSURE_CUES
+    assert estimate_up(*front(3.0))[1] in UNSURE_CUES
+    for seed in range(20):
+        up, cue = estimate_up(*front(12.0, 30, seed))
+        assert cue == "headings" and np.degrees(np.arccos(up @ UP)) < 3.0

@@ -180,6 +180,17 @@ def test_tilt_is_the_angle_between_the_ups():
     assert tilt_deg(Sim3(2.0, turn, np.zeros(3)), (Z, Z)) == pytest.approx(30)
 
 
+@pytest.mark.parametrize(("of_object", "of_scene", "used"), [
+    ("headings", "GPS", True), ("image up", "GPS", False), ("headings", "few headings", False), (None, None, True),
+])  # fmt: skip
+def test_gravity_counts_only_where_it_was_measured_on_both_sides(tmp_path, of_object, of_scene, used):
+    cues = [{} if cue is None else {"up_cue": quantity(cue, "")} for cue in (of_object, of_scene)]
+    write_json(tmp_path / "undistorted.json", cues[0] | {"up_in_camera_frame": quantity([0, 0.0, 2.0], "1")})
+    write_json(tmp_path / "crop.json", cues[1] | {"up_in_scene": quantity([0.0, 0, 1], "")})
+    inputs = Inputs(tmp_path / "object.ply", tmp_path / "crop.ply", tmp_path / "crop.json", tmp_path / "undistorted.json")
+    assert (inputs.ups() is not None) == used
+
+
 def stage_inputs(folder, obj, scene, up_in_object=None):
     """The files of two clouds as the stages read them; gravity is known when the object's up is given."""
     write_cloud(folder / "object.ply", obj)

@@ -159,3 +159,19 @@ def test_what_lies_beyond_a_smaller_photo_is_neither_off_its_mask_nor_empty(figu
     nothing = np.zeros(views.masks.shape, np.float32)
     given = middle, 1, nothing, smaller.masks, views.intrinsics, views.object_from_cam, 0.01
     assert compare(*given).off_mask > 0 == compare(*given, sparse_depths(smaller)).off_mask
+
+
+def test_many_details_of_a_part_do_not_cut_off_the_rest():
+    k = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
+    v, u = np.indices((HEIGHT, WIDTH)) + 0.5
+    ahead = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], -1).reshape(-1, 3)
+    poses, masks = [], []
+    for count, distance, target in ((10, 3.0, 0.5), (24, 1.1, 0.85)):
+        for turn in np.arange(count) * 2 * np.pi / count:
+            centre = np.array([distance * np.cos(turn), distance * np.sin(turn), 1.2])
+            poses.append(looking(centre, (0, 0, target)))
+            masks.append(np.isfinite(enter(FIGURE, centre, ahead @ poses[-1][:3, :3].T)).reshape(HEIGHT, WIDTH))
+    outlines = silhouettes(np.array(masks), None, np.repeat(k[None], len(poses), 0), np.array(poses))
+    volume = find_volume(outlines, CELLS, 0.04)
+    cells = volume.nerf_from_object.inverse().apply((np.argwhere(volume.hull) + 0.5) / CELLS)
+    assert cells[:, 2].min() < 0.05 and cells[:, 2].max() > 0.95

@@ -85,10 +85,17 @@ def crop_scene(*, inputs: CropInputs, crop: Path, report: Path, settings: CropSe
     unit = length_unit(inputs.georeference_json)
     about = {
         "mode": quantity(marks.mode, ""),
+        "up_cue": quantity(_up_cue(inputs.georeference_json), ""),
         "fiducials": quantity(marks.fiducials, unit),
         "voted_points": quantity(marks.voted, "1"),
     }
     write_json(report, about | _report(len(scene), part, cut, unit))
+
+
+def _up_cue(georeference_json: Path | None) -> str | None:
+    """What says which way is up in the scene; None where that is not known."""
+    cue = None if georeference_json is None else read_json(georeference_json).get("up_cue", {}).get("value")
+    return None if cue is None else str(cue)
 
 
 def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
@@ -268,7 +275,8 @@ def _announce(cut: Crop, source: str) -> None:
     if cut.keep.sum() < MIN_POINTS:
         raise StageError(
             f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {MIN_POINTS} are"
-            " needed: the scene may not show the object, or a fiducial or mask may not lie on it"
+            " needed: the scene may not show the object, or a fiducial or mask may not lie on it; where the object is small"
+            " in the scene's photos, raise scene.depth_maps.max_image_size_px or set scene.dense_cloud.min_photos to 2"
         )
 
 

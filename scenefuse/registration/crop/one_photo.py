@@ -17,8 +17,8 @@ from scenefuse.transforms import Array
 from scenefuse.workspace import View, read_views
 
 # A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
-# more; of points up to so many spacings behind the nearest.
-AROUND_SPACINGS, AROUND_PX, THICK_SPACINGS = 2, 3, 8
+# more; of points up to so many spacings behind the nearest that is no stray: so many lie within these.
+AROUND_SPACINGS, AROUND_PX, THICK_SPACINGS, LEAST_CROWD = 2, 3, 8, 3
 # Inside clicks with a depth that span an object.
 LEAST_INSIDE = 3
 # Rounds in which the crop grows along the object; each reaches farther by its margin.
@@ -124,7 +124,11 @@ def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: 
     rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
     if not len(rows):
         return None
-    front = rows[depth[rows] <= depth[rows].min() + THICK_SPACINGS * step]
+    # A single point that floats before the surface does not say where it is.
+    ahead, thick = np.sort(depth[rows]), THICK_SPACINGS * step
+    crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= LEAST_CROWD
+    nearest = ahead[crowd.argmax()]
+    front = rows[(depth[rows] >= nearest) & (depth[rows] <= nearest + thick)]
     return np.median(points[front], axis=0)
 
 

@@ -125,7 +125,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
             f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks}, {MIN_OWN} are needed; look at"
             " the masks, and take sharper photos of the object"
         )
-    low, high = np.percentile(own, [1, 99], axis=0)
+    low, high = np.percentile(own, 1, axis=0, method="lower"), np.percentile(own, 99, axis=0, method="higher")
     return Masked(found, own[((own >= low) & (own <= high)).all(1)])
 
 

@@ -55,11 +55,16 @@ class Landmarks:
         return self.start[points][owner] + offset, owner
 
     def looked_at(self) -> Array:
-        """(3,) the point that the optical axes of all photos pass nearest to, by least squares."""
+        """(3,) the point that the optical axes of all photos pass nearest to, by least squares.
+
+        Axes side by side, along a front, may meet behind the cameras: then the middle of all points.
+        """
         axes, rotations = self.cam_from_model[:, 2, :3], self.cam_from_model[:, :, :3]
         centres = -np.einsum("nji,nj->ni", rotations, self.cam_from_model[:, :, 3])
         across = np.eye(3) - axes[:, :, None] * axes[:, None]
-        return np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=1e-9)[0]
+        place = np.linalg.lstsq(across.sum(0), np.einsum("nij,nj->i", across, centres), rcond=1e-9)[0]
+        ahead = ((place - centres) * axes).sum(1) > 0
+        return place if ahead.mean() > 0.5 else np.median(self.points, axis=0)
 
     def pixel_size(self, points: NDArray[np.int64]) -> Array:
         """What one pixel of the nearest photo covers at each of some points, in the model's unit."""

@@ -19,6 +19,9 @@ MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
 OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
+# Where the cameras say which way is up, heights do only if they fix the tilt to so many degrees (two standard errors);
+# five photos beside each other have one error, and heights are half as exact as stated for the plane.
+TILT_DEG, HEIGHTS, ALIKE = 2.0, 2.0, 5.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
 BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
@@ -202,12 +205,19 @@ def _middle(difference: Array) -> Array:
 
 
 def place_by_gps(
-    centres: Array, target: Array, up: Array, settings: GeoreferenceSettings, seed: int, sd_m: float | None = None
+    centres: Array,
+    target: Array,
+    up: Array,
+    settings: GeoreferenceSettings,
+    seed: int,
+    sd_m: float | None = None,
+    sure_up: bool = False,
 ) -> Placement:
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
-    the tilt: then the cameras' up direction (3,) closes it. Positions within five times the GPS accuracy of each other
+    the tilt: then the cameras' up direction (3,) closes it. So does it where it is sure and heights are less exact, as a
+    phone's are on a walk around a house. Positions within five times the GPS accuracy of each other
     say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
@@ -215,7 +225,7 @@ def place_by_gps(
     if extent[0] < SPREAD * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
-    fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed)
+    fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
     if inliers.sum() < max(MIN_GPS_PHOTOS, 0.5 * len(target)):
         reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
         return upright(up, reason)
@@ -232,13 +242,15 @@ def place_by_gps(
 
 
 def _fit(
-    centres: Array, target: Array, up: Array, accuracy_m: float, limit: float, seed: int
+    centres: Array, target: Array, up: Array, accuracy_m: float, limit: float, seed: int, sure_up: bool
 ) -> tuple[Sim3, NDArray[np.bool_], bool]:
     """Similarity, inliers, and whether the cameras had to level it, because the positions that agree do not."""
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= WIDTH * accuracy_m)
+        width = _extent(target[rows])[1] if rows.sum() >= MIN_GPS_PHOTOS else 0.0
+        tilt = HEIGHTS * accuracy_m * np.sqrt(ALIKE / max(rows.sum(), 1)) / max(width, 1e-9)
+        return bool(width >= WIDTH * accuracy_m and (not sure_up or tilt <= np.radians(TILT_DEG)))
 
     if fixes_tilt(has_height):
         with contextlib.suppress(ValueError):  # no three positions agree
