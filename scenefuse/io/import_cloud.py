@@ -159,9 +159,7 @@ def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
         yield Cloud(cloud.points, normals, None if own.most_color is None else cloud.colors)
 
 
-def write_placed(
-    cloud: Path, source: Path, parts: ColumnParts, own: Survey, pose: Sim3, unit: str
-) -> dict[str, Any]:
+def write_placed(cloud: Path, source: Path, parts: ColumnParts, own: Survey, pose: Sim3, unit: str) -> dict[str, Any]:
     """Write a file's points in another frame, tile by tile; the report of it.
 
     Args:

@@ -1,0 +1,113 @@
+"""The dense cloud of another program's project, in the coordinates of the cameras that it found."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenefuse.io.import_cloud import IMPORTED, survey, write_placed
+from scenefuse.io.tiles.parts import columns_in_parts
+from scenefuse.io.units import length_unit
+from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
+from scenefuse.transforms import Array, Sim3
+from scenefuse.workspace import View, posed_images, read_model, view_of
+
+# So many photos have to frame a point for it to count as seen; fewer confirm none (method F4).
+LEAST_PHOTOS = 3
+# A cloud in other coordinates than the cameras has a smaller share of its points in their pictures than this, or
+# fewer of its points beside the cameras' own points, and of these beside its own, whichever are more.
+LEAST_SEEN, LEAST_NEAR = 0.1, 0.2
+# What is beside a point: within this share of the cloud's diagonal, without its outermost 1 % on each side.
+NEAR = 0.01
+STRAY_PERCENT = 1.0
+# Points of the cloud that are projected into all photos, and that are compared with the cameras' own points.
+MOST_PROJECTED, MOST_COMPARED = 10_000, 200_000
+
+
+def import_posed_cloud(
+    *, source: Path, sparse: Path, sparse_json: Path, georeference_json: Path | None = None, cloud: Path, report: Path
+) -> None:
+    """Take a cloud that lies in the coordinates of given cameras, into the frame that the cameras are in now (M12).
+
+    Args:
+        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
+        sparse: COLMAP model of the given cameras, with the points that the photos' own matches give.
+        sparse_json: its JSON; where known lengths scaled the model, they scale the cloud alike.
+        georeference_json: JSON of a scene, with the similarity that georeferencing moved the model by; an object's
+            model stays where it is.
+        cloud: output PLY, tile by tile (`open_cloud`); however large, it is never all in memory.
+        report: output JSON: points, spacing, notes, how well cloud and cameras fit, and for an object
+            `object_from_file`.
+
+    Raises:
+        StageError: the file is missing, damaged, of an unknown ending, has too few different points, or lies in other
+            coordinates than the cameras.
+    """
+    parts = columns_in_parts(source)
+    own = survey(source, parts)
+    given = _scaled(sparse_json)
+    fit = fit_to_cameras(given.apply(own.sample), sparse)
+    check_fit(source, fit)
+    if georeference_json is None:
+        content = write_placed(cloud, source, parts, own, given, "object units")
+        content |= {"object_from_file": quantity(given.matrix, "object units")}
+    else:
+        moved = Sim3.from_matrix(np.array(value(read_json(georeference_json), "scene_from_sparse")))
+        content = write_placed(cloud, source, parts, own, moved @ given, length_unit(georeference_json))
+        content |= {"backend": quantity(IMPORTED, "")}
+    write_json(report, content | fit)
+
+
+def fit_to_cameras(points: Array, sparse: Path) -> dict[str, Any]:
+    """How a cloud's points (N, 3) and a sparse model in its frame fit: shares, as quantities.
+
+    `seen_share` of the points lie in the pictures of three photos or more; `near_sparse_share` lie beside a point of
+    the model, and `sparse_near_share` of the model's points beside one of them.
+    """
+    model = read_model(sparse)
+    views = [view_of(model, image) for image in posed_images(model)]
+    own = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    few = points[:: max(1, len(points) // MOST_COMPARED)]
+    low, high = np.percentile(few, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    reach = NEAR * float(np.linalg.norm(high - low))
+    return {
+        "seen_share": quantity(_seen(points[:: max(1, len(points) // MOST_PROJECTED)], views), "1"),
+        "near_sparse_share": quantity(_near(few, own, reach), "1"),
+        "sparse_near_share": quantity(_near(own, few, reach), "1"),
+    }
+
+
+def check_fit(source: Path, fit: dict[str, Any]) -> None:
+    """StageError where a cloud lies in other coordinates than the cameras; fit: of `fit_to_cameras`."""
+    seen, near = value(fit, "seen_share"), max(value(fit, "near_sparse_share"), value(fit, "sparse_near_share"))
+    if seen < LEAST_SEEN:
+        found = f"{100 * seen:.0f} % of its points are in the pictures of {LEAST_PHOTOS} photos"
+    elif near < LEAST_NEAR:
+        found = f"{100 * near:.0f} % of its points lie where the photos' matches meet"
+    else:
+        return
+    raise StageError(
+        f"{source} does not lie in the coordinates of the row's cameras: only {found}; export cloud and cameras in the"
+        " same coordinates, with the same axes, or empty the cell cameras or the cell cloud"
+    )
+
+
+def _scaled(sparse_json: Path) -> Sim3:
+    """model_from_given: what known lengths did to the given cameras."""
+    scale = read_json(sparse_json).get("metres_per_unit", {}).get("value")
+    return Sim3(1.0 if scale is None else scale, np.eye(3), np.zeros(3))
+
+
+def _seen(points: Array, views: list[View]) -> float:
+    """Share of points (N, 3) that lie in enough pictures; a lens's distortion is left out."""
+    count = np.zeros(len(points), np.int64)
+    for view in views:
+        count[view.visible(points)[0]] += 1
+    return float((count >= LEAST_PHOTOS).mean())
+
+
+def _near(points: Array, others: Array, reach: float) -> float:
+    """Share of points (N, 3) with one of the others (M, 3) within reach."""
+    distance = cKDTree(others).query(points, distance_upper_bound=reach, workers=threads())[0]
+    return float(np.isfinite(distance).mean())
