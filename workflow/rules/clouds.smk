@@ -7,11 +7,7 @@
 ruleorder: import_scene_cloud > fuse_depth_maps
 ruleorder: import_scene_cloud > georegister
 ruleorder: import_posed_scene_cloud > fuse_depth_maps
-ruleorder:
-    import_object_cloud
-    > import_posed_object_cloud
-    > make_cloud_as_paper
-    > make_object_cloud
+ruleorder: import_object_cloud > import_posed_object_cloud > make_object_cloud
 
 
 include: "../functions/clouds.smk"
