@@ -72,7 +72,7 @@ def test_a_scene_s_cloud_goes_where_georeferencing_took_its_cameras(given):
 def test_an_object_s_cloud_stays_among_its_cameras_and_is_scaled_with_them(given):
     cloud, report = imported(given)
     np.testing.assert_allclose(cloud.points, read_cloud(given / "cloud.ply").points, atol=1e-12)
-    assert value(report, "seen_share") > 0.8 and value(report, "sparse_near_share") > 0.5
+    assert value(report, "seen_share") > 0.8 and value(report, "met_share") > 0.5
     model = pycolmap.Reconstruction(given / "sparse")
     model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(), np.zeros(3)))
     model.write(given / "sparse")
