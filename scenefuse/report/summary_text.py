@@ -121,7 +121,9 @@ def _given(fields: Fields, stage: str) -> str:
     if not source:
         return ""
     if find(fields, f"{stage}.seen_share") is not None:
-        return f"the cloud {source}, in the coordinates of the given cameras"
+        outside = find(fields, f"{stage}.outside_masks")
+        cut = f"; {outside} points outside the masks were left out" if outside else ""
+        return f"the cloud {source}, in the coordinates of the given cameras{cut}"
     crs = find(fields, "georeference.crs")
     return f"as a cloud, {source}, without photos" + (f"; coordinates: {_crs_name(crs)}" if crs else "")
 

@@ -1,5 +1,9 @@
 """A cloud in the coordinates of given cameras: it goes where these went, and a cloud from elsewhere is refused."""
 
+import shutil
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -13,6 +17,7 @@ from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.given.cloud import import_posed_cloud
 from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.workspace import read_views
 
 FLIGHT = fly()
 SCALE = 2.5
@@ -82,6 +87,29 @@ def test_an_object_s_cloud_stays_among_its_cameras_and_is_scaled_with_them(given
     write_json(given / "fusion.json", {name: quantity(None, "") for name in ("scene_from_object", "registration")})
     write_frame_ledger(object_json=given / "out.json", fusion_json=given / "fusion.json", report=given / "frames.json")
     assert value(read_json(given / "frames.json"), "object_from_file")[0] == [SCALE, 0, 0, 0]
+
+
+def test_what_lies_outside_an_object_s_masks_is_left_out(given):
+    (given / "masks").mkdir()
+    views, cloud = read_views(given / "sparse"), read_cloud(given / "cloud.ply")
+    own = np.linalg.norm(field().points - [5, 0, 0], axis=1) < 10
+    hull = cloud.points[own]
+    for view in views:
+        pixels = view.visible(hull)[1].astype(np.int32)
+        mask = np.zeros((view.height, view.width), np.uint8)
+        if len(pixels):
+            cv2.fillConvexPoly(mask, cv2.convexHull(pixels), 255)
+        cv2.imwrite(str(given / f"masks/{Path(view.name).stem}.png"), mask)
+    (given / "workspace").mkdir()
+    shutil.copytree(given / "sparse", given / "workspace/sparse")
+    cut, report = imported(given, workspace=given / "workspace", masks=given / "masks")
+    kept = {*map(tuple, cut.points)}
+    assert len(kept & {*map(tuple, hull)}) == own.sum() and len(kept) < 1.3 * own.sum()
+    assert value(report, "points") == len(cut) == len(cloud) - value(report, "outside_masks")
+    for mask in (given / "masks").iterdir():
+        cv2.imwrite(str(mask), np.zeros((views[0].height, views[0].width), np.uint8))
+    with pytest.raises(StageError, match="only 0 of 6000 points of .* lie inside the masks"):
+        imported(given, workspace=given / "workspace", masks=given / "masks")
 
 
 @pytest.mark.parametrize(

@@ -109,11 +109,13 @@ rule import_posed_scene_cloud:
 
 
 use rule import_posed_scene_cloud as import_posed_object_cloud with:
-    # Take a cloud in the coordinates of an object's given cameras.
+    # Take a cloud in the coordinates of an object's given cameras, without what lies outside its masks, if it has some.
     input:
         as_inputs(cloud_of("object")),
         sparse="results/objects/{object}/sparse",
         sparse_json="results/objects/{object}/sparse.json",
+        workspace=if_masked("results/objects/{object}/undistorted"),
+        masks=if_masked("results/objects/{object}/masks"),
     output:
         cloud="results/objects/{object}/object.ply",
         report="results/objects/{object}/object.json",
@@ -123,9 +125,12 @@ use rule import_posed_scene_cloud as import_posed_object_cloud with:
         "results/benchmarks/import_posed_object_cloud/{object}.tsv"
     wildcard_constraints:
         object=one_of(POSED_OBJECTS),
+    resources:
+        mem_mb=by_size(4000, all=50),
+        runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         source=cloud_path("object"),
-        place=options_of("georeference_json"),
+        place=options_of("workspace", "masks"),
         files=state_of(cloud_of("object")),
         script=script("sfm/import_posed_cloud.py"),
         code=code("sfm/import_posed_cloud.py"),
