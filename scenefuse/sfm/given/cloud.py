@@ -20,7 +20,7 @@ from scenefuse.workspace import View, posed_images, read_model, read_views, view
 # So many photos have to frame a point for it to count as seen; fewer confirm none (method F4).
 LEAST_PHOTOS = 3
 # A cloud in other coordinates than the cameras has a smaller share of its points in their pictures than this, or is
-# met by a smaller share of the points that the photos' own matches give in its box. Of three right clouds 72 % were met
+# met by a smaller share of the points that the photos' own matches give in its box. Of four right clouds 66 % were met
 # or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
 LEAST_SEEN, LEAST_MET = 0.1, 0.2
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
