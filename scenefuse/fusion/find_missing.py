@@ -53,7 +53,7 @@ class MissingInputs:
     scene_workspace: Path | None = None
     """The scene's, in the frame of its cloud, where it has photos."""
     masks: Path | None = None
-    """Folder of the object's masks, {photo}.png; as the workspace."""
+    """Folder of the object's masks, {photo}.png; without them only points of the object's cloud are looked at."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     start = time.perf_counter()
     use_threads(threads())
     fusion, unit = read_json(inputs.fusion_json), length_unit(inputs.georeference_json)
-    if value(fusion, "status") != "fused" or inputs.object_workspace is None or inputs.masks is None:
+    if value(fusion, "status") != "fused" or inputs.object_workspace is None:
         nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
         write_cloud(outputs.missing, nothing)
         _write_table(outputs.next_photos, [])
@@ -94,8 +94,9 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
             )
         write_json(outputs.report, {"status": quantity(status, ""), "reason": quantity(reason, "")})
         return
-    folders = inputs.object_workspace, inputs.masks
-    obj, photos, masks = _in_scene(inputs, *folders, Sim3.from_matrix(np.array(value(fusion, "scene_from_object"))))
+    obj, photos, masks = _in_scene(
+        inputs, inputs.object_workspace, Sim3.from_matrix(np.array(value(fusion, "scene_from_object")))
+    )
     cameras = masks or photos[0].views
     near, around_it = _surroundings(inputs, obj, cameras)
     missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
@@ -138,14 +139,14 @@ def _surroundings(inputs: MissingInputs, obj: Cloud, cameras: list[View]) -> tup
     return near, replace(around_it, normals=normals)
 
 
-def _in_scene(
-    inputs: MissingInputs, workspace: Path, masks: Path, pose: Sim3
-) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
+def _in_scene(inputs: MissingInputs, workspace: Path, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
     """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
     own = with_normals(read_cloud(inputs.object))
     obj = own.transformed(pose)
     photos = photos_of(workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
-    views = [(view, masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
+    if inputs.masks is None:
+        return obj, photos, []
+    views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
     return obj, photos, [_silhouette(view, path) for view, path in views if path.is_file()]
 
 

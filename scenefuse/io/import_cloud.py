@@ -25,6 +25,8 @@ STRAY_PERCENT = 1.0
 SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
+# What `backend` says of a scene's cloud that was not made here.
+IMPORTED = "imported"
 
 
 def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_json: Path) -> None:
@@ -41,22 +43,15 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
         StageError: the file is missing, damaged, in degrees, of an unknown ending, or has too few different points.
     """
     parts = columns_in_parts(source)
-    own = _survey(source, parts)
+    own = survey(source, parts)
     crs = las_crs(source)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
     origin = near_origin(own.sample)
     shift = Sim3(1.0, np.eye(3), origin)
-
-    def placed() -> Iterator[Cloud]:
-        return (replace(part, points=part.points - origin) for part in _clouds(parts, own))
-
-    write_tiled(cloud, placed, own.count, own.sample - origin)
-    tiles = open_cloud(cloud)
-    diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
-    content = _report(source, own, tiles.spacing(), diagonal, unit)
-    write_json(report, content | {"backend": quantity("imported", "")})
+    content = write_placed(cloud, source, parts, own, shift.inverse(), unit)
+    write_json(report, content | {"backend": quantity(IMPORTED, "")})
     place = {
         "length_unit": quantity(unit, ""),
         "crs": quantity(name, ""),
@@ -78,13 +73,13 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
         StageError: as of `import_scene_cloud`.
     """
     parts = columns_in_parts(source)
-    own = _survey(source, parts)
-    whole = concatenate(list(_clouds(parts, own)))
+    own = survey(source, parts)
+    whole = concatenate(list(clouds_in_parts(parts, own)))
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
-    content = _report(source, own, spacing(placed.points), placed.diagonal, "object units")
+    content = import_report(source, own, spacing(placed.points), placed.diagonal, "object units")
     write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
 
 
@@ -99,7 +94,7 @@ def near_origin(points: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class _Survey:
+class Survey:
     """What has to be known of all of a file's points before any is written.
 
     Attributes:
@@ -119,7 +114,7 @@ class _Survey:
     unused: list[str]
 
 
-def _survey(source: Path, parts: ColumnParts) -> _Survey:
+def survey(source: Path, parts: ColumnParts) -> Survey:
     """Go through a file once.
 
     Raises:
@@ -151,10 +146,10 @@ def _survey(source: Path, parts: ColumnParts) -> _Survey:
         )
     if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
         most_color = None  # Formats with colours are used for points without, which are black then.
-    return _Survey(count, left_out, sample, unit_normals, most_color, sorted(unused))
+    return Survey(count, left_out, sample, unit_normals, most_color, sorted(unused))
 
 
-def _clouds(parts: ColumnParts, own: _Survey) -> Iterator[Cloud]:
+def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
     """The file's points in parts, with unit normals or none, colours as bytes or none, and no further fields."""
     for columns in parts():
         cloud = cloud_of(finite_rows(columns)[0], own.most_color)
@@ -164,7 +159,28 @@ def _clouds(parts: ColumnParts, own: _Survey) -> Iterator[Cloud]:
         yield Cloud(cloud.points, normals, None if own.most_color is None else cloud.colors)
 
 
-def _report(source: Path, own: _Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
+def write_placed(cloud: Path, source: Path, parts: ColumnParts, own: Survey, pose: Sim3, unit: str) -> dict[str, Any]:
+    """Write a file's points in another frame, tile by tile; the report of it.
+
+    Args:
+        cloud: output PLY.
+        source: the file.
+        parts: its columns.
+        own: what `survey` says of it.
+        pose: frame_from_file.
+        unit: of lengths in that frame.
+    """
+
+    def placed() -> Iterator[Cloud]:
+        return (part.transformed(pose) for part in clouds_in_parts(parts, own))
+
+    write_tiled(cloud, placed, own.count, pose.apply(own.sample))
+    tiles = open_cloud(cloud)
+    diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
+    return import_report(source, own, tiles.spacing(), diagonal, unit)
+
+
+def import_report(source: Path, own: Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
     """What was taken over, and what became of the rest; printed too."""
     notes = [f"{own.left_out} rows without a finite position were left out"] if own.left_out else []
     if own.unit_normals is False:

@@ -100,11 +100,16 @@ def _checked_table(name: str, kind: str) -> dict[str, Row]:
 
 
 def _cloud_problem(row: Row) -> str:
-    """What is wrong with a row that has a cloud in the place of photos, or neither; "" where nothing is."""
+    """What is wrong with a row that has a cloud in the place of photos or beside them, or neither; "" where nothing."""
     if not row.get("cloud"):
         return "" if row.get("photos") else "has neither photos nor cloud; fill one of these columns"
     if row.get("photos"):
-        return "has both photos and a cloud; keep the one that is to be used, in a row of its own the other"
+        if row.get("cameras"):
+            return ""
+        return (
+            "has both photos and a cloud, but no cameras, in whose coordinates the cloud would lie; fill the column"
+            " cameras, or empty photos or cloud"
+        )
     for column in OF_PHOTOS:
         if row.get(column):
             return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
@@ -116,12 +121,13 @@ def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
     scene = row.get("scene")
     if not scene:
         if row.get("cloud"):
-            return "is a cloud and lies in no scene, so there is nothing to do; name its scene, or give photos"
+            other = "empty the cell cloud" if row.get("photos") else "give photos"
+            return f"is a cloud and lies in no scene, so there is nothing to do; name its scene, or {other}"
         told = next((column for column in OF_SCENE if row.get(column)), None)
         return f"lies in no scene that its {told} could be of; empty that cell, or name its scene" if told else ""
     if scene not in scenes:
         return f"lies in scene '{scene}', which {table} does not list"
-    if row.get("truth") and scenes[scene].get("cloud"):
+    if row.get("truth") and not scenes[scene].get("photos"):
         return f"has a truth, but its scene '{scene}' is a cloud, and the evaluation compares cameras; empty the cell"
     return ""
 

@@ -56,10 +56,6 @@ class EvaluationInputs:
     """COLMAP model of its photos as they were taken."""
     undistorted: Path
     """COLMAP workspace of its undistorted photos, in which the masks were made."""
-    masks: Path
-    """Folder of masks of the undistorted photos."""
-    stages: list[Path]
-    """Folders that hold depth_maps/, in order; empty for none."""
     cloud: Path
     """The object's cloud in its own frame."""
     variants: list[Path]
@@ -70,6 +66,10 @@ class EvaluationInputs:
     """The flight's truth folder."""
     truth_object: Path
     """The orbit's truth folder."""
+    masks: Path | None = None
+    """Folder of masks of the undistorted photos, where there are some."""
+    stages: tuple[Path, ...] = ()
+    """Folders that hold depth_maps/, in order; none where the cloud was given."""
     alignment_json: Path | None = None
     """JSON of the alignment from shared features, measured like a variant, or nothing."""
     scene: Path | None = None
@@ -106,10 +106,10 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
     position = float(np.median(known.fit.position)) / known.diagonal
     result: dict[str, Any] = {
         "diagonal": quantity(known.diagonal, "m"),
-        **_mask_results(inputs),
+        **({} if inputs.masks is None else _mask_results(inputs, inputs.masks)),
         **camera_results(known.fit, len(known.orbit.names)),
         "camera_position_over_diagonal": quantity(position, "1"),
-        **depth_results(inputs.stages, known, settings.max_photos),
+        **depth_results(list(inputs.stages), known, settings.max_photos),
         **cloud_results(known.fit.truth_from_model.apply(points), known, settings.samples, seed),
     }
 
@@ -144,12 +144,12 @@ def _around_object(inputs: EvaluationInputs, known: ObjectTruth, truth_from_scen
     return found
 
 
-def _mask_results(inputs: EvaluationInputs) -> dict[str, Any]:
+def _mask_results(inputs: EvaluationInputs, masks: Path) -> dict[str, Any]:
     """IoU of every mask; the true mask takes the way of its photo, through the model's own camera, into the mask's."""
     scores, missing = {}, 0
     taken = read_cameras(inputs.sparse)
     for view in read_views(inputs.undistorted / "sparse"):
-        path = inputs.masks / f"{Path(view.name).stem}.png"
+        path = masks / f"{Path(view.name).stem}.png"
         if not path.is_file():
             missing += 1
             continue

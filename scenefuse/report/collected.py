@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.report.values import Fields, find, load
@@ -14,7 +15,11 @@ _OBJECT_FILES = (
     *("stage1.json", "stage2.json", "stage3.json", "stage4.json", "object.json"),
 )
 _SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
+# The same of an object whose cloud was given with its photos; masks are made only where they mark it.
+_POSED_FILES = tuple(name for name in _OBJECT_FILES if not name.startswith(("masks", "stage")))
 _JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
+Given = Literal["photos", "cloud", "both"]
+"""What of a scene or an object the user gave; `both`: photos, cameras, and a cloud in their coordinates."""
 ALONE = "by itself"
 """Status of an object that is done and lies in no scene."""
 
@@ -44,16 +49,17 @@ class Collected:
     alone: bool = False
 
 
-def collect_scene(folder: Path, chunks: int, is_cloud: bool = False) -> tuple[Fields, str]:
+def collect_scene(folder: Path, chunks: int, given: Given = "photos") -> tuple[Fields, str]:
     """The quantities of a scene's stages, and the first file that is missing up to its cloud, or "".
 
     Args:
         folder: the scene's results.
         chunks: jobs that its depth maps are split into.
-        is_cloud: whether it was given as a cloud.
+        given: what of it was given.
     """
-    made = (*_SCENE_FILES, *(f"depth/{k}.json" for k in range(chunks)))
-    there, gap = unbroken(folder, (*(("georeference.json",) if is_cloud else made), "dense.json"))
+    maps = tuple(f"depth/{k}.json" for k in range(chunks)) if given == "photos" else ()
+    made = ("georeference.json",) if given == "cloud" else (*_SCENE_FILES, *maps)
+    there, gap = unbroken(folder, (*made, "dense.json"))
     found = read_fields(folder, [name for name in there if "/" not in name])
     return found | ({} if gap else read_fields(folder, ["truth.json"])), gap
 
@@ -64,7 +70,7 @@ def collect(
     jobs: JobRecords,
     scene: str = "",
     scene_gap: str = "",
-    is_cloud: bool = False,
+    given: Given = "photos",
     linked: bool = True,
 ) -> Collected:
     """Everything about one object. What stands behind a missing file is from an earlier run and is left out.
@@ -75,12 +81,13 @@ def collect(
         jobs: where the rules' logs and benchmarks are.
         scene: name of the scene that the object lies in; "" for one by itself.
         scene_gap: the first file that this scene lacks, or "".
-        is_cloud: whether the object was given as a cloud.
+        given: what of the object was given.
         linked: whether object and scene both have photos.
     """
     alone = not scene
-    there, gap = unbroken(folder, ("object.json",) if is_cloud else _OBJECT_FILES)
+    there, gap = unbroken(folder, {"photos": _OBJECT_FILES, "cloud": ("object.json",), "both": _POSED_FILES}[given])
     stages = read_fields(folder, [*there, *(["alignment.json"] if linked and not gap else [])])
+    stages |= read_fields(folder, ["masks.json"] if given == "both" and not gap else [])
     if find(stages, "stage1.workspace") == "poses":
         stages |= read_fields(folder, ["poses.json"])
     who = folder.name

@@ -33,14 +33,14 @@ TEMPORARY = ".tmp-"
 
 def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> int | None:
     """Bytes that a scene or an object from photos will take; None where that cannot be told: a cloud, a video, photos
-    that are yet to be made or cannot be read.
+    that are yet to be made or cannot be read. With a cloud beside the photos there are no maps.
 
     Args:
         kind: `scene` or `object`.
         row: its row of the table.
         settings: its settings.
     """
-    if row.get("cloud") or not row.get("photos"):
+    if not row.get("photos"):
         return None
     try:
         photos = photo_files(Path(row["photos"]))
@@ -58,6 +58,7 @@ def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> 
         maps = OBJECT_BYTES * min(photo, own["nerf"]["width_px"] / width) ** 2
         count = math.ceil(count / own["frames"]["frame_step"])
         count = min(count, own["frames"]["max_frames"] or count)
+    maps *= not row.get("cloud")
     pixels = width * height * (PHOTO_BYTES * photo**2 + maps)
     return round(count * (pixels + FEATURE_BYTES * own["features"]["max_features"]))
 

@@ -58,10 +58,11 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     if join.fused and join.missing is not None:
         pictures["missing"] = _missing(inputs.name, join, join.missing, clouds[1][1])
     cloud = join.object_cloud or read_cloud(inputs.object_cloud)
-    if inputs.workspace is None or inputs.masks is None:
-        pictures["object"] = cloud_sheet(inputs.name, cloud)
-    else:
+    if inputs.workspace is not None:
         cloud = join.object_cloud or upright(cloud, inputs.workspace)
+    if inputs.workspace is None or inputs.masks is None or not inputs.stages:
+        pictures["object"] = cloud_sheet(inputs.name, cloud, inputs.workspace is not None)
+    else:
         pictures["object"] = object_sheet(inputs.name, cloud, inputs.workspace, inputs.masks, list(inputs.stages))
     with atomic_directory(figures) as folder:
         for name, picture in pictures.items():

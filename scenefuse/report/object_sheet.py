@@ -41,11 +41,11 @@ def object_sheet(name: str, cloud: Cloud, workspace: Path, masks: Path, stages: 
     return draw_sheet(Sheet(f"{name}: the object by itself", note, rows, row_labels, [], captions, tile))
 
 
-def cloud_sheet(name: str, cloud: Cloud) -> Image:
-    """The same of an object that was given as a cloud: the cloud from four sides."""
+def cloud_sheet(name: str, cloud: Cloud, has_photos: bool) -> Image:
+    """The same of an object whose cloud was given: the cloud from four sides."""
     radii, framed, tile = point_radii(cloud.points), inner(cloud.points), (320, 240)
     sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
-    note = f"given as a cloud of {len(cloud):,} points: no photos, no masks, no stages"
+    note = f"given as a cloud of {len(cloud):,} points: no stages, {'its own' if has_photos else 'no'} photos"
     return draw_sheet(Sheet(f"{name}: the object by itself", note, [sides], ["cloud"], [], {}, tile))
 
 

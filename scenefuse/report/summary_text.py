@@ -72,7 +72,7 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     if find(fields, "dense.points") is None:
         return _line("missing", f"no dense cloud: {row['error']}")
     given = _given(fields, "dense")
-    lines = _line("given", given) if given else _line("cameras", _cameras(row, "photos"))
+    lines = _line("given", given) + (_line("cameras", _cameras(row, "photos")) if row["registered"] else [])
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame)) + _survey_lines(fields)
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
@@ -120,6 +120,10 @@ def _given(fields: Fields, stage: str) -> str:
     source = find(fields, f"{stage}.source")
     if not source:
         return ""
+    if find(fields, f"{stage}.seen_share") is not None:
+        outside = find(fields, f"{stage}.outside_masks")
+        cut = f"; {outside} points outside the masks were left out" if outside else ""
+        return f"the cloud {source}, in the coordinates of the given cameras{cut}"
     crs = find(fields, "georeference.crs")
     return f"as a cloud, {source}, without photos" + (f"; coordinates: {_crs_name(crs)}" if crs else "")
 

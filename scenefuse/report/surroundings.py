@@ -83,11 +83,11 @@ class FigureInputs:
     next_photos: Path
     """CSV of the stations from where photos would show them."""
     workspace: Path | None = None
-    """The object's undistorted COLMAP workspace (images/, sparse/); None where the object was given as a cloud."""
+    """The object's undistorted COLMAP workspace (images/, sparse/); None where it has no photos."""
     masks: Path | None = None
-    """Folder of the object's masks, {photo}.png; as the workspace."""
+    """Folder of the object's masks, {photo}.png, where it has some."""
     stages: tuple[Path, ...] = ()
-    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too."""
+    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too; none where its cloud was given."""
 
 
 def read_surroundings(inputs: FigureInputs) -> Surroundings:

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from scenefuse.job_records import JobRecords
-from scenefuse.report.collected import Collected, collect, collect_scene, read_fields, status_of
+from scenefuse.report.collected import Collected, Given, collect, collect_scene, read_fields, status_of
 from scenefuse.report.disk import disk_table
 from scenefuse.report.summary_text import summary_text
 from scenefuse.report.tables import (
@@ -29,6 +29,8 @@ def write_summary(
     scene_of: tuple[str, ...] = (),
     cloud_scenes: tuple[str, ...] = (),
     cloud_objects: tuple[str, ...] = (),
+    posed_scenes: tuple[str, ...] = (),
+    posed_objects: tuple[str, ...] = (),
 ) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
@@ -45,8 +47,10 @@ def write_summary(
         scenes: result folders of the scenes (results/scenes/{scene}).
         objects: result folders of the objects (results/objects/{object}); they need not exist.
         scene_of: name of the scene that each object lies in; empty for one by itself.
-        cloud_scenes: names of the scenes that were given as clouds.
+        cloud_scenes: names of the scenes that were given as clouds without photos.
         cloud_objects: names of the objects that were.
+        posed_scenes: names of the scenes whose clouds were given with photos and cameras.
+        posed_objects: names of the objects whose were.
 
     Raises:
         StageError: no variant is given, or not one scene for each object.
@@ -55,7 +59,9 @@ def write_summary(
         raise StageError("no registration variant is given; name at least one, the one that is fused first")
     if len(scene_of) != len(objects):
         raise StageError(f"{len(objects)} objects but {len(scene_of)} scenes are given; name the scene of each object")
-    parts = {folder.name: collect_scene(folder, chunks, folder.name in cloud_scenes) for folder in scenes}
+    parts = {
+        folder.name: collect_scene(folder, chunks, _given(folder.name, cloud_scenes, posed_scenes)) for folder in scenes
+    }
     found = [
         collect(
             folder,
@@ -63,7 +69,7 @@ def write_summary(
             jobs,
             scene,
             parts[scene][1] if scene in parts else "",
-            folder.name in cloud_objects,
+            _given(folder.name, cloud_objects, posed_objects),
             bool(scene) and folder.name not in cloud_objects and scene not in cloud_scenes,
         )
         for folder, scene in zip(objects, scene_of)
@@ -89,6 +95,11 @@ def write_summary(
     with atomic_file(summary / "summary.txt") as temporary:
         temporary.write_text(text)
     print(text, flush=True)
+
+
+def _given(name: str, clouds: tuple[str, ...], posed: tuple[str, ...]) -> Given:
+    """What of a scene or an object was given."""
+    return "cloud" if name in clouds else "both" if name in posed else "photos"
 
 
 def _completed(folder: Path, objects: list[Collected], variant: str) -> Fields:

@@ -41,6 +41,7 @@ def georegister(
     photos: Path,
     control: Path | None = None,
     lengths: Path | None = None,
+    held: bool = False,
     georeferenced: Path,
     residuals: Path,
     report: Path,
@@ -57,6 +58,7 @@ def georegister(
         photos: JSON list of the photos with their GPS positions.
         control: control and check points with their clicks, an OpenDroneMap gcp_list.txt.
         lengths: known lengths between clicked points, `lengths.tsv`; beside control points or GPS only measured.
+        held: whether the model is only moved: a dense cloud is given that goes with its cameras as they are.
         georeferenced: output, COLMAP model.
         residuals: output, tab-separated: what is left at every surveyed point and every photo with a position.
         report: output, JSON: status, transform, origin, CRS, residuals.
@@ -78,7 +80,9 @@ def georegister(
         found = replace(found, placement=scaled(found.placement, known.scale, len(known.names)))
     transform = found.placement.local_from_model
     model.transform(pycolmap.Sim3d(transform.scale, pycolmap.Rotation3d(transform.rotation), transform.translation))
-    adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
+    adjustment: dict[str, Any] = {}
+    if not held:
+        adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
     with atomic_directory(georeferenced) as temporary:
         model.write(temporary)
     left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, sizes))

@@ -106,7 +106,11 @@ def in_metres(
     model.transform(pycolmap.Sim3d(known.scale, pycolmap.Rotation3d(), np.zeros(3)))
     off = dict(zip(known.names, known.off_m.tolist()))
     print("in metres by known lengths, off by " + ", ".join(f"{n} {o:+.3g} m" for n, o in off.items()), flush=True)
-    return {"length_unit": quantity("m", ""), "lengths_off_m": quantity(off, "m")}
+    return {
+        "length_unit": quantity("m", ""),
+        "metres_per_unit": quantity(known.scale, "m per unit of the model before"),
+        "lengths_off_m": quantity(off, "m"),
+    }
 
 
 def _mapped(

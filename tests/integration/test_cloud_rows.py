@@ -1,7 +1,9 @@
-"""A scene and an object given as clouds, without a single photo: the whole workflow, from the tables to the report."""
+"""A scene and an object given as clouds, without a single photo: the whole workflow, from the tables to the report; and
+what is planned where clouds are given beside photos and cameras."""
 
 import json
 import os
+import re
 import shutil
 
 import laspy
@@ -10,7 +12,7 @@ import pytest
 import yaml
 from support.cloud_files import UTM
 from support.planted import errors, plant
-from support.user_project import planned
+from support.user_project import Project, planned
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.stage import read_json, value
@@ -114,3 +116,40 @@ def test_a_cloud_that_is_not_there_is_one_sentence(project, tmp_path, snakemake)
     refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
     assert refused.returncode != 0
     assert "scenes.tsv, scene 'yard': yrad.laz in the column cloud does not exist" in refused.stdout
+
+
+SFM = {"map_scene_photos", "map_object_photos", "undistort_scene_photos", "undistort_object_photos", "align_models"}
+STEREO = {"estimate_depth_maps", "fuse_depth_maps"}
+TRAINING = {"train_depth", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud"}
+POSED = "\tphotos\tcameras\tcloud"
+
+
+def test_clouds_beside_photos_and_cameras_take_the_place_of_stereo_and_training(yard, snakemake):
+    shed = "yard\tclose\tclose.json\tshed.ply\t"
+    yard.objects = f"object\tscene{POSED}\tprompts\nshed\t{shed}\nhut\t{shed}clicks.tsv\n"
+    plan = snakemake(yard.path, "-n", config=yard.write())
+    assert plan.returncode == 0, plan.stdout[-3000:]
+    rules = planned(plan.stdout)
+    assert {"import_posed_scene_cloud", "import_posed_object_cloud", "find_missing", *SFM} <= rules
+    assert not rules & {*STEREO, *TRAINING}
+    assert re.search(r"make_masks +1\n", plan.stdout)  # of the hut, which has prompts
+
+
+def test_a_cloud_beside_photos_without_cameras_stops_before_anything_runs(yard, snakemake):
+    yard.scenes = "scene\tphotos\tcloud\nyard\tflight\tyard.ply\n"
+    refused = snakemake(yard.path, "-n", config=yard.write())
+    assert refused.returncode != 0
+    assert "scenes.tsv: scene 'yard' has both photos and a cloud, but no cameras" in refused.stdout
+
+
+@pytest.fixture
+def yard(tmp_path):
+    """The yard with photos, cameras and a cloud, and files for a shed with the same."""
+    project = Project(tmp_path)
+    for name in ("flight", "close"):
+        project.photos(name)
+        (project.path / f"{name}.json").write_text("{}")
+    for name in ("yard.ply", "shed.ply", "clicks.tsv"):
+        (project.path / name).write_text("")
+    project.scenes = f"scene{POSED}\nyard\tflight\tflight.json\tyard.ply\n"
+    return project

@@ -326,8 +326,26 @@ def test_masks_come_before_fiducials_which_then_check_them(orbit, tmp_path):
     stray = np.concatenate([trial.fiducials[:4], away[:1]])
     crop_scene(**stage_files(tmp_path, trial, stray) | {"inputs": both}, settings=SETTINGS)
     assert value(read_json(files["report"]), "notes")[1].endswith("lie outside the box: p4")
-    with pytest.raises(StageError, match="all 5 marks of .* lie outside the box that the masks mark"):
+    with pytest.raises(StageError, match="all 5 marks of .* lie outside the box that marks the object"):
         crop_scene(**stage_files(tmp_path, trial, away[:5]) | {"inputs": both}, settings=SETTINGS)
+
+
+def test_without_masks_the_object_s_own_cloud_marks_it_through_the_alignment(orbit, tmp_path):
+    folder, trial = orbit
+    files = stage_files(tmp_path, trial, trial.fiducials)
+    crop_scene(**files, settings=SETTINGS)
+    clicked = read_cloud(files["crop"]).points
+    write_cloud(tmp_path / "object.ply", trial.object)
+    alone = replace(files["inputs"], fiducials=None, cloud=tmp_path / "object.ply")
+    linked = replace(alone, alignment_json=folder / "alignment.json")
+    crop_scene(**files | {"inputs": linked}, settings=SETTINGS)
+    own = read_cloud(files["crop"]).points
+    assert value(read_json(files["report"]), "mode") == "cloud"
+    assert len({*map(tuple, clicked)} & {*map(tuple, own)}) > 0.9 * max(len(clicked), len(own))
+    not_found = {"found": quantity(False, ""), "reason": quantity("only 3 of 90 matched points agree", "")}
+    write_json(tmp_path / "alignment.json", not_found)
+    crop_scene(**files | {"inputs": replace(alone, alignment_json=tmp_path / "alignment.json")}, settings=SETTINGS)
+    assert value(read_json(files["report"]), "mode") == "none"  # the whole scene
 
 
 def test_without_an_alignment_the_fiducials_mark_the_object_and_that_is_said(orbit, tmp_path):

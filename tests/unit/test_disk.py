@@ -27,6 +27,8 @@ def test_a_forecast_grows_with_photos_and_maps(photos):
     scene, thing = forecast("scene", row, shipped), forecast("object", row, shipped)
     # Photos are not enlarged: all maps have the photos' size.
     assert 3 * 400 * 300 * 15 < scene < thing < 3 * 400 * 300 * 150
+    for kind, whole in (("scene", scene), ("object", thing)):  # a cloud beside photos saves the maps
+        assert forecast(kind, row | {"cloud": "a.ply"}, shipped) < 0.7 * whole
     shipped["object"]["nerf"]["width_px"] = 200
     assert forecast("object", row, shipped) < thing
     (photos / "c.png").unlink()

@@ -230,6 +230,15 @@ def test_a_mask_of_another_size_is_one_sentence(files):
     assert not outputs.missing.exists()
 
 
+def test_without_masks_only_points_of_the_object_are_looked_at_and_that_is_said(files):
+    inputs, outputs = files
+    find_missing(inputs=replace(inputs, masks=None), outputs=outputs)
+    report = read_json(outputs.report)
+    assert value(report, "status") == "found" and value(report, "notes")[0].startswith(
+        "0 masks: what they do not frame"
+    )
+
+
 def test_of_an_object_without_photos_the_stage_writes_that_nothing_was_looked_for(files):
     inputs, outputs = files
     find_missing(inputs=replace(inputs, object_workspace=None, masks=None), outputs=outputs)

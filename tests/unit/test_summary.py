@@ -78,7 +78,7 @@ def results(tmp_path):
     return tmp_path
 
 
-def summarise(results, names=("house", "balloon", "sculpture"), lone=()):
+def summarise(results, names=("house", "balloon", "sculpture"), lone=(), **posed):
     write_summary(
         scenes=(results / "scenes/demo",),
         chunks=2,
@@ -87,6 +87,7 @@ def summarise(results, names=("house", "balloon", "sculpture"), lone=()):
         variants=["full", "paper"],
         jobs=JobRecords(results / "logs", results / "benchmarks"),
         summary=results / "summary",
+        **posed,
     )
     return results / "summary"
 
@@ -235,6 +236,21 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     table = read(summary, "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "failed" and np.isnan(table.loc[("house", "full"), "scale"])
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
+
+
+def test_of_clouds_given_with_cameras_neither_depth_maps_nor_stages_are_missed(results):
+    for name in ("depth/0.json", "depth/1.json"):
+        (results / "scenes/demo" / name).unlink()
+    for name in ("masks", "stage1", "stage2", "stage3", "stage4"):
+        (results / f"objects/house/{name}.json").unlink()
+    given = {"points": quantity(5000, "1"), "source": quantity("own.laz", ""), "seen_share": quantity(1.0, "1")}
+    for path in (results / "scenes/demo/dense.json", results / "objects/house/object.json"):
+        write_json(path, given)
+    text = (summarise(results, posed_scenes=("demo",), posed_objects=("house",)) / "summary.txt").read_text()
+    scene, house = (text[text.index(f"{name}\n") :][:400] for name in ("scene demo", "object house: registered"))
+    for part in (scene, house):
+        assert "given         the cloud own.laz, in the coordinates of the given cameras" in part
+    assert "59 of 60 photos registered" in scene and "points 5000" in house
 
 
 def test_the_text_says_what_the_scene_makes_of_an_object_s_known_lengths(results):

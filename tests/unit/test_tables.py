@@ -248,13 +248,26 @@ def test_a_row_with_a_cloud_needs_no_photos(cloud_project):
     assert found.scenes["yard"]["cloud"] == "yard.laz" and found.objects["shed"]["cloud"] == "shed.ply"
 
 
+def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
+    photographed = {"photos": "flight", "cameras": "sparse", "truth": "truth"}
+    found = cloud_project(scene=photographed, obj=photographed | {"prompts": "clicks.tsv"})
+    assert found.scenes["yard"]["cloud"] == "yard.laz" and found.objects["shed"]["photos"] == "flight"
+
+
 @pytest.mark.parametrize(
     "rows, sentence",
     [
         ({"scene": {"cloud": ""}}, "scenes.tsv: scene 'yard' has neither photos nor cloud"),
         ({"obj": {"cloud": ""}}, "objects.tsv: object 'shed' has neither photos nor cloud"),
-        ({"scene": {"photos": "flight"}}, "scenes.tsv: scene 'yard' has both photos and a cloud; keep the one"),
-        ({"obj": {"photos": "close"}}, "objects.tsv: object 'shed' has both photos and a cloud"),
+        (
+            {"scene": {"photos": "flight"}},
+            "scenes.tsv: scene 'yard' has both photos and a cloud, but no cameras, .*; fill the column",
+        ),
+        ({"obj": {"photos": "close"}}, "objects.tsv: object 'shed' has both photos and a cloud, but no cam"),
+        (
+            {"obj": {"scene": "", "photos": "close", "cameras": "sparse"}},
+            "'shed' is a cloud and lies in no scene, .* empty the cell cloud",
+        ),
         ({"obj": {"masks": "masks"}}, "'shed' is a cloud and has no photos that its masks could be for; empty that"),
         ({"obj": {"prompts": "a.tsv"}}, "'shed' is a cloud and has no photos that its prompts could be for"),
         ({"scene": {"calibration": "1 PINHOLE"}}, "'yard' is a cloud and has no photos that its calibration"),
@@ -263,7 +276,7 @@ def test_a_row_with_a_cloud_needs_no_photos(cloud_project):
             "'shed' has a truth, but its scene 'yard' is a cloud",
         ),
     ],
-    ids=["no scene", "no object", "both", "object both", "masks", "prompts", "calibration", "truth"],
+    ids=["no scene", "no object", "both", "object both", "alone", "masks", "prompts", "calibration", "truth"],
 )
 def test_a_bad_row_with_a_cloud_is_one_sentence(cloud_project, rows, sentence):
     with pytest.raises(StageError, match=sentence):

@@ -12,7 +12,7 @@ def variant_options(part):
 
 
 def crop_mode(wildcards):
-    """How a variant crops: by the object's masks where the photos of both sides may be linked, else by the file in the
+    """How a variant crops: by the object's masks (or its given cloud) where the photos of both sides may be linked, else by the file in the
     column fiducials. Without either, the whole scene is kept: None."""
     crop = registration_of(wildcards)["crop"]
     marked, linked = object_row(wildcards.object).get("fiducials"), is_linked(wildcards)
@@ -29,11 +29,11 @@ def crop_marks(wildcards):
     own = dict(zip(["fiducials"], clicked))
     if mode == "masks":
         folder = f"results/objects/{wildcards.object}"
-        own |= {
-            "alignment_json": f"{folder}/alignment.json",
-            "workspace": f"{folder}/undistorted",
-            "masks": f"{folder}/masks",
-        }
+        own["alignment_json"] = f"{folder}/alignment.json"
+        if has_masks(object_row(wildcards.object)):
+            own |= {"workspace": f"{folder}/undistorted", "masks": f"{folder}/masks"}
+        else:
+            own["cloud"] = f"{folder}/object.ply"
     return own
 
 

@@ -28,9 +28,9 @@ def results_of(wildcards):
 
 
 def scene_model(wildcards):
-    """The cameras of a scene; none where it is given as a cloud."""
+    """The cameras of a scene; none where it has no photos."""
     folder = f"results/scenes/{wildcards.scene}/georeferenced"
-    return [] if scene_row(wildcards.scene).get("cloud") else [folder]
+    return [folder] if scene_row(wildcards.scene).get("photos") else []
 
 
 def summary_command(log):
@@ -39,6 +39,8 @@ def summary_command(log):
         "scene_of": [row.get("scene", "") for row in OBJECTS.values()],
         "cloud_scenes": CLOUD_SCENES,
         "cloud_objects": CLOUD_OBJECTS,
+        "posed_scenes": POSED_SCENES,
+        "posed_objects": POSED_OBJECTS,
     }
     given = flags({name: found for name, found in given.items() if found})
     return (

@@ -2,8 +2,8 @@
 
 
 def photos_of(row, who):
-    """The cell `photos` of a row; a scene or object that is given as a cloud has none."""
-    if row.get("cloud"):
+    """The cell `photos` of a row; a scene or object that is given as a cloud alone has none."""
+    if not row.get("photos"):
         raise WorkflowError(
             f"{who} is given as a cloud: nothing is made from photos of it"
         )

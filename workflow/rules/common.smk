@@ -48,8 +48,14 @@ SCENES, OBJECTS, VARIANTS = PROJECT.scenes, PROJECT.objects, PROJECT.variants
 # Objects that lie in a scene, and those by themselves: their cloud is the result.
 JOINED = {name: row for name, row in OBJECTS.items() if row.get("scene")}
 LONE = [name for name in OBJECTS if name not in JOINED]
-CLOUD_SCENES, CLOUD_OBJECTS = (
-    [name for name, row in rows.items() if row.get("cloud")]
+# Clouds without photos, and clouds in the coordinates of cameras that are given with the photos.
+CLOUD_SCENES, CLOUD_OBJECTS, POSED_SCENES, POSED_OBJECTS = (
+    [
+        name
+        for name, row in rows.items()
+        if row.get("cloud") and bool(row.get("photos")) == photographed
+    ]
+    for photographed in (False, True)
     for rows in (SCENES, OBJECTS)
 )
 if config["gpu"] == "auto":
@@ -155,27 +161,63 @@ def in_photographed_scene(*paths):
     """The same; none where the scene is given as a cloud."""
 
     def files(wildcards):
+        photos = scene_row(scene_of(wildcards)).get("photos")
+        return in_scene(*paths)(wildcards) if photos else []
+
+    return files
+
+
+def in_matched_scene(*paths):
+    """The same; none where the scene has no depth maps of its own, as its cloud is given."""
+
+    def files(wildcards):
         given = scene_row(scene_of(wildcards)).get("cloud")
         return [] if given else in_scene(*paths)(wildcards)
 
     return files
 
 
-def if_photographed(*paths):
-    """Input function: files that the photos of the object give; none where it is given as a cloud."""
+def files_if(has, *paths):
+    """Input function: files of the object, where `has`, a function of its row, says that there are any."""
 
     def files(wildcards):
-        row = object_row(wildcards.object)
         found = [path.replace("{object}", wildcards.object) for path in paths]
-        return [] if row.get("cloud") else found
+        return found if has(object_row(wildcards.object)) else []
 
     return files
 
 
+def if_photographed(*paths):
+    """Input function: files that the photos of the object give; none where it is given as a cloud without any."""
+    return files_if(lambda row: row.get("photos"), *paths)
+
+
+def if_trained(*paths):
+    """Input function: files of the object's stages 1 to 4; none where its cloud is given."""
+    return files_if(lambda row: not row.get("cloud"), *paths)
+
+
+def has_masks(row):
+    """Whether masks of an object are made: where its cloud is given, only if its prompts or masks are given too."""
+    own = row.get("prompts") or row.get("masks")
+    return row.get("photos") and (own or not row.get("cloud"))
+
+
+def if_masked(*paths):
+    """Input function: files that the masks of the object give."""
+    return files_if(has_masks, *paths)
+
+
+def judging_photos(wildcards):
+    """The workspace of the photos that judge an object's points; none where it has no photos."""
+    given = object_row(wildcards.object).get("cloud")
+    return if_photographed(UNDISTORTED if given else POSED)(wildcards)
+
+
 def is_linked(wildcards):
     """Whether the object and its scene both have photos."""
-    given = object_row(wildcards.object).get("cloud")
-    return not (given or scene_row(scene_of(wildcards)).get("cloud"))
+    rows = object_row(wildcards.object), scene_row(scene_of(wildcards))
+    return all(row.get("photos") for row in rows)
 
 
 def if_linked(*paths):

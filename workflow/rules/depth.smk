@@ -5,11 +5,12 @@
 
 
 # The workspace that the training stages read; all have the same photos, and poses in the same frame. In recipe paper, the last one.
+UNDISTORTED = "results/objects/{object}/undistorted"
 POSED = (
     "results/objects/{object}/refined_poses"
     if config["object"]["recipe"] == "paper"
     else {
-        "sfm": "results/objects/{object}/undistorted",
+        "sfm": UNDISTORTED,
         "network": "results/objects/{object}/poses",
     }[config["object"]["stage1"]["pose_source"]]
 )

@@ -17,7 +17,7 @@ rule fuse_object:
         crop_json="results/objects/{object}/registration/full/crop.json",
         fine="results/objects/{object}/registration/full/fine.json",
         scene=in_scene("dense.ply"),
-        object_workspace=if_photographed(POSED),
+        object_workspace=judging_photos,
         scene_workspace=in_photographed_scene("undistorted"),
         georeference=in_scene("georeference.json"),
     output:
@@ -58,9 +58,9 @@ rule find_missing:
         checked="results/objects/{object}/checked.ply",
         fusion="results/objects/{object}/fusion.json",
         crop_json="results/objects/{object}/registration/full/crop.json",
-        object_workspace=if_photographed(POSED),
+        object_workspace=judging_photos,
         scene_workspace=in_photographed_scene("undistorted"),
-        masks=if_photographed("results/objects/{object}/masks"),
+        masks=if_masked("results/objects/{object}/masks"),
         georeference=in_scene("georeference.json"),
     output:
         missing="results/objects/{object}/missing.ply",

@@ -125,14 +125,16 @@ rule evaluate_scene:
 rule evaluate_object:
     """Compare an object with its truth, where it is known: masks, cameras, depth after each stage, cloud, registration, fusion (G8)."""
     input:
-        workspace=POSED,
+        workspace=judging_photos,
         sparse="results/objects/{object}/sparse",
         undistorted="results/objects/{object}/undistorted",
-        masks="results/objects/{object}/masks",
-        stages=expand(
-            "results/objects/{object}/stage{stage}",
-            stage=[1, 2, 3, 4],
-            allow_missing=True,
+        masks=if_masked("results/objects/{object}/masks"),
+        stages=if_trained(
+            *expand(
+                "results/objects/{object}/stage{stage}",
+                stage=[1, 2, 3, 4],
+                allow_missing=True,
+            )
         ),
         cloud="results/objects/{object}/object.ply",
         variants=expand(
@@ -158,6 +160,7 @@ rule evaluate_object:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
+        made=options_of("masks", "stages"),
         options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
@@ -167,6 +170,6 @@ rule evaluate_object:
         "{wildcards.object}: comparing with the truth"
     shell:
         "exec python {params.script} --workspace {input.workspace} --sparse {input.sparse} --undistorted {input.undistorted}"
-        " --masks {input.masks} --stages {input.stages} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --scene {input.scene} --fused {input.fused}"
+        " {params.made} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --scene {input.scene} --fused {input.fused}"
         " --checked {input.checked} --scene-json {input.scene_json} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
         " --report {output} --seed {params.seed} {params.options} &> {log}"

@@ -11,6 +11,7 @@ ruleorder: estimate_as_paper > train_depth > find_poses
 ruleorder: refine_as_paper > refine_depth
 ruleorder: train_nerf_as_paper > train_object_nerf
 ruleorder: retrain_nerf_as_paper > retrain_object_nerf
+ruleorder: import_object_cloud > import_posed_object_cloud > make_cloud_as_paper
 ruleorder: make_cloud_as_paper > make_object_cloud
 ruleorder: register_for_fusion_as_paper > estimate_scale > register_coarsely > register_finely
 

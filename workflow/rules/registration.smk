@@ -160,9 +160,9 @@ rule register_finely:
         alignment_json=if_linked("results/objects/{object}/alignment.json"),
         object_spread=if_photographed("results/objects/{object}/spread.npz"),
         scene_spread=in_photographed_scene("spread.npz"),
-        workspace=in_photographed_scene("undistorted"),
-        depth=in_photographed_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
-        depth_json=in_photographed_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
+        workspace=in_matched_scene("undistorted"),
+        depth=in_matched_scene(*(f"depth/{chunk}" for chunk in CHUNKS)),
+        depth_json=in_matched_scene(*(f"depth/{chunk}.json" for chunk in CHUNKS)),
     output:
         fine="results/objects/{object}/registration/{variant}/fine.json",
         picture=report(

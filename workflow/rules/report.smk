@@ -67,8 +67,8 @@ rule draw_object:
         missing_json="results/objects/{object}/missing.json",
         next_photos="results/objects/{object}/next_photos.csv",
         workspace=if_photographed("results/objects/{object}/undistorted"),
-        masks=if_photographed("results/objects/{object}/masks"),
-        stages=if_photographed(
+        masks=if_masked("results/objects/{object}/masks"),
+        stages=if_trained(
             *expand(
                 "results/objects/{object}/stage{stage}",
                 stage=[1, 2, 3, 4],

@@ -27,9 +27,10 @@ class CropSettings:
     """Settings of the crop."""
 
     mode: Literal["masks", "fiducials"] = setting("masks")
-    """What marks the object in the scene: its masks, seen through the alignment from shared features, and only where
-    photos share too few the file in the column `fiducials`; or this file in any case. An object without it, and without
-    photos on both sides, is searched in the whole scene."""
+    """What marks the object in the scene: its masks (or, where a cloud of it is given with cameras and without masks,
+    this cloud), seen through the alignment from shared features, and only where photos share too few the file in the
+    column `fiducials`; or this file in any case. An object without it, and without photos on both sides, is searched in
+    the whole scene."""
     shape: Literal["box", "oriented", "hull"] = setting("box")
     """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
     margin: float = setting(0.05, least=0)

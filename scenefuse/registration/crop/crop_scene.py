@@ -1,4 +1,4 @@
-"""The crop stage: an object's surroundings, cut out of the scene by its masks, by clicks or by fiducials."""
+"""The crop stage: an object's surroundings, cut out of the scene by its masks or cloud, by clicks or by fiducials."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, spacing, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
@@ -26,6 +26,8 @@ MIN_FIDUCIALS = 4
 MOST_WHOLE = 10_000_000
 # How far from clicks a crop may reach, in their extents: it grows, and looks for ground around what it has become.
 GROWN_EXTENTS = 2 * MOST_GROWTH
+# Points of an object's own cloud that mark it, and the outermost share of them on each side, in percent, that does not.
+MOST_OWN, STRAY_PERCENT = 20_000, 0.5
 
 
 @dataclass(frozen=True)
@@ -35,8 +37,8 @@ class CropInputs:
     scene: Path
     """Dense scene cloud (PLY), z up as the georegister stage leaves it."""
     sparse: Path | None = None
-    """COLMAP model of the scene in the same frame; clicks are in its photos. None where the scene was given as a
-    cloud."""
+    """COLMAP model of the scene in the same frame; clicks are in its photos. None where the scene has no
+    photos."""
     georeference_json: Path | None = None
     """JSON of the scene, for the unit of its lengths and the origin of an imported cloud."""
     fiducials: Path | None = None
@@ -44,11 +46,13 @@ class CropInputs:
     or clicks (point, photo, x_px, y_px) or scene points (point, x, y, z; of an imported scene in its file's
     coordinates), at least four different points on the object."""
     alignment_json: Path | None = None
-    """JSON of the alignment stage, with `found` and `scene_from_object`, for the masks."""
+    """JSON of the alignment stage, with `found` and `scene_from_object`, for the masks or the cloud."""
     workspace: Path | None = None
     """Undistorted COLMAP workspace of the object, for the masks."""
     masks: Path | None = None
     """Folder of the object's masks."""
+    cloud: Path | None = None
+    """The object's cloud, which was given with its cameras and has no masks: it marks the object in their place."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Marks:
     """What marks the object.
 
     Attributes:
-        mode: none, masks, clicks or fiducials.
+        mode: none, masks, cloud, clicks or fiducials.
         fiducials: (F, 3) in the scene frame: the fiducials, or the inside clicks with their depth.
         voted: scene points that the masks vote for.
     """
@@ -99,9 +103,12 @@ def _up_cue(georeference_json: Path | None) -> str | None:
 
 
 def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
-    """The part of the scene that was read, and the crop of it by what marks the object, in this order: masks where
-    photos are linked, then the user's file."""
-    if settings.whole_scene:
+    """The part of the scene that was read, and the crop of it by what marks the object, in this order: masks (or the
+    object's own cloud) where photos are linked, then the user's file."""
+    alignment = None if inputs.alignment_json is None else read_json(inputs.alignment_json)
+    found = alignment is not None and value(alignment, "found")
+    unmarked = inputs.cloud is not None and not found and inputs.fiducials is None
+    if settings.whole_scene or unmarked:
         if len(scene) > MOST_WHOLE:
             raise StageError(
                 f"nothing marks the object, and the scene has {len(scene)} points; without marks it is searched in at"
@@ -111,10 +118,9 @@ def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple
         cut = whole(near)
         print(cut.notes[0], flush=True)
         return near, cut, Marks("none", np.zeros((0, 3)))
-    if settings.mode == "masks" and inputs.alignment_json is not None:
-        alignment = read_json(inputs.alignment_json)
-        if value(alignment, "found") or inputs.fiducials is None:
-            return crop_by_masks(scene, inputs, settings)
+    if settings.mode == "masks" and alignment is not None:
+        if found or inputs.fiducials is None:
+            return (crop_by_masks if inputs.cloud is None else crop_by_cloud)(scene, inputs, settings)
         near, cut, marks = crop_by_file(scene, inputs, settings)
         note = (
             f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
@@ -202,25 +208,51 @@ def crop_by_masks(scene: TiledCloud, inputs: CropInputs, settings: CropSettings)
     votes = votes_of(near, masked, pose, settings, len(scene))
     cut = crop_cloud(near, np.concatenate([near.points[votes.object], votes.own]), UP, settings, votes.other)
     notes = [f"marked by the votes of {inputs.masks} through the alignment from shared features, not by fiducials"]
-    points = np.zeros((0, 3))
-    if inputs.fiducials is not None:
-        names, points, clicks = _located(scene, inputs, settings)
-        notes += [] if clicks is None else clicks.left_out
-        notes += _check_inside(names, points, cut, inputs.fiducials)
-    cut = replace(cut, notes=notes + cut.notes)
+    points, clicked = _checked(scene, inputs, settings, cut)
+    cut = replace(cut, notes=notes + clicked + cut.notes)
     _announce(cut, str(inputs.masks))
     return near, cut, Marks("masks", points, int(votes.object.sum()))
 
 
+def crop_by_cloud(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+    """`crop_cloud` around the object's own cloud where the alignment puts it, and the part of the scene that was read;
+    checked by the fiducials or clicks where there are some.
+
+    Raises:
+        StageError: a file is missing, or the fiducials mark something else.
+    """
+    assert inputs.cloud is not None and inputs.alignment_json is not None
+    own = read_cloud(inputs.cloud).points
+    low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    own = own[((own >= low) & (own <= high)).all(1)]
+    marks = _alignment(inputs.alignment_json).apply(own[:: max(1, len(own) // MOST_OWN)])
+    near = scene.near(*around_marks(marks, settings))[1]
+    cut = crop_cloud(near, marks, UP, settings)
+    notes = ["marked by the object's own cloud through the alignment from shared features: it has no masks"]
+    points, clicked = _checked(scene, inputs, settings, cut)
+    cut = replace(cut, notes=notes + clicked + cut.notes)
+    _announce(cut, str(inputs.cloud))
+    return near, cut, Marks("cloud", points)
+
+
+def _checked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings, cut: Crop) -> tuple[Array, list[str]]:
+    """The fiducials or clicks (F, 3) that check a crop, none where no file is given, and what they say."""
+    if inputs.fiducials is None:
+        return np.zeros((0, 3)), []
+    names, points, clicks = _located(scene, inputs, settings)
+    notes = [] if clicks is None else clicks.left_out
+    return points, [*notes, *_check_inside(names, points, cut, inputs.fiducials)]
+
+
 def _check_inside(names: list[str], points: Array, cut: Crop, path: Path) -> list[str]:
-    """Names the fiducials (F, 3) off the box that the masks mark; StageError when all are."""
+    """Names the fiducials (F, 3) off the box that the object is in; StageError when all are."""
     level = points @ cut.level_from_scene.T
     off = ((level < cut.low) | (level > cut.high)).any(axis=1)
     outside = [names[k] for k in np.flatnonzero(off)]
     if len(outside) == len(names):
         raise StageError(
-            f"all {len(names)} marks of {path} lie outside the box that the masks mark in the scene: either they are on"
-            " something else, or the alignment from shared features is wrong; correct them, or set"
+            f"all {len(names)} marks of {path} lie outside the box that marks the object in the scene: either they are"
+            " on something else, or the alignment from shared features is wrong; correct them, or set"
             " registration.crop.mode to fiducials"
         )
     if not outside:

@@ -1,0 +1,129 @@
+"""A cloud in the coordinates of given cameras: it goes where these went, and a cloud from elsewhere is refused."""
+
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from support.cloud_files import UTM
+from support.surveyed import FRAME, MODEL_FROM_LOCAL, fly, write_inputs
+
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.registration.frame_ledger import write_frame_ledger
+from scenefuse.sfm.geodesy import scene_frame
+from scenefuse.sfm.georeference import camera_poses, georegister
+from scenefuse.sfm.given.cloud import import_posed_cloud
+from scenefuse.sfm.survey.placement import GeoreferenceSettings
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.workspace import read_views
+
+FLIGHT = fly()
+SCALE = 2.5
+
+
+def field(count=6000, seed=1):
+    """The hilly field under the flight, east, north and up in metres, with normals."""
+    x, y = np.random.default_rng(seed).uniform([-45, -30], [45, 30], (count, 2)).T
+    normals = np.stack([-np.cos(x / 15) / 5, 2 * np.sin(y / 11) / 11, np.ones(count)], axis=1)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return Cloud(np.stack([x, y, 3 * np.sin(x / 15) + 2 * np.cos(y / 11)], axis=1), normals.astype(np.float32))
+
+
+@pytest.fixture
+def given(tmp_path):
+    """A folder with given cameras, and the field as a cloud in their coordinates."""
+    write_inputs(tmp_path, FLIGHT.model(), FLIGHT.photos(noise_m=0.1))
+    write_cloud(tmp_path / "cloud.ply", field().transformed(MODEL_FROM_LOCAL))
+    return tmp_path
+
+
+def imported(folder, **more):
+    """The imported cloud and its report."""
+    files = {name: folder / name for name in ("sparse", "sparse.json")}
+    out = {"cloud": folder / "out.ply", "report": folder / "out.json"}
+    source = folder / "cloud.ply"
+    import_posed_cloud(source=source, sparse=files["sparse"], sparse_json=files["sparse.json"], **out, **more)
+    return read_cloud(out["cloud"]), read_json(out["report"])
+
+
+def test_a_scene_s_cloud_goes_where_georeferencing_took_its_cameras(given):
+    georegister(
+        sparse=given / "sparse",
+        sparse_json=given / "sparse.json",
+        photos=given / "photos.json",
+        held=True,
+        georeferenced=given / "georeferenced",
+        residuals=given / "residuals.tsv",
+        report=given / "georeference.json",
+        settings=GeoreferenceSettings(),
+        seed=0,
+    )
+    cloud, report = imported(given, georeference_json=given / "georeference.json")
+    place = read_json(given / "georeference.json")
+    truth = scene_frame(place).apply(FRAME.inverse(field().points))
+    assert np.median(np.linalg.norm(cloud.points - truth, axis=1)) < 0.3  # by the noise of the positions
+    assert report["spacing"]["unit"] == "m" and value(report, "source") == "cloud.ply"
+    assert np.abs((cloud.normals * field().normals).sum(1) - 1).max() < 0.01
+    # The cameras were moved and not adjusted: the cloud lies among them as it did.
+    centres = camera_poses(pycolmap.Reconstruction(given / "sparse"))[2]
+    moved = camera_poses(pycolmap.Reconstruction(given / "georeferenced"))[2]
+    before = np.linalg.norm(centres[:, None] - read_cloud(given / "cloud.ply").points[:9], axis=2)
+    after = np.linalg.norm(moved[:, None] - cloud.points[:9], axis=2)
+    np.testing.assert_allclose(after, before * value(place, "scale"), rtol=1e-6)
+
+
+def test_an_object_s_cloud_stays_among_its_cameras_and_is_scaled_with_them(given):
+    cloud, report = imported(given)
+    np.testing.assert_allclose(cloud.points, read_cloud(given / "cloud.ply").points, atol=1e-12)
+    assert value(report, "seen_share") > 0.8 and value(report, "met_share") > 0.5
+    model = pycolmap.Reconstruction(given / "sparse")
+    model.transform(pycolmap.Sim3d(SCALE, pycolmap.Rotation3d(), np.zeros(3)))
+    model.write(given / "sparse")
+    write_json(given / "sparse.json", {"metres_per_unit": quantity(SCALE, "")})
+    scaled, _ = imported(given)
+    np.testing.assert_allclose(scaled.points, SCALE * cloud.points, atol=1e-12)
+    write_json(given / "fusion.json", {name: quantity(None, "") for name in ("scene_from_object", "registration")})
+    write_frame_ledger(object_json=given / "out.json", fusion_json=given / "fusion.json", report=given / "frames.json")
+    assert value(read_json(given / "frames.json"), "object_from_file")[0] == [SCALE, 0, 0, 0]
+
+
+def test_what_lies_outside_an_object_s_masks_is_left_out(given):
+    (given / "masks").mkdir()
+    views, cloud = read_views(given / "sparse"), read_cloud(given / "cloud.ply")
+    own = np.linalg.norm(field().points - [5, 0, 0], axis=1) < 10
+    hull = cloud.points[own]
+    for view in views:
+        pixels = view.visible(hull)[1].astype(np.int32)
+        mask = np.zeros((view.height, view.width), np.uint8)
+        if len(pixels):
+            cv2.fillConvexPoly(mask, cv2.convexHull(pixels), 255)
+        cv2.imwrite(str(given / f"masks/{Path(view.name).stem}.png"), mask)
+    (given / "workspace").mkdir()
+    shutil.copytree(given / "sparse", given / "workspace/sparse")
+    cut, report = imported(given, workspace=given / "workspace", masks=given / "masks")
+    kept = {*map(tuple, cut.points)}
+    assert len(kept & {*map(tuple, hull)}) == own.sum() and len(kept) < 1.3 * own.sum()
+    assert value(report, "points") == len(cut) == len(cloud) - value(report, "outside_masks")
+    for mask in (given / "masks").iterdir():
+        cv2.imwrite(str(mask), np.zeros((views[0].height, views[0].width), np.uint8))
+    with pytest.raises(StageError, match="only 0 of 6000 points of .* lie inside the masks"):
+        imported(given, workspace=given / "workspace", masks=given / "masks")
+
+
+@pytest.mark.parametrize(
+    "moved, sentence",
+    [
+        (lambda points: points + UTM, r"cloud.ply does not lie in .* only 0 % of its points are in the pictures"),
+        (lambda points: points[:, [0, 2, 1]], "only .* of its points .*; export cloud and cameras in the same"),
+        (lambda points: MODEL_FROM_LOCAL.inverse().apply(points), "does not lie in the coordinates of the row's cam"),
+        (lambda points: 3 * points, "does not lie in the coordinates of the row's cameras"),
+    ],
+    ids=["crs", "swapped axes", "metres", "another unit"],
+)
+def test_a_cloud_in_other_coordinates_than_the_cameras_is_one_sentence(given, moved, sentence):
+    write_cloud(given / "cloud.ply", Cloud(moved(read_cloud(given / "cloud.ply").points)))
+    with pytest.raises(StageError, match=sentence):
+        imported(given)
+    assert not (given / "out.ply").exists()
