@@ -45,7 +45,7 @@ class Inputs:
         return both
 
     def ups(self) -> tuple[Array, Array] | None:
-        """Unit up directions (3,) in the object's and in the scene's frame, or None when either is unknown or unsure."""
+        """Unit up directions (3,) in the object's and in the scene's frame; None when either is unknown or unsure."""
         of_object = {} if self.workspace_json is None else read_json(self.workspace_json)
         of_scene = read_json(self.crop_json)
         if any(content.get("up_cue", {}).get("value") in UNSURE_CUES for content in (of_object, of_scene)):

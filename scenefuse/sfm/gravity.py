@@ -7,8 +7,8 @@ Array = NDArray[np.float64]
 
 # RMS sine (about 8 degrees) by which the cameras' x axes have to leave one line to fix the vertical on their own.
 MIN_AXIS_SPREAD = 0.15
-# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number: beyond
-# this, in degrees, they hardly do.
+# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number:
+# beyond this, in degrees, they hardly do.
 MOST_HEADINGS_SD_DEG = 2.5
 # A hand rolls a camera by so many degrees at least, as far as a few photos can tell.
 LEAST_ROLL_DEG = 1.0

@@ -296,7 +296,9 @@ def test_photos_in_both_models(tmp_path):
 def test_photos_side_by_side_along_a_front_look_at_what_they_show(tmp_path):
     seen, rng = world(11, 300, spread=(8, 1, 3)), np.random.default_rng(2)
     # Axes that spread a little: they meet behind the photographer.
-    views = [(np.array([x, -9.0, 0]), np.array([1.4 * x, 0, 0]) + rng.normal(0, 0.1, 3)) for x in np.linspace(-4, 4, 10)]
+    views = [
+        (np.array([x, -9.0, 0]), np.array([1.4 * x, 0, 0]) + rng.normal(0, 0.1, 3)) for x in np.linspace(-4, 4, 10)
+    ]
     capture(tmp_path, "front", seen, views, 0)
     place = read_landmarks(tmp_path / "front", tmp_path / "front.db").looked_at()
     assert abs(place[1]) < 1.5 and np.abs(place[[0, 2]]).max() < 2

@@ -187,7 +187,9 @@ def test_gravity_counts_only_where_it_was_measured_on_both_sides(tmp_path, of_ob
     cues = [{} if cue is None else {"up_cue": quantity(cue, "")} for cue in (of_object, of_scene)]
     write_json(tmp_path / "undistorted.json", cues[0] | {"up_in_camera_frame": quantity([0, 0.0, 2.0], "1")})
     write_json(tmp_path / "crop.json", cues[1] | {"up_in_scene": quantity([0.0, 0, 1], "")})
-    inputs = Inputs(tmp_path / "object.ply", tmp_path / "crop.ply", tmp_path / "crop.json", tmp_path / "undistorted.json")
+    inputs = Inputs(
+        tmp_path / "object.ply", tmp_path / "crop.ply", tmp_path / "crop.json", tmp_path / "undistorted.json"
+    )
     assert (inputs.ups() is not None) == used
 
 

@@ -307,8 +307,8 @@ def _announce(cut: Crop, source: str) -> None:
     if cut.keep.sum() < MIN_POINTS:
         raise StageError(
             f"only {cut.keep.sum()} scene points are left in the {cut.shape} of {source}, {MIN_POINTS} are"
-            " needed: the scene may not show the object, or a fiducial or mask may not lie on it; where the object is small"
-            " in the scene's photos, raise scene.depth_maps.max_image_size_px or set scene.dense_cloud.min_photos to 2"
+            " needed: the scene may not show the object, or a fiducial or mask may not lie on it; where the scene's"
+            " photos show it small, raise scene.depth_maps.max_image_size_px or set scene.dense_cloud.min_photos to 2"
         )
 
 

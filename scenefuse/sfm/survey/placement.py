@@ -216,9 +216,9 @@ def place_by_gps(
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
-    the tilt: then the cameras' up direction (3,) closes it. So does it where it is sure and heights are less exact, as a
-    phone's are on a walk around a house. Positions within five times the GPS accuracy of each other
-    say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
+    the tilt: then the cameras' up direction (3,) closes it; also where that is sure and heights are less exact, as a
+    phone's are on a walk around a house. Positions within five times the GPS accuracy of each other say nothing about
+    scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
     limit = _limit(accuracy_m, extent[0], settings)
