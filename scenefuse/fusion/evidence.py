@@ -32,6 +32,9 @@ MARGIN = 0.01
 """Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden."""
 LEAST_THROUGH = 2
 """Photos that must see through a point."""
+SHARE_THROUGH = 0.3
+"""And this share of those that it is open to, where it is not measured: a surface that is wrong itself lies behind
+good points in some photos; a point that is not there has surfaces behind it in many."""
 MOST_CONFIRM = 0.5
 """A measured point of the scene that more than this share of the photos asked confirm is not seen through."""
 LEAST_VIEWS = 3
@@ -240,13 +243,14 @@ def _surer(one: Matches, two: Matches) -> Matches:
 
 
 def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(N,) points where photos see a surface behind them; of measured ones, shares of photos speak against each other.
+    """(N,) points where photos see a surface behind them: enough of those they are open to; of measured ones, a larger
+    share than confirms them.
 
     All photos are held against a surface, only the best are matched: their numbers cannot be compared. A measured point
     that most of the photos asked confirm stays: all photos of a pot before a wall have the wall behind it.
     """
     confirming = matches.photos / (matches.tested + 1.0)  # the reference is among both
-    least = np.where(measured, confirming * (seen.in_view - seen.hidden), 0)
+    least = np.where(measured, confirming, SHARE_THROUGH) * (seen.in_view - seen.hidden)
     least = np.where(measured & (confirming > MOST_CONFIRM), np.inf, least)
     return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
 

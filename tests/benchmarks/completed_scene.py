@@ -10,8 +10,9 @@ A quarter of an object's masks wrong needs its stages to run again: see spoil_ma
 
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -106,8 +107,8 @@ def fuse(case: Case, settings: FusionSettings) -> Cloud:
     return together(fused.kept, fused.added)
 
 
-def fusions() -> dict[str, FusionSettings]:
-    """Every mode that there is, by the name of its row."""
+def fusions(modes: tuple[str, ...]) -> dict[str, FusionSettings]:
+    """Every mode that there is, or those wanted, by the name of its row."""
     found = {}
     for mode in get_args(get_type_hints(FusionSettings)["mode"]):
         if mode not in THINNED:
@@ -116,7 +117,9 @@ def fusions() -> dict[str, FusionSettings]:
             continue
         for density, name in ((1, "the scene's density"), (0, "its own density")):
             found[f"{mode}, {name}"] = FusionSettings(mode=mode, density=density)
-    return found
+    if unknown := set(modes) - set(found):
+        raise StageError(f"there are no rows {sorted(unknown)}; there are {', '.join(found)}")
+    return {name: settings for name, settings in found.items() if not modes or name in modes}
 
 
 def read_case(results: Path, name: str, scene: Cloud) -> Case:
@@ -146,10 +149,10 @@ def scores(case: Case, cloud: Cloud) -> dict[str, float]:
     return {f"{name}_{end}": score for end, of_end in found.items() for name, score in of_end.items()}
 
 
-def completed_rows(case: Case) -> Iterator[dict[str, Any]]:
+def completed_rows(case: Case, modes: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     """The rows of the first table."""
     yield {"cloud": BEFORE, **scores(case, case.scene)}
-    for name, settings in fusions().items():
+    for name, settings in fusions(modes).items():
         yield {"cloud": name, **scores(case, fuse(case, settings))}
     yield {"cloud": ALONE, **scores(case, case.object.transformed(case.pose))}
 
@@ -206,11 +209,11 @@ def perfect_scene(case: Case) -> Case:
     return replace(case, scene=whole, crop=perfect, pose=case.true_pose)
 
 
-def harm_rows(case: Case) -> Iterator[dict[str, Any]]:
+def harm_rows(case: Case, modes: tuple[str, ...]) -> Iterator[dict[str, Any]]:
     """The rows of the second table: scores of the completed scene minus those of the scene before."""
     for wrong, spoilt in harmed(case):
         before = scores(spoilt, spoilt.scene)
-        for name, settings in fusions().items():
+        for name, settings in fusions(modes).items():
             after = scores(spoilt, fuse(spoilt, settings))
             yield {"wrong": wrong, "cloud": name, **{key: after[key] - before[key] for key in after}}
 
@@ -295,6 +298,7 @@ def completed_scene(
     certificate: bool = False,
     cost: bool = False,
     object: Path | None = None,
+    modes: tuple[str, ...] = (),
 ) -> None:
     """Print the scene's F-scores around each object against truth, before and after every kind of fusion.
 
@@ -307,16 +311,22 @@ def completed_scene(
         certificate: print the third table instead: whether the added points are as exact as they say.
         cost: print the fourth table instead: seconds and memory of the fusion.
         object: a cloud in the object's own frame that takes the place of the only one of `objects`.
+        modes: which rows of the first two tables, by their names; all without it.
 
     Raises:
         StageError: a folder holds no finished demo, or a cloud is given for several objects.
     """
     rows: list[dict[str, Any]] = []
     kind = "_harm" if harm else "_certificate" if certificate else "_cost" if cost else ""
-    rows_of = {"": completed_rows, "_harm": harm_rows, "_certificate": certificate_rows, "_cost": cost_rows}[kind]
+    rows_of: dict[str, Callable[[Case], Iterator[dict[str, Any]]]] = {
+        "": partial(completed_rows, modes=modes),
+        "_harm": partial(harm_rows, modes=modes),
+        "_certificate": certificate_rows,
+        "_cost": cost_rows,
+    }
     for folder in results:
         for case in read_cases(folder, objects, object):
-            for row in rows_of(case):
+            for row in rows_of[kind](case):
                 rows.append({"run": str(folder), "object": case.name, "shift_over_diagonal": case.shift, **row})
                 print(f"{folder}, {case.name}: {row.get('wrong', '')} {row.get('cloud', kind[1:])}", flush=True)
     table = pd.DataFrame(rows)

@@ -20,6 +20,7 @@ from scenefuse.io.settings import read_settings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
+from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3, rotation_between
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -92,9 +93,12 @@ def test_the_harm_done_to_an_object_is_as_large_as_it_says():
 
 def test_every_mode_of_fusion_is_in_the_table_of_the_completed_scene():
     modes = get_args(get_type_hints(FusionSettings)["mode"])
-    found = completed_scene.fusions()
+    found = completed_scene.fusions(())
     assert {settings.mode for settings in found.values()} == set(modes) >= set(completed_scene.THINNED)
     assert FusionSettings() in found.values()
+    assert list(completed_scene.fusions(("evidence",))) == ["evidence"]
+    with pytest.raises(StageError, match="no rows.*'evidense'"):
+        completed_scene.fusions(("evidense",))
 
 
 def test_the_table_of_the_completed_scene_compares_with_the_better_source_of_each_run():

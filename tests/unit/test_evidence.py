@@ -227,12 +227,13 @@ def test_every_point_says_what_is_known_of_it(near, far):
 
 
 def test_a_measured_point_goes_where_a_larger_share_of_photos_sees_through_than_confirms():
-    # All 40 photos that it is open to are held against the surface behind, four of the best ten are matched.
-    count, nothing = 3, np.zeros(3)
-    seen = Visibility(np.full(count, 50), np.full(count, 10), np.array([12, 20, 12]))
-    matches = Matches(nothing, nothing, np.full(count, 4), np.full(count, 9), nothing, nothing, nothing)
-    measured = np.array([True, True, False])
-    assert is_seen_through(seen, matches, measured).tolist() == [False, True, True]
+    # All 40 photos that it is open to are held against the surface behind; four of the best ten confirm it, or six.
+    through, confirming = np.array([12, 20, 20, 11, 12]), np.array([4, 4, 6, 4, 4])
+    count, nothing = len(through), np.zeros(len(through))
+    seen = Visibility(np.full(count, 50), np.full(count, 10), through)
+    matches = Matches(nothing, nothing, confirming, np.full(count, 9), nothing, nothing, nothing)
+    measured = np.array([True, True, True, False, False])
+    assert is_seen_through(seen, matches, measured).tolist() == [False, True, False, False, True]
 
 
 def test_a_pot_before_a_wall_stays_where_most_photos_confirm_it():
