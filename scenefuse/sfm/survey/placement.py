@@ -19,9 +19,10 @@ MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
 OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
-# Where the cameras say which way is up, heights do only if they fix the tilt to so many degrees (two standard errors);
-# five photos beside each other have one error, and heights are half as exact as stated for the plane.
-TILT_DEG, HEIGHTS, ALIKE = 2.0, 2.0, 5.0
+# Heights that lean against what the cameras surely say is up, by more than the first (degrees), are not believed where
+# they fix the tilt to more than the second only (two standard errors); five photos beside each other have one error,
+# and heights are half as exact as stated for the plane.
+LEAN_DEG, TILT_DEG, HEIGHTS, ALIKE = 3.0, 2.0, 2.0, 5.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
 BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
@@ -216,8 +217,8 @@ def place_by_gps(
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
-    the tilt: then the cameras' up direction (3,) closes it; also where that is sure and heights are less exact, as a
-    phone's are on a walk around a house. Positions within five times the GPS accuracy of each other say nothing about
+    the tilt: then the cameras' up direction (3,) closes it; also where it is sure and inexact heights contradict it, as
+    a phone's do on a walk around a house. Positions within five times the GPS accuracy of each other say nothing about
     scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
@@ -248,14 +249,18 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        width = _extent(target[rows])[1] if rows.sum() >= MIN_GPS_PHOTOS else 0.0
-        tilt = HEIGHTS * accuracy_m * np.sqrt(ALIKE / max(rows.sum(), 1)) / max(width, 1e-9)
-        return bool(width >= WIDTH * accuracy_m and (not sure_up or tilt <= np.radians(TILT_DEG)))
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= WIDTH * accuracy_m)
+
+    def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
+        lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))
+        tilt = np.degrees(HEIGHTS * accuracy_m * np.sqrt(ALIKE / rows.sum()) / _extent(target[rows])[1])
+        return bool(sure_up and lean > LEAN_DEG and tilt > TILT_DEG)
 
     if fixes_tilt(has_height):
         with contextlib.suppress(ValueError):  # no three positions agree
             fitted, inliers = fit_measured(centres, target, limit, seed)
-            if inliers.sum() >= 0.5 * len(target) and fixes_tilt(inliers & has_height):
+            used = inliers & has_height
+            if inliers.sum() >= 0.5 * len(target) and fixes_tilt(used) and not leans(fitted, used):
                 return fitted, inliers, False
     return *fit_level(centres, target, up, limit, seed), True
 
