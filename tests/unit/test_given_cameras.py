@@ -82,7 +82,10 @@ def opensfm(folder, kind="perspective"):
 LENS = {"f": FOCAL, "cx": 0.0, "cy": 0.0}
 
 
-def metashape(folder, lens=LENS):
+EARTH = "<reference>GEOGCS[&quot;WGS 84&quot;]</reference><transform><scale>3</scale></transform>"
+
+
+def metashape(folder, lens=LENS, placed=EARTH):
     """As Metashape exports it: labels without ending, a group, a photo that was not aligned."""
     inside = "".join(f"<{name}>{number}</{name}>" for name, number in lens.items())
     cameras = "".join(
@@ -95,7 +98,7 @@ def metashape(folder, lens=LENS):
     (folder / "cameras.xml").write_text(
         f'<document><chunk><sensors><sensor id="0" type="frame">{size}{calibration}</sensor></sensors>'
         f'<cameras><group id="0">{cameras}</group><camera id="99" sensor_id="0" label="lost"/></cameras>'
-        "<transform><scale>3</scale></transform></chunk></document>"
+        f"{placed}</chunk></document>"
     )
     return folder / "cameras.xml"
 
@@ -164,6 +167,21 @@ def test_wrong_cameras_are_named(tmp_path):
     (tmp_path / "opensfm/reconstruction.json").write_text("{}")
     with pytest.raises(StageError, match="no reconstruction of OpenSfM"):
         read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+
+
+def test_cameras_of_metashape_lie_where_a_chunk_in_local_coordinates_was_placed(tmp_path):
+    turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True).as_matrix()
+    inside = f"<rotation>{' '.join(map(repr, turn.ravel().tolist()))}</rotation><translation>1 2 3</translation>"
+    placed = f'<components><component id="0"><transform>{inside}<scale>2.5</scale></transform></component></components>'
+    (tmp_path / "photos").mkdir()
+    for view in FLIGHT.views:
+        cv2.imwrite(str(tmp_path / "photos" / view.name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    for reference in ("", "<reference>LOCAL_CS[&quot;Local Coordinates (m)&quot;]</reference>"):
+        found = read_given(metashape(tmp_path, placed=reference + placed), tmp_path / "photos")
+        for photo, view in zip(found, FLIGHT.views, strict=True):
+            pose = view.world_from_cam
+            np.testing.assert_allclose(photo.object_from_cam[:3, 3], 2.5 * turn @ pose[:3, 3] + [1, 2, 3], atol=1e-9)
+            np.testing.assert_allclose(photo.object_from_cam[:3, :3], turn @ pose[:3, :3], atol=1e-9)
 
 
 def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):

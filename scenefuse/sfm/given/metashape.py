@@ -11,7 +11,7 @@ from scenefuse.sfm.given.names import find_photo
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.stage import StageError
-from scenefuse.transforms import Array
+from scenefuse.transforms import Array, Sim3
 
 # Parameters of its lens; those that are zero are left out of the file.
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -36,7 +36,7 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
         if chunk is None:
             raise ValueError("it has no chunk")
         sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
-        files, lenses, found = photo_files(folder), {}, []
+        files, lenses, found, moved = photo_files(folder), {}, [], _local_from_chunk(chunk)
         for camera in chunk.iterfind("cameras//camera"):
             placed, number = camera.find("transform"), camera.attrib["sensor_id"]
             if placed is None or not placed.text:
@@ -45,10 +45,27 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
                 lenses[number] = _camera(sensors[number], f"{file}, sensor {number}")
             label = camera.attrib["label"]
             pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
+            if moved is not None:
+                pose[:3, :3], pose[:3, 3] = moved.rotation @ pose[:3, :3], moved.apply(pose[:3, 3])
             found.append(PosedPhoto(label, find_photo(label, files, folder), lenses[number], pose, None, False))
     except (OSError, ET.ParseError, KeyError, ValueError) as error:
         raise StageError(f"{file} holds no cameras of Metashape ({error!r}); export them as Agisoft XML") from None
     return found
+
+
+def _local_from_chunk(chunk: ET.Element) -> Sim3 | None:
+    """Where a chunk lies in local coordinates, by scale bars or markers: those of its exported clouds.
+
+    None where it was never placed, or on the earth: its clouds are exported in a CRS then; its cameras stay as they are.
+    """
+    reference = (chunk.findtext("reference") or "").strip()
+    placed = [*chunk.iterfind("components/component/transform"), *chunk.iterfind("transform")]
+    if not placed or (reference and not reference.startswith("LOCAL_CS")):
+        return None
+    rotation, translation, scale = (placed[0].findtext(name) for name in ("rotation", "translation", "scale"))
+    turn = np.eye(3) if rotation is None else np.array(rotation.split(), dtype=float).reshape(3, 3)
+    shift = np.zeros(3) if translation is None else np.array(translation.split(), dtype=float).reshape(3)
+    return Sim3(1.0 if scale is None else float(scale), turn, shift)
 
 
 def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:
