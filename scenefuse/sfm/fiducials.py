@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.tables import comma_advice, composed, read_cells
 from scenefuse.stage import StageError
 from scenefuse.workspace import read_model
 
@@ -79,14 +80,8 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     Raises:
         StageError: the file is missing or empty, its header is none of these, or a line is not well formed.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (FileNotFoundError, IsADirectoryError):
-        raise StageError(f"the file of marked points {path} does not exist; write it, or correct its path") from None
-    except UnicodeDecodeError:
-        raise StageError(f"{path} is no text; save the marked points as tab-separated text (UTF-8)") from None
-    rows = [(n, line.split("\t")) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    rows = read_cells(path)
+    header = rows[0][1] if rows else []
     if header not in (CLICK_COLUMNS, POINT_COLUMNS, LABEL_COLUMNS):
         raise StageError(
             f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
@@ -94,24 +89,7 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
         )
     if len(rows) == 1:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
-    texts = 1 if header == POINT_COLUMNS else 2
-    names: list[list[str]] = []
-    numbers: list[list[float]] = []
-    for number, cells in rows[1:]:
-        try:
-            if len(cells) != 4:
-                raise ValueError
-            values = [float(cell) for cell in cells[texts:]]
-            if not np.isfinite(values).all():
-                raise ValueError
-        except ValueError:
-            raise StageError(
-                f"{path}, line {number}: expected {' '.join(header)} separated by tabs, got '{' '.join(cells)}'"
-            ) from None
-        names.append([cell.strip() for cell in cells[:texts]])
-        numbers.append(values)
-        if header == LABEL_COLUMNS and names[-1][0] not in LABELS:
-            raise StageError(f"{path}, line {number}: the label is {', '.join(LABELS)}, not '{names[-1][0]}'")
+    names, numbers = _split(path, header, rows[1:])
     if header == LABEL_COLUMNS:
         return _labels(path, names, numbers)
     keys = [tuple(entry) for entry in names]
@@ -121,6 +99,32 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     if header == POINT_COLUMNS:
         return ScenePoints(path, [n[0] for n in names], np.array(numbers))
     return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
+
+
+def _split(
+    path: Path, header: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[list[list[str]], list[list[float]]]:
+    """The names and the numbers of each line below the header."""
+    texts = 1 if header == POINT_COLUMNS else 2
+    names: list[list[str]] = []
+    numbers: list[list[float]] = []
+    for number, cells in rows:
+        try:
+            if len(cells) != 4:
+                raise ValueError
+            values = [float(cell) for cell in cells[texts:]]
+            if not np.isfinite(values).all():
+                raise ValueError
+        except ValueError:
+            raise StageError(
+                f"{path}, line {number}: expected {' '.join(header)} separated by tabs, got '{' '.join(cells)}'"
+                f"{comma_advice(cells[texts:])}"
+            ) from None
+        names.append(cells[:texts])
+        numbers.append(values)
+        if header == LABEL_COLUMNS and cells[0] not in LABELS:
+            raise StageError(f"{path}, line {number}: the label is {', '.join(LABELS)}, not '{cells[0]}'")
+    return names, numbers
 
 
 def _labels(path: Path, names: list[list[str]], numbers: list[list[float]]) -> Labels:
@@ -174,7 +178,8 @@ def triangulate_consistent(
         StageError: a photo that the model does not hold, a click outside its photo, a point with fewer than two clicks
             in registered photos. Each message names the point.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = None if sizes is None else {composed(name): size for name, size in sizes.items()}
     positions, residuals, names, left_out = [], [], [], []
     for point, observed in _sightings(clicks, images, sizes).items():
         seen, pixels = [images[name] for name, _ in observed], np.array([p for _, p in observed])
@@ -202,7 +207,7 @@ def _sightings(
     """The registered photos and their pixels where each point was clicked, two or more."""
     seen: dict[str, list[tuple[str, Array]]] = {}
     lost: dict[str, list[str]] = {}
-    for point, photo, pixel in zip(clicks.points, clicks.photos, clicks.pixels):
+    for point, photo, pixel in zip(clicks.points, map(composed, clicks.photos), clicks.pixels):
         seen.setdefault(point, [])
         if photo in images:
             seen[point].append((photo, model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))

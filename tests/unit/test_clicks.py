@@ -1,5 +1,6 @@
 """Masks from clicks in one photo: a planted ball, sparse points on it and around it, photos on a circle."""
 
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 
@@ -540,6 +541,16 @@ def test_clicks_come_in_pixels_of_the_original_and_boxes_as_two_corners(tmp_path
     np.testing.assert_allclose(found[0].pixels, [[50, 30], [10, 5]])
     assert found[0].inside.tolist() == [True, False] and found[0].box is None
     np.testing.assert_allclose(found[1].box, [[30, 20], [80, 70]])
+
+
+def test_umlauts_in_two_spellings_are_one_photo(tmp_path, photos):
+    apart, whole = (unicodedata.normalize(form, "Tür 1.png") for form in ("NFD", "NFC"))
+    views = [replace(view, name=apart) if view.name == "f00.png" else view for view in photos.views]
+    (tmp_path / "sparse").mkdir()
+    write_model(tmp_path / "sparse", views)
+    labels = read(tmp_path, [("inside", whole, 100, 60)])
+    found = clicks_per_photo(labels, tmp_path / "sparse", views, {apart: (2 * WIDTH, 2 * HEIGHT)})
+    np.testing.assert_allclose(found[0].pixels, [[50, 30]])
 
 
 @pytest.mark.parametrize(

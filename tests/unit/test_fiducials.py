@@ -1,10 +1,14 @@
+import unicodedata
+
 import numpy as np
 import pycolmap
 import pytest
 
 from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
+from scenefuse.sfm.survey.lengths import read_end_clicks
 from scenefuse.stage import StageError
 
+LABELS = "label\tphoto\tx_px\ty_px\n"
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
 
 
@@ -137,6 +141,45 @@ def test_bad_files(tmp_path, text, sentence):
     path.write_text(text)
     with pytest.raises(StageError, match=sentence):
         read_points(path)
+
+
+def test_a_file_from_a_spreadsheet_is_read_as_the_tables_are(tmp_path):
+    path, lines = tmp_path / "f.tsv", LABELS + "inside\tIMG, 7.JPG\t690\t180\n"
+    quoted = lines.replace("IMG, 7.JPG", '"IMG, 7.JPG"')
+    for content in (
+        lines.replace("\n", "\r\n").encode("utf-16"),
+        lines.encode("utf-8-sig"),
+        lines.replace("\n", "\t \t\n").encode(),
+        (quoted + "\t\t\t\n").encode(),
+    ):
+        path.write_bytes(content)
+        marked = read_points(path)
+        assert (marked.photos, marked.pixels.tolist()) == (["IMG, 7.JPG"], [[690, 180]])
+    path.write_bytes(lines.replace("IMG", "König").encode("cp1252"))
+    with pytest.raises(StageError, match="line 2: not UTF-8 text; save it as UTF-8"):
+        read_points(path)
+
+
+def test_a_decimal_comma_is_named(tmp_path):
+    path = tmp_path / "f.tsv"
+    path.write_text(LABELS + "inside\tIMG_1,2.JPG\t10\t20\ninside\tIMG 7.JPG\t690,5\t180\n")
+    with pytest.raises(StageError, match=r"line 3: expected .* got '.*'; 690,5 has a decimal comma, write 690\.5$"):
+        read_points(path)
+    path.write_text("length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1,5\ta\t1.jpg\t3\t4\n")
+    with pytest.raises(StageError, match=r"line 2: .*; 1,5 has a decimal comma, write 1\.5$"):
+        read_end_clicks(path)
+
+
+def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
+    model = pycolmap.Reconstruction(model)
+    for image in model.images.values():
+        image.name = unicodedata.normalize("NFD", f"Gebäude {image.name}")
+    sizes = {image.name: (640, 480) for image in model.images.values()}
+    plain = clicked(model, tmp_path, photos=tuple(sizes))
+    clicks = Clicks(plain.path, plain.points, [unicodedata.normalize("NFC", p) for p in plain.photos], plain.pixels)
+    assert clicks.photos != plain.photos
+    for known in (None, sizes):
+        np.testing.assert_allclose(triangulate(clicks, model, 5.0, known)[1], list(POINTS.values()), atol=1e-7)
 
 
 def test_missing_file(tmp_path):

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import Labels
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -80,10 +81,11 @@ def clicks_per_photo(
         StageError: a photo that does not exist or has no camera, a click outside its photo, a box that is not two
             corners, only clicks outside.
     """
-    images = {image.name: image for image in posed_images(read_model(sparse))}
-    rows = {view.name: k for k, view in enumerate(views)}
+    images = {composed(image.name): image for image in posed_images(read_model(sparse))}
+    rows = {composed(view.name): k for k, view in enumerate(views)}
+    sizes = {composed(name): size for name, size in sizes.items()}
     found: dict[int, list[tuple[str, Array]]] = {}
-    for label, photo, pixel in zip(labels.labels, labels.photos, labels.pixels):
+    for label, photo, pixel in zip(labels.labels, map(composed, labels.photos), labels.pixels):
         if photo not in images or photo not in rows:
             known = "has no camera (it could not be registered)" if photo in sizes else "is not among the photos"
             some = ", ".join(sorted(images)[:3])

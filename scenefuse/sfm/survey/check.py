@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from scenefuse.io.tables import composed
 from scenefuse.sfm.survey.control_file import read_control, unknown_photo
 from scenefuse.sfm.survey.lengths import read_ends
 
@@ -18,6 +19,7 @@ def check_files(names: list[str], control: Path | None = None, lengths: Path | N
     if lengths is not None:
         ends = read_ends(lengths)[2]
         clicked += [(lengths, point, photo) for point, photo in zip(ends.points, ends.photos)]
+    known = set(map(composed, names))
     for path, point, photo in clicked:
-        if photo not in names:
+        if composed(photo) not in known:
             raise unknown_photo(path, point, photo, names)
