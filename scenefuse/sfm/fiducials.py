@@ -152,7 +152,8 @@ def triangulate(
         clicks: two or more photos per point.
         model: of the photos that were clicked in (not of undistorted ones).
         max_residual_px: a point with a larger RMS reprojection error is an error, in pixels of the model's photos.
-        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies.
+        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies; of
+            all photos, also those that could not be registered.
 
     Returns:
         Point names in order of appearance, (P, 3) positions, (P,) RMS reprojection errors in pixels.
@@ -161,8 +162,10 @@ def triangulate(
         StageError: as `triangulate_consistent`, and rays that are parallel or miss each other: all points at once.
     """
     names, positions, residuals, left_out = triangulate_consistent(clicks, model, max_residual_px, sizes)
-    if left_out:
+    if len(names) < len(set(clicks.points)):
         raise StageError(f"{clicks.path}: {'; '.join(left_out)}; correct these clicks, or delete them")
+    for sentence in left_out:
+        print(f"left out of {clicks.path}: {sentence}", flush=True)
     return names, positions, residuals
 
 
@@ -172,16 +175,18 @@ def triangulate_consistent(
     max_residual_px: float,
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> tuple[list[str], Array, Array, list[str]]:
-    """As `triangulate`, but points whose clicks contradict each other are left out and named in the fourth result.
+    """As `triangulate`, but what cannot be used is left out and named in the fourth result: points whose clicks
+    contradict each other, clicks in photos without a camera, and points that have fewer than two others.
 
     Raises:
-        StageError: a photo that the model does not hold, a click outside its photo, a point with fewer than two clicks
-            in registered photos. Each message names the point.
+        StageError: a photo that is none of `sizes`, a click outside its photo, a point that is clicked once only. Each
+            message names the point.
     """
     images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
     sizes = None if sizes is None else {composed(name): size for name, size in sizes.items()}
-    positions, residuals, names, left_out = [], [], [], []
-    for point, observed in _sightings(clicks, images, sizes).items():
+    positions, residuals, names = [], [], []
+    sightings, left_out = _sightings(clicks, images, sizes)
+    for point, observed in sightings.items():
         seen, pixels = [images[name] for name, _ in observed], np.array([p for _, p in observed])
         position, residual = intersect(seen, pixels)
         if position is None:
@@ -203,29 +208,33 @@ def triangulate_consistent(
 
 def _sightings(
     clicks: Clicks, images: Mapping[str, pycolmap.Image], sizes: Mapping[str, tuple[int, int]] | None
-) -> dict[str, list[tuple[str, Array]]]:
-    """The registered photos and their pixels where each point was clicked, two or more."""
+) -> tuple[dict[str, list[tuple[str, Array]]], list[str]]:
+    """The registered photos and their pixels where each point was clicked, two or more; and what is left out since a
+    photo has no camera."""
     seen: dict[str, list[tuple[str, Array]]] = {}
     lost: dict[str, list[str]] = {}
     for point, photo, pixel in zip(clicks.points, map(composed, clicks.photos), clicks.pixels):
         seen.setdefault(point, [])
         if photo in images:
             seen[point].append((photo, model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))
-        elif sizes is not None and photo in sizes:
+        elif sizes is None or photo in sizes:
             lost.setdefault(point, []).append(photo)
         else:
             raise StageError(
                 f"{clicks.path}: point {point} is clicked in {photo}, which is not among the {len(images)} "
                 f"registered photos; click in one of them ({', '.join(sorted(images)[:3])}, ...)"
             )
+    left_out, unsure = [], "" if sizes else ", or is none of the photos"
     for point, observed in seen.items():
+        count = f"the number of registered photos in which point {point} is clicked is {len(observed)}"
+        unregistered = f"{', '.join(lost.get(point, []))} could not be registered{unsure}"
+        if len(observed) < 2 and point not in lost:
+            raise StageError(f"{clicks.path}: {count}; two or more are needed, click it in another one")
         if len(observed) < 2:
-            why = f" ({', '.join(lost[point])} could not be registered)" if point in lost else ""
-            raise StageError(
-                f"{clicks.path}: the number of registered photos in which point {point} is clicked is "
-                f"{len(observed)}{why}; two or more are needed, click it in another one"
-            )
-    return seen
+            left_out.append(f"{count} ({unregistered}), two or more are needed")
+        elif point in lost:
+            left_out.append(f"{unregistered}: its click on point {point}")
+    return {point: observed for point, observed in seen.items() if len(observed) > 1}, left_out
 
 
 def locate(

@@ -5,6 +5,7 @@ import pycolmap
 import pytest
 
 from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
+from scenefuse.sfm.survey.check import check_marks
 from scenefuse.sfm.survey.lengths import read_end_clicks
 from scenefuse.stage import StageError
 
@@ -74,7 +75,7 @@ def with_click(clicks, index, photo=None, pixel=None):
 def test_error_sentences_name_the_point(model, tmp_path):
     clicks = clicked(model, tmp_path)
     with pytest.raises(StageError, match=r"point door is clicked in 9\.jpg, which is not among the 3 registered"):
-        triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0)
+        triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0, {f"{i}.jpg": (640, 480) for i in (1, 2, 3)})
     with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
         triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
     with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
@@ -99,9 +100,16 @@ def test_a_click_in_a_photo_that_was_not_registered_is_left_out(model, tmp_path)
     clicks = with_click(clicked(model, tmp_path), 0, photo="4.jpg")
     _, positions, _ = triangulate(clicks, model, 5.0, sizes)
     np.testing.assert_allclose(positions[0], POINTS["roof"], atol=1e-7)
+    left_out = triangulate_consistent(clicks, model, 5.0, sizes)[3]
+    assert left_out == ["4.jpg could not be registered: its click on point roof"]
+    # Of one photo only, the point is left out; the others remain.
     two = with_click(clicked(model, tmp_path, photos=("1.jpg", "2.jpg")), 0, photo="4.jpg")
     with pytest.raises(StageError, match=r"is 1 \(4\.jpg could not be registered\)"):
         triangulate(two, model, 5.0, sizes)
+    assert triangulate_consistent(two, model, 5.0, sizes)[0] == ["door"]
+    # Where the photos are not known, as in a scene, it may be a wrong name as well.
+    left_out = triangulate_consistent(clicks, model, 5.0)[3]
+    assert left_out == ["4.jpg could not be registered, or is none of the photos: its click on point roof"]
 
 
 def test_parallel_rays(model, tmp_path):
@@ -180,6 +188,26 @@ def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
     assert clicks.photos != plain.photos
     for known in (None, sizes):
         np.testing.assert_allclose(triangulate(clicks, model, 5.0, known)[1], list(POINTS.values()), atol=1e-7)
+
+
+def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(tmp_path):
+    path, photos = tmp_path / "f.tsv", [f"{k}.jpg" for k in range(1, 6)]
+    path.write_text(LABELS + "inside\t3.jpg\t1\t2\noutside\t4.jpg\t1\t2\n")
+    check_marks(path, photos)
+    check_marks(path)
+    with pytest.raises(
+        StageError, match=r"the click outside is in 4\.jpg, which is none of the 3 photos \(1\.jpg, \.\.\.\)"
+    ):
+        check_marks(path, photos[:3])
+    with pytest.raises(
+        StageError, match=r"in 4\.jpg, but only 3 of the 5 photos are used .* max_frames to 5 and frame_s"
+    ):
+        check_marks(path, photos, photos[::2])
+    path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
+    check_marks(path, photos)
+    path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
+    with pytest.raises(StageError, match=r"a is in 9\.jpg"):
+        check_marks(path, photos)
 
 
 def test_missing_file(tmp_path):
