@@ -16,6 +16,9 @@ from scenefuse.sfm.photo_files import GEO_FILE, photo_files
 from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
+# Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
+MOST_PIXELS = 250_000_000
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
 # Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.

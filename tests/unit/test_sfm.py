@@ -66,6 +66,16 @@ def test_sequential_pairs_close_loops():
     assert len(pairs) == 8 + 7 + 3
 
 
+def test_photos_counted_without_leading_zeros_are_paired_in_the_order_they_were_taken_in():
+    photos = [photo(name) for name in sorted(f"b/IMG_{k}.JPG" for k in range(1, 31))]
+    kind, _, pairs = choose_pairs(photos, False, PAIRS)
+    names = [p.name for p in photos]
+    assert kind == "sequential" and pairs == sorted(pairs, key=lambda p: (names.index(p[0]), names.index(p[1])))
+    assert all(names.index(a) < names.index(b) for a, b in pairs)
+    found = {frozenset(int(name[6:-4]) for name in pair) for pair in pairs}
+    assert all(frozenset((k, k + step)) in found for step in (1, 2) for k in range(1, 31 - step))
+
+
 def test_cameras_are_shared_by_size_model_and_focal_length():
     photos = [photo("a/1"), photo("a/2", camera="X", focal=500.0), photo("b/3"), photo("b/4", camera="X", focal=700.0)]
     assert camera_groups(photos, "auto") == [["a/1", "b/3"], ["a/2"], ["b/4"]]
