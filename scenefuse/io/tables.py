@@ -3,11 +3,15 @@
 import codecs
 import csv
 import io
+import re
+import unicodedata
 from pathlib import Path
 
 from scenefuse.stage import StageError
 
 Row = dict[str, str]
+# What a spreadsheet writes where a comma separates decimals.
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
 
 
 def read_table(path: Path, key: str) -> dict[str, Row]:
@@ -47,6 +51,34 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     """
     lines = enumerate(read_text(path).splitlines(), 1)
     return [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
+
+
+def read_cells(path: Path) -> list[tuple[int, list[str]]]:
+    """The cells of each line of a tab-separated file, with its number from 1, as `read_lines` has them: without blanks
+    around them, a spreadsheet's quotes, and empty cells at the end.
+
+    Raises:
+        StageError: the file is missing, or is no text.
+    """
+    rows = []
+    for number, line in read_lines(path):
+        cells = [cell.strip() for cell in next(csv.reader([line], delimiter="\t"))]
+        while cells and not cells[-1]:
+            cells.pop()
+        if cells:
+            rows.append((number, cells))
+    return rows
+
+
+def comma_advice(cells: list[str]) -> str:
+    """What to add to an error about cells that should be numbers, where one has a decimal comma; "" where none has."""
+    odd = next((cell for cell in cells if DECIMAL_COMMA.fullmatch(cell)), None)
+    return f"; {odd} has a decimal comma, write {odd.replace(',', '.')}" if odd else ""
+
+
+def composed(name: str) -> str:
+    """A photo's name in one spelling, to find it by: macOS writes an umlaut as two characters, others as one."""
+    return unicodedata.normalize("NFC", name)
 
 
 def read_text(path: Path) -> str:

@@ -36,7 +36,7 @@ class Prompted:
         masks: (H, W) per photo, empty where there is none.
         target: where the object is.
         reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
-        left_out: clicks that contradict the others, a sentence each.
+        left_out: clicks that contradict the others, or whose photo has no camera, a sentence each.
     """
 
     masks: list[Mask]
@@ -71,7 +71,8 @@ def masks_from_prompts(
         StageError: the prompts are wrong or too few, or lead to no mask.
     """
     if isinstance(marked, Labels):
-        clicked = with_depth(photos, clicks_per_photo(marked, sparse, photos.views, sizes))
+        own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
+        clicked = with_depth(photos, own)
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
@@ -83,7 +84,7 @@ def masks_from_prompts(
         else:
             masks = segment_by_grabcut(target, photos, settings, carried.clicked)
         masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
-        return Prompted(masks, target, carried.reasons, carried.left_out)
+        return Prompted(masks, target, carried.reasons, left_out + carried.left_out)
     points, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = target_from_points(points, photos, up, seed)
     if network:
@@ -105,7 +106,7 @@ def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: Ph
 def _points(
     marked: Clicks | ScenePoints, sparse: Path, sizes: Mapping[str, tuple[int, int]], max_residual_px: float
 ) -> tuple[Array, list[str]]:
-    """(N, 3) prompts in the object's frame, and the points whose clicks contradict each other."""
+    """(N, 3) prompts in the object's frame, and the points and clicks that are left out."""
     left_out: list[str] = []
     if isinstance(marked, ScenePoints):
         names, points = marked.points, marked.positions

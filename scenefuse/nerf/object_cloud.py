@@ -18,7 +18,7 @@ from scenefuse.io.maps import read_depth, read_normals
 from scenefuse.mvs.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import sparse_depths
-from scenefuse.mvs.views import Views, load_views, on_picture
+from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
@@ -110,7 +110,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     if up := read_json(inputs.workspace_json).get("up_in_camera_frame"):
         known["up_in_camera_frame"] = up
     views = _views(inputs, saved["names"])
-    maps = _read_maps(inputs.stage, views, settings.gates.min_confidence)
+    maps = read_maps(inputs.stage, views, settings.gates.min_confidence)
     poses, rendered = saved["object_from_cam"].numpy(), max(int((maps.depths > 0).sum()), 1)
     refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
     maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
@@ -137,7 +137,7 @@ class SurfaceMaps:
 
     depths: Maps
     confidence: Maps
-    normals: Maps
+    normals: NDArray[np.float16]
 
 
 def fuse_depths(
@@ -177,7 +177,7 @@ def _confirmed(
     keep &= found.through <= gates.through_share * (found.agree + found.through)
     keep &= found.off_mask <= gates.mask_share * found.compared
     rows, columns = rows[keep], columns[keep]
-    normals = maps.normals[index, rows, columns] @ poses[index, :3, :3].T.astype(np.float32)
+    normals = maps.normals[index, rows, columns].astype(np.float32) @ poses[index, :3, :3].T.astype(np.float32)
     towards = poses[index, :3, 3] - found.mean[keep]
     missing = ~normals.any(1)
     normals[missing] = towards[missing] / np.linalg.norm(towards[missing], axis=1, keepdims=True)
@@ -231,17 +231,25 @@ def _neutral(views: Views, saved: dict[str, Any]) -> Views:
     return replace(views, images=without_appearance(images, intrinsics, saved["log_gain"], saved["falloff"]).numpy())
 
 
-def _read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps:
-    """The maps of all views, without depths outside the masks or below the least confidence."""
-    shape = views.masks.shape[1:]
-    depths, confidence = (
-        np.stack([on_picture(read_depth(stage / folder / f"{name}.bin"), shape) for name in views.names])
-        for folder in ("depth_maps", "confidence_maps")
-    )
-    files = [stage / "normal_maps" / f"{name}.bin" for name in views.names]
-    normals = np.stack([on_picture(read_normals(file), shape) for file in files])
-    kept = np.where((confidence >= least_confidence) & views.masks, depths, 0).astype(np.float32)
-    return SurfaceMaps(kept, confidence, normals)
+def read_maps(stage: Path, views: Views, least_confidence: float) -> SurfaceMaps:
+    """The maps of all views, without depths outside the masks or below the least confidence.
+
+    They are most of the stage's memory: each is read into its place.
+    """
+    depths = np.zeros(views.masks.shape, np.float32)
+    confidence = np.zeros_like(depths)
+    normals = np.zeros((*depths.shape, 3), np.float16)
+    kinds: list[tuple[str, Any, Any]] = [
+        ("depth_maps", depths, read_depth),
+        ("confidence_maps", confidence, read_depth),
+        ("normal_maps", normals, read_normals),
+    ]
+    for folder, maps, read in kinds:
+        for index, name in enumerate(views.names):
+            found = read(stage / folder / f"{name}.bin")
+            maps[index, : found.shape[0], : found.shape[1]] = found
+    depths[(confidence < least_confidence) | ~views.masks] = 0
+    return SurfaceMaps(depths, confidence, normals)
 
 
 def _report(raw: Cloud, thinned: Cloud, cleaned: Cloud, shares: tuple[float, float], seed: int) -> dict[str, Any]:

@@ -1,12 +1,16 @@
 """A table of clicks on disk: read, changed, and saved without losing what others wrote."""
 
+import csv
 import fcntl
 import hashlib
+import io
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
+from scenefuse.io.tables import composed, read_cells, read_text
 from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, length_label, merged
 from scenefuse.sfm.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
 from scenefuse.sfm.survey.lengths import COLUMNS, read_end_clicks
@@ -36,8 +40,10 @@ class Document:
         version: counts changes, so that every open page notices those of others.
     """
 
-    def __init__(self, path: Path, kind: Kind) -> None:
+    def __init__(self, path: Path, kind: Kind, photos: Iterable[str] = ()) -> None:
+        """Read the file; names of photos are spelled as in `photos`, where the file writes their umlauts otherwise."""
         self.path, self.kind = path, kind
+        self._spelled = {composed(name): name for name in photos}
         self.version = 0
         self.read()
         self._restore()
@@ -147,7 +153,7 @@ class Document:
         if not self._draft.is_file() or self.fixed:
             return
         try:
-            self.kind, rows = _read(self._draft, self.kind)
+            self.kind, rows = self._read_rows(self._draft)
             self.history.change(rows)
         except StageError:
             self.history.change(())  # a draft without rows: everything was removed
@@ -158,23 +164,24 @@ class Document:
         if not self._holds_rows():
             return ()
         try:
-            self.kind, rows = _read(self.path, self.kind)
+            self.kind, rows = self._read_rows(self.path)
         except NotClicked as error:
             self.fixed = str(error)
             return ()
-        self._comments = [
-            line for line in self.path.read_text(encoding="utf-8-sig").splitlines() if line.startswith("#")
-        ]
+        self._comments = [line for line in read_text(self.path).splitlines() if line.startswith("#")]
         return rows
+
+    def _read_rows(self, path: Path) -> tuple[Kind, Rows]:
+        kind, rows = _read(path, self.kind)
+        return kind, tuple(replace(row, photo=self._spelled.get(composed(row.photo), row.photo)) for row in rows)
 
     def _holds_rows(self) -> bool:
         """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
         try:
-            lines = self.path.read_text(encoding="utf-8-sig").splitlines()
-        except (OSError, UnicodeDecodeError):
+            rows = read_cells(self.path)
+        except StageError:
             return True
-        cells = [line.split("\t") for line in lines if line.strip() and not line.startswith("#")]
-        return len(cells) > 1 or (len(cells) == 1 and cells[0] not in HEADERS.values())
+        return len(rows) > 1 or (len(rows) == 1 and rows[0][1] not in HEADERS.values())
 
     def _what_changed(self) -> str:
         try:
@@ -210,7 +217,10 @@ def _read(path: Path, kind: Kind) -> tuple[Kind, Rows]:
 
 
 def _line(click: Click) -> str:
-    return f"{click.label}\t{click.photo}\t{click.x:.10g}\t{click.y:.10g}"
+    line = io.StringIO()
+    cells = [*click.label.split("\t"), click.photo, f"{click.x:.10g}", f"{click.y:.10g}"]
+    csv.writer(line, delimiter="\t", lineterminator="").writerow(cells)
+    return line.getvalue()
 
 
 def _write(path: Path, text: str) -> None:

@@ -36,7 +36,7 @@ class Board:
     """
 
     def __init__(self, source: Source) -> None:
-        self.source, self.document = source, Document(source.path, source.kind)
+        self.source, self.document = source, Document(source.path, source.kind, source.pictures)
         self.notes: list[str] = []
         self.read_cameras()
 

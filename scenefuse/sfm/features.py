@@ -91,7 +91,7 @@ def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
         StageError: mode "single" and photos of different sizes.
     """
     keys: dict[str, Callable[[Photo], Any]] = {
-        "auto": lambda p: (p.width, p.height, p.camera, p.focal_px and round(p.focal_px)),
+        "auto": lambda p: (p.width, p.height, p.camera, _zoom(p)),
         "single": lambda p: (p.width, p.height),
         "per_folder": lambda p: (str(Path(p.name).parent), p.width, p.height),
         "per_photo": lambda p: p.name,
@@ -103,6 +103,14 @@ def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
         sizes = ", ".join(f"{w}x{h} ({names[0]})" for (w, h), names in groups.items())
         raise StageError(f"camera_mode is single but the photos differ in size: {sizes}; set it to auto")
     return list(groups.values())
+
+
+def _zoom(photo: Photo) -> str:
+    """The focal length that EXIF gives, in words that are the same for photos of one: the 35 mm equivalent to a pixel,
+    or, where it is not told, millimetres, and tenths of them below ten."""
+    if photo.focal_px:
+        return f"{round(photo.focal_px)} px"
+    return f"{photo.focal_mm:.{int(photo.focal_mm < 10)}f} mm" if photo.focal_mm else ""
 
 
 def read_calibration(path: Path) -> pycolmap.Camera:

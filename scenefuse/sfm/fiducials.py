@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.tables import comma_advice, composed, read_cells
 from scenefuse.stage import StageError
 from scenefuse.workspace import read_model
 
@@ -79,14 +80,8 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     Raises:
         StageError: the file is missing or empty, its header is none of these, or a line is not well formed.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (FileNotFoundError, IsADirectoryError):
-        raise StageError(f"the file of marked points {path} does not exist; write it, or correct its path") from None
-    except UnicodeDecodeError:
-        raise StageError(f"{path} is no text; save the marked points as tab-separated text (UTF-8)") from None
-    rows = [(n, line.split("\t")) for n, line in enumerate(lines, 1) if line.strip() and not line.startswith("#")]
-    header = [cell.strip() for cell in rows[0][1]] if rows else []
+    rows = read_cells(path)
+    header = rows[0][1] if rows else []
     if header not in (CLICK_COLUMNS, POINT_COLUMNS, LABEL_COLUMNS):
         raise StageError(
             f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
@@ -94,24 +89,7 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
         )
     if len(rows) == 1:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
-    texts = 1 if header == POINT_COLUMNS else 2
-    names: list[list[str]] = []
-    numbers: list[list[float]] = []
-    for number, cells in rows[1:]:
-        try:
-            if len(cells) != 4:
-                raise ValueError
-            values = [float(cell) for cell in cells[texts:]]
-            if not np.isfinite(values).all():
-                raise ValueError
-        except ValueError:
-            raise StageError(
-                f"{path}, line {number}: expected {' '.join(header)} separated by tabs, got '{' '.join(cells)}'"
-            ) from None
-        names.append([cell.strip() for cell in cells[:texts]])
-        numbers.append(values)
-        if header == LABEL_COLUMNS and names[-1][0] not in LABELS:
-            raise StageError(f"{path}, line {number}: the label is {', '.join(LABELS)}, not '{names[-1][0]}'")
+    names, numbers = _split(path, header, rows[1:])
     if header == LABEL_COLUMNS:
         return _labels(path, names, numbers)
     keys = [tuple(entry) for entry in names]
@@ -121,6 +99,32 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     if header == POINT_COLUMNS:
         return ScenePoints(path, [n[0] for n in names], np.array(numbers))
     return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
+
+
+def _split(
+    path: Path, header: list[str], rows: list[tuple[int, list[str]]]
+) -> tuple[list[list[str]], list[list[float]]]:
+    """The names and the numbers of each line below the header."""
+    texts = 1 if header == POINT_COLUMNS else 2
+    names: list[list[str]] = []
+    numbers: list[list[float]] = []
+    for number, cells in rows:
+        try:
+            if len(cells) != 4:
+                raise ValueError
+            values = [float(cell) for cell in cells[texts:]]
+            if not np.isfinite(values).all():
+                raise ValueError
+        except ValueError:
+            raise StageError(
+                f"{path}, line {number}: expected {' '.join(header)} separated by tabs, got '{' '.join(cells)}'"
+                f"{comma_advice(cells[texts:])}"
+            ) from None
+        names.append(cells[:texts])
+        numbers.append(values)
+        if header == LABEL_COLUMNS and cells[0] not in LABELS:
+            raise StageError(f"{path}, line {number}: the label is {', '.join(LABELS)}, not '{cells[0]}'")
+    return names, numbers
 
 
 def _labels(path: Path, names: list[list[str]], numbers: list[list[float]]) -> Labels:
@@ -148,7 +152,8 @@ def triangulate(
         clicks: two or more photos per point.
         model: of the photos that were clicked in (not of undistorted ones).
         max_residual_px: a point with a larger RMS reprojection error is an error, in pixels of the model's photos.
-        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies.
+        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies; of
+            all photos, also those that could not be registered.
 
     Returns:
         Point names in order of appearance, (P, 3) positions, (P,) RMS reprojection errors in pixels.
@@ -157,8 +162,10 @@ def triangulate(
         StageError: as `triangulate_consistent`, and rays that are parallel or miss each other: all points at once.
     """
     names, positions, residuals, left_out = triangulate_consistent(clicks, model, max_residual_px, sizes)
-    if left_out:
+    if len(names) < len(set(clicks.points)):
         raise StageError(f"{clicks.path}: {'; '.join(left_out)}; correct these clicks, or delete them")
+    for sentence in left_out:
+        print(f"left out of {clicks.path}: {sentence}", flush=True)
     return names, positions, residuals
 
 
@@ -168,15 +175,18 @@ def triangulate_consistent(
     max_residual_px: float,
     sizes: Mapping[str, tuple[int, int]] | None = None,
 ) -> tuple[list[str], Array, Array, list[str]]:
-    """As `triangulate`, but points whose clicks contradict each other are left out and named in the fourth result.
+    """As `triangulate`, but what cannot be used is left out and named in the fourth result: points whose clicks
+    contradict each other, clicks in photos without a camera, and points that have fewer than two others.
 
     Raises:
-        StageError: a photo that the model does not hold, a click outside its photo, a point with fewer than two clicks
-            in registered photos. Each message names the point.
+        StageError: a photo that is none of `sizes`, a click outside its photo, a point that is clicked once only. Each
+            message names the point.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
-    positions, residuals, names, left_out = [], [], [], []
-    for point, observed in _sightings(clicks, images, sizes).items():
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = None if sizes is None else {composed(name): size for name, size in sizes.items()}
+    positions, residuals, names = [], [], []
+    sightings, left_out = _sightings(clicks, images, sizes)
+    for point, observed in sightings.items():
         seen, pixels = [images[name] for name, _ in observed], np.array([p for _, p in observed])
         position, residual = intersect(seen, pixels)
         if position is None:
@@ -198,29 +208,33 @@ def triangulate_consistent(
 
 def _sightings(
     clicks: Clicks, images: Mapping[str, pycolmap.Image], sizes: Mapping[str, tuple[int, int]] | None
-) -> dict[str, list[tuple[str, Array]]]:
-    """The registered photos and their pixels where each point was clicked, two or more."""
+) -> tuple[dict[str, list[tuple[str, Array]]], list[str]]:
+    """The registered photos and their pixels where each point was clicked, two or more; and what is left out since a
+    photo has no camera."""
     seen: dict[str, list[tuple[str, Array]]] = {}
     lost: dict[str, list[str]] = {}
-    for point, photo, pixel in zip(clicks.points, clicks.photos, clicks.pixels):
+    for point, photo, pixel in zip(clicks.points, map(composed, clicks.photos), clicks.pixels):
         seen.setdefault(point, [])
         if photo in images:
             seen[point].append((photo, model_pixel(clicks.path, point, photo, pixel, images[photo], sizes)))
-        elif sizes is not None and photo in sizes:
+        elif sizes is None or photo in sizes:
             lost.setdefault(point, []).append(photo)
         else:
             raise StageError(
                 f"{clicks.path}: point {point} is clicked in {photo}, which is not among the {len(images)} "
                 f"registered photos; click in one of them ({', '.join(sorted(images)[:3])}, ...)"
             )
+    left_out, unsure = [], "" if sizes else ", or is none of the photos"
     for point, observed in seen.items():
+        count = f"the number of registered photos in which point {point} is clicked is {len(observed)}"
+        unregistered = f"{', '.join(lost.get(point, []))} could not be registered{unsure}"
+        if len(observed) < 2 and point not in lost:
+            raise StageError(f"{clicks.path}: {count}; two or more are needed, click it in another one")
         if len(observed) < 2:
-            why = f" ({', '.join(lost[point])} could not be registered)" if point in lost else ""
-            raise StageError(
-                f"{clicks.path}: the number of registered photos in which point {point} is clicked is "
-                f"{len(observed)}{why}; two or more are needed, click it in another one"
-            )
-    return seen
+            left_out.append(f"{count} ({unregistered}), two or more are needed")
+        elif point in lost:
+            left_out.append(f"{unregistered}: its click on point {point}")
+    return {point: observed for point, observed in seen.items() if len(observed) > 1}, left_out
 
 
 def locate(

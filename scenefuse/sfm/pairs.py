@@ -1,5 +1,6 @@
 """Which pairs of photos are compared: all of them, neighbours by GPS, or neighbours in time with loops."""
 
+import re
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -62,7 +63,9 @@ def choose_pairs(photos: list[Photo], is_video: bool, settings: MatchSettings) -
         return kind, reason, list(combinations(names, 2))
     if kind == "spatial":
         return kind, reason, spatial_pairs(photos, settings.neighbours)
-    return kind, reason, sequential_pairs(names, settings.overlap, settings.loop_every)
+    in_time, order = sorted(names, key=_counted), {name: index for index, name in enumerate(names)}
+    pairs = sequential_pairs(in_time, settings.overlap, settings.loop_every)
+    return kind, reason, sorted((_ordered(a, b, order) for a, b in pairs), key=lambda p: (order[p[0]], order[p[1]]))
 
 
 def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
@@ -117,6 +120,12 @@ def _automatic(
 def _gps_usable(photos: list[Photo]) -> bool:
     known, positions = gps_positions(photos)
     return len(known) >= max(3, 0.8 * len(photos)) and gps_spread_m(positions) > MIN_GPS_SPREAD_M
+
+
+def _counted(name: str) -> list[str | int]:
+    """A photo's name with its numbers as such: img2 was taken before img10."""
+    parts = re.split(r"(\d+)", name)
+    return [int(part) if index % 2 else part for index, part in enumerate(parts)]
 
 
 def _ordered(a: str, b: str, order: dict[str, int]) -> Pair:

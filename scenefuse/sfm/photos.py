@@ -16,6 +16,9 @@ from scenefuse.sfm.photo_files import GEO_FILE, photo_files
 from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 
+# Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
+MOST_PIXELS = 250_000_000
+Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
 # Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.
@@ -45,6 +48,7 @@ class Photo:
         orientation: EXIF orientation; 1 is upright.
         horizontal_sd_m: standard deviation of the position, east and north, from XMP or geo.txt, or None.
         vertical_sd_m: of the altitude, likewise.
+        focal_mm: EXIF's focal length as it is, or None.
     """
 
     name: str
@@ -59,6 +63,7 @@ class Photo:
     orientation: int = 1
     horizontal_sd_m: float | None = None
     vertical_sd_m: float | None = None
+    focal_mm: float | None = None
 
     @property
     def has_gps(self) -> bool:
@@ -184,7 +189,10 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             latitude, longitude, altitude = _position(exif.get_ifd(IFD.GPSInfo))
             xmp = image.info.get("xmp", b"")
             horizontal, vertical = rtk_accuracy(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-            equivalent_mm = _number(exif.get_ifd(IFD.Exif).get(Base.FocalLengthIn35mmFilm))
+            taken = exif.get_ifd(IFD.Exif)
+            equivalent_mm, focal_mm = (
+                _number(taken.get(tag)) or None for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
+            )
             image.load()
             width, height = image.size
     except Exception as error:
@@ -196,7 +204,7 @@ def inspect_photo(folder: Path, name: str) -> Photo:
     focal_px = equivalent_mm / 36.0 * max(width, height) if equivalent_mm else None
     digest = sha256(path)
     place = (latitude, longitude, altitude)
-    return Photo(name, width, height, digest, *place, focal_px, camera, orientation, horizontal, vertical)
+    return Photo(name, width, height, digest, *place, focal_px, camera, orientation, horizontal, vertical, focal_mm)
 
 
 def photo_notes(photos: list[Photo]) -> list[str]:

@@ -127,7 +127,7 @@ def test_a_failed_object_does_not_block_the_other_and_is_named(project, refused)
 def test_a_file_in_a_table_that_is_not_there_is_one_sentence(project, refused, table, column, target):
     project.photos("flight")
     project.photos("close")
-    (project.path / "prompts.tsv").write_text("")
+    (project.path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t1\t2\n")
     cells = {"scene": "yard", "photos": "close", "prompts": "prompts.tsv"} | {column: "mine.x"}
     if table == "scenes":
         project.scenes = f"scene\tphotos\t{column}\nyard\tflight\tmine.x\n"
@@ -147,6 +147,27 @@ def test_known_lengths_in_unknown_photos_of_an_object_stop_before_anything_runs(
     assert (
         "object 'shed': bar.tsv: point bar a is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)" in output
     )
+
+
+@pytest.mark.parametrize(
+    ("column", "cells", "words"),
+    [
+        ("prompts", "7.jpg\t1\t2", "in 7.jpg, which is none of the 4 photos (0.jpg, ...)"),
+        ("prompts", "2.jpg\t1\t2", "in 2.jpg, but only 2 of the 4 photos are used (object.frames)"),
+        ("fiducials", "3.jpg\t1\t2", "in 3.jpg, which is none of the 3 photos (0.jpg, ...)"),
+        ("fiducials", "0.jpg\t1,5\t2", "1,5 has a decimal comma, write 1.5"),
+    ],
+)
+def test_clicks_that_cannot_be_used_stop_before_anything_runs(project, refused, column, cells, words):
+    project.photos("flight")
+    project.photos("close", 4)
+    project.config["object"]["frames"] = {"max_frames": 2}
+    project.objects = HEADER + "shed\tyard\tclose\tfiducials.tsv\tprompts.tsv\t\t\n"
+    for name in ("fiducials", "prompts"):
+        click = cells if name == column else "0.jpg\t1\t2"
+        (project.path / f"{name}.tsv").write_text(f"label\tphoto\tx_px\ty_px\ninside\t{click}\n")
+    output = refused("-n", "results/objects/shed/fused.ply")
+    assert f"objects.tsv, object 'shed': {column}.tsv" in output and words in output
 
 
 def test_control_points_in_unknown_photos_stop_before_anything_runs(project, refused):

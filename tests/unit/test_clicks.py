@@ -1,5 +1,6 @@
 """Masks from clicks in one photo: a planted ball, sparse points on it and around it, photos on a circle."""
 
+import unicodedata
 from dataclasses import replace
 from pathlib import Path
 
@@ -535,11 +536,34 @@ SIZES = {"f00.png": (2 * WIDTH, 2 * HEIGHT), "lost.png": (WIDTH, HEIGHT)}
 
 def test_clicks_come_in_pixels_of_the_original_and_boxes_as_two_corners(tmp_path, model, photos):
     rows = [("inside", "f00.png", 100, 60), ("outside", "f00.png", 20, 10), ("box", "f01.png", 80, 20)]
-    found = clicks_per_photo(read(tmp_path, [*rows, ("box", "f01.png", 30, 70)]), model, photos.views, SIZES)
+    labels = read(tmp_path, [*rows, ("box", "f01.png", 30, 70)])
+    found, left_out = clicks_per_photo(labels, model, photos.views, SIZES)
+    assert left_out == []
     assert list(found) == [0, 1]
     np.testing.assert_allclose(found[0].pixels, [[50, 30], [10, 5]])
     assert found[0].inside.tolist() == [True, False] and found[0].box is None
     np.testing.assert_allclose(found[1].box, [[30, 20], [80, 70]])
+
+
+def test_umlauts_in_two_spellings_are_one_photo(tmp_path, photos):
+    apart, whole = (unicodedata.normalize(form, "Tür 1.png") for form in ("NFD", "NFC"))
+    views = [replace(view, name=apart) if view.name == "f00.png" else view for view in photos.views]
+    (tmp_path / "sparse").mkdir()
+    write_model(tmp_path / "sparse", views)
+    labels = read(tmp_path, [("inside", whole, 100, 60)])
+    found, _ = clicks_per_photo(labels, tmp_path / "sparse", views, {apart: (2 * WIDTH, 2 * HEIGHT)})
+    np.testing.assert_allclose(found[0].pixels, [[50, 30]])
+
+
+def test_a_click_in_a_photo_without_a_camera_is_left_out_where_others_say_what_the_object_is(tmp_path, model, photos):
+    rows = [("inside", "f03.png", *MIDDLE), ("inside", "lost.png", 5, 5), ("inside", "f03.png", 70, 45)]
+    labels = read(tmp_path, rows)
+    found, left_out = clicks_per_photo(labels, model, photos.views, SIZES)
+    sentence = "the click inside at (5, 5) is in lost.png, which has no camera (it could not be registered)"
+    assert list(found) == [3] and left_out == [sentence]
+    up = np.array([0, 0, 1.0])
+    prompted = masks_from_prompts(labels, model, SIZES, photos, up, Told(photos), MaskSettings(), 0)
+    assert prompted.left_out == [sentence]
 
 
 @pytest.mark.parametrize(
@@ -549,7 +573,10 @@ def test_clicks_come_in_pixels_of_the_original_and_boxes_as_two_corners(tmp_path
             [("inside", "f00.png", 241, 10)],
             r"the click inside at \(241, 10\) lies outside f00\.png, which has 240 x 180",
         ),
-        ([("inside", "lost.png", 5, 5)], r"in lost\.png, which has no camera"),
+        (
+            [("inside", "lost.png", 5, 5), ("outside", "f00.png", 5, 5)],
+            r"no other click inside: .* in lost\.png, which has no camera .*; click in one of the 12",
+        ),
         ([("inside", "none.png", 5, 5)], r"in none\.png, which is not among the photos; click in one of the 12"),
         ([("outside", "f00.png", 5, 5)], "holds only clicks outside the object"),
         ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
@@ -585,7 +612,7 @@ def test_a_click_is_undistorted(tmp_path, photos):
     model.write(tmp_path / "bent")
     seen = model.images[1].project_point(np.array([0, 0.5, 0.5]))
     labels = read(tmp_path, [("inside", "f00.png", *seen)])
-    found = clicks_per_photo(labels, tmp_path / "bent", photos.views, {})
+    found, _ = clicks_per_photo(labels, tmp_path / "bent", photos.views, {})
     straight = photos.views[0].project(np.array([[0, 0.5, 0.5]]))[0]
     assert np.linalg.norm(seen - straight[0]) > 0.05
     np.testing.assert_allclose(found[0].pixels, straight, atol=1e-6)

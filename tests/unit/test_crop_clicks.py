@@ -1,5 +1,7 @@
 """A few clicks in one photo of the scene find the object there."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from scenefuse.io.tiles import tiled_cloud, write_tiles
 from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.sfm.fiducials import read_points
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import look_at
 from scenefuse.workspace import View, write_model
@@ -142,6 +145,18 @@ def test_a_click_on_the_sky_is_left_out_and_named_and_too_few_are_an_error(crop)
     assert value(report, "notes")[0].startswith("the click inside (700, 2) in drone 1.jpg")
     with pytest.raises(StageError, match=r"2 clicks inside .* 3 are needed \(the click inside \(700, 2\)"):
         crop(inside(*CORNERS[:2], (700.0, 2.0)), view=photo(np.array([12.0, -18.0, 4.0])))
+
+
+def test_a_click_in_a_scene_photo_without_a_camera_is_left_out_and_named(crop, monkeypatch):
+    def with_lost(path):
+        marked = read_points(path)
+        return replace(marked, photos=[*marked.photos[:-1], "drone 3.jpg"])
+
+    monkeypatch.setattr("scenefuse.registration.crop.crop_scene.read_points", with_lost)
+    note = value(crop(inside(*CORNERS, (1, -2, 1.5)))[1], "notes")[0]
+    assert "is in drone 3.jpg, which has no camera (it could not be registered, or is none of the photos)" in note
+    with pytest.raises(StageError, match=r"2 clicks inside .* 3 are needed \(.* drone 3\.jpg, which has no camera"):
+        crop(inside(*CORNERS[:3]))
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,15 @@
+import unicodedata
+
 import numpy as np
 import pycolmap
 import pytest
 
 from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
+from scenefuse.sfm.survey.check import check_marks
+from scenefuse.sfm.survey.lengths import read_end_clicks
 from scenefuse.stage import StageError
 
+LABELS = "label\tphoto\tx_px\ty_px\n"
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
 
 
@@ -70,7 +75,7 @@ def with_click(clicks, index, photo=None, pixel=None):
 def test_error_sentences_name_the_point(model, tmp_path):
     clicks = clicked(model, tmp_path)
     with pytest.raises(StageError, match=r"point door is clicked in 9\.jpg, which is not among the 3 registered"):
-        triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0)
+        triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0, {f"{i}.jpg": (640, 480) for i in (1, 2, 3)})
     with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
         triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
     with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
@@ -95,9 +100,16 @@ def test_a_click_in_a_photo_that_was_not_registered_is_left_out(model, tmp_path)
     clicks = with_click(clicked(model, tmp_path), 0, photo="4.jpg")
     _, positions, _ = triangulate(clicks, model, 5.0, sizes)
     np.testing.assert_allclose(positions[0], POINTS["roof"], atol=1e-7)
+    left_out = triangulate_consistent(clicks, model, 5.0, sizes)[3]
+    assert left_out == ["4.jpg could not be registered: its click on point roof"]
+    # Of one photo only, the point is left out; the others remain.
     two = with_click(clicked(model, tmp_path, photos=("1.jpg", "2.jpg")), 0, photo="4.jpg")
     with pytest.raises(StageError, match=r"is 1 \(4\.jpg could not be registered\)"):
         triangulate(two, model, 5.0, sizes)
+    assert triangulate_consistent(two, model, 5.0, sizes)[0] == ["door"]
+    # Where the photos are not known, as in a scene, it may be a wrong name as well.
+    left_out = triangulate_consistent(clicks, model, 5.0)[3]
+    assert left_out == ["4.jpg could not be registered, or is none of the photos: its click on point roof"]
 
 
 def test_parallel_rays(model, tmp_path):
@@ -137,6 +149,65 @@ def test_bad_files(tmp_path, text, sentence):
     path.write_text(text)
     with pytest.raises(StageError, match=sentence):
         read_points(path)
+
+
+def test_a_file_from_a_spreadsheet_is_read_as_the_tables_are(tmp_path):
+    path, lines = tmp_path / "f.tsv", LABELS + "inside\tIMG, 7.JPG\t690\t180\n"
+    quoted = lines.replace("IMG, 7.JPG", '"IMG, 7.JPG"')
+    for content in (
+        lines.replace("\n", "\r\n").encode("utf-16"),
+        lines.encode("utf-8-sig"),
+        lines.replace("\n", "\t \t\n").encode(),
+        (quoted + "\t\t\t\n").encode(),
+    ):
+        path.write_bytes(content)
+        marked = read_points(path)
+        assert (marked.photos, marked.pixels.tolist()) == (["IMG, 7.JPG"], [[690, 180]])
+    path.write_bytes(lines.replace("IMG", "König").encode("cp1252"))
+    with pytest.raises(StageError, match="line 2: not UTF-8 text; save it as UTF-8"):
+        read_points(path)
+
+
+def test_a_decimal_comma_is_named(tmp_path):
+    path = tmp_path / "f.tsv"
+    path.write_text(LABELS + "inside\tIMG_1,2.JPG\t10\t20\ninside\tIMG 7.JPG\t690,5\t180\n")
+    with pytest.raises(StageError, match=r"line 3: expected .* got '.*'; 690,5 has a decimal comma, write 690\.5$"):
+        read_points(path)
+    path.write_text("length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1,5\ta\t1.jpg\t3\t4\n")
+    with pytest.raises(StageError, match=r"line 2: .*; 1,5 has a decimal comma, write 1\.5$"):
+        read_end_clicks(path)
+
+
+def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
+    model = pycolmap.Reconstruction(model)
+    for image in model.images.values():
+        image.name = unicodedata.normalize("NFD", f"Gebäude {image.name}")
+    sizes = {image.name: (640, 480) for image in model.images.values()}
+    plain = clicked(model, tmp_path, photos=tuple(sizes))
+    clicks = Clicks(plain.path, plain.points, [unicodedata.normalize("NFC", p) for p in plain.photos], plain.pixels)
+    assert clicks.photos != plain.photos
+    for known in (None, sizes):
+        np.testing.assert_allclose(triangulate(clicks, model, 5.0, known)[1], list(POINTS.values()), atol=1e-7)
+
+
+def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(tmp_path):
+    path, photos = tmp_path / "f.tsv", [f"{k}.jpg" for k in range(1, 6)]
+    path.write_text(LABELS + "inside\t3.jpg\t1\t2\noutside\t4.jpg\t1\t2\n")
+    check_marks(path, photos)
+    check_marks(path)
+    with pytest.raises(
+        StageError, match=r"the click outside is in 4\.jpg, which is none of the 3 photos \(1\.jpg, \.\.\.\)"
+    ):
+        check_marks(path, photos[:3])
+    with pytest.raises(
+        StageError, match=r"in 4\.jpg, but only 3 of the 5 photos are used .* max_frames to 5 and frame_s"
+    ):
+        check_marks(path, photos, photos[::2])
+    path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
+    check_marks(path, photos)
+    path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
+    with pytest.raises(StageError, match=r"a is in 9\.jpg"):
+        check_marks(path, photos)
 
 
 def test_missing_file(tmp_path):

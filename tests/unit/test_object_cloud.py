@@ -1,10 +1,13 @@
 """Fusing depth maps of a sphere into a cloud; cleaning; the sentences for bad input."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
 from scenefuse.io.clouds import Cloud
+from scenefuse.io.maps import write_depth, write_normals
 from scenefuse.mvs.views import Views
 from scenefuse.nerf.object_cloud import (
     CloudGates,
@@ -14,6 +17,7 @@ from scenefuse.nerf.object_cloud import (
     clean,
     fuse_depths,
     make_object_cloud,
+    read_maps,
     with_plane_normals,
 )
 from scenefuse.stage import StageError
@@ -38,7 +42,7 @@ def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
     spoiled = rng.choice(len(rows), 60, replace=False)
     damaged = depths.copy()
     damaged[0, rows[spoiled], columns[spoiled]] *= 0.8
-    normals = np.zeros((*depths.shape, 3), np.float32)
+    normals = np.zeros((*depths.shape, 3), np.float16)
     maps = SurfaceMaps(damaged, ((depths > 0) * 0.8).astype(np.float32), normals)
     cloud, diagonal = fuse_depths(views, views.object_from_cam, maps, SETTINGS)
     distance = np.abs(np.linalg.norm(cloud.points - CENTER, axis=1) - RADIUS)
@@ -50,6 +54,28 @@ def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
     outward = (cloud.points - CENTER) / RADIUS
     planes = with_plane_normals(cloud).normals
     assert np.median((planes * outward).sum(1)) > 0.98
+
+
+def test_maps_are_read_into_their_places_without_a_second_copy_of_all(tmp_path):
+    views, depths = _views()
+    sure = np.where(np.indices(depths.shape)[2] > 20, 0.9, 0.1).astype(np.float32)
+    normals = np.random.default_rng(0).normal(size=(*depths.shape, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=3, keepdims=True)
+    for k, name in enumerate(views.names):
+        write_depth(tmp_path / f"depth_maps/{name}.bin", depths[k] + 1)
+        write_depth(tmp_path / f"confidence_maps/{name}.bin", sure[k])
+        # One smaller than its picture.
+        write_normals(tmp_path / f"normal_maps/{name}.bin", normals[k] if k else normals[k, :40, :30])
+    assert views.masks.any()
+    tracemalloc.start()
+    maps = read_maps(tmp_path, views, 0.5)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    held = maps.depths.nbytes + maps.confidence.nbytes + maps.normals.nbytes
+    assert peak < 1.4 * held and held <= 14 * depths.size
+    np.testing.assert_array_equal(maps.depths, np.where(views.masks & (sure > 0.5), depths + 1, 0))
+    np.testing.assert_allclose(maps.normals[1:], normals[1:], atol=1e-3)
+    assert maps.normals[0, :40, :30].any() and not maps.normals[0, 40:].any() and not maps.normals[0, :, 30:].any()
 
 
 def test_cleaning_drops_a_small_group_and_far_points():

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 
 from scenefuse.sfm.photo_files import photo_files
-from scenefuse.sfm.photos import check_unchanged, gps_positions, list_photos, read_photos
+from scenefuse.sfm.photos import check_unchanged, gps_positions, inspect_photo, list_photos, read_photos
 from scenefuse.stage import StageError, read_json, value
 
 
@@ -122,6 +122,15 @@ def test_an_unreadable_photo_is_named_and_nothing_is_written(tmp_path, content):
     with pytest.raises(StageError, match=r"bad\.jpg cannot be decoded .* remove it"):
         listed(tmp_path, folder)
     assert not (tmp_path / "photos.json").exists()
+
+
+def test_a_photo_of_200_megapixels_is_read_and_one_that_no_camera_takes_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "p").mkdir()
+    Image.new("1", (20_000, 10_000)).save(tmp_path / "p" / "phone.png")
+    assert inspect_photo(tmp_path / "p", "phone.png").width == 20_000
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", Image.MAX_IMAGE_PIXELS // 3)
+    with pytest.raises(StageError, match=r"phone\.png cannot be decoded .*exceeds limit"):
+        inspect_photo(tmp_path / "p", "phone.png")
 
 
 def test_missing_and_empty_folders(tmp_path):

@@ -1,5 +1,7 @@
 """Tables of clicks on disk: what is read back, what others wrote, and files that cannot be read."""
 
+import unicodedata
+
 import pytest
 
 from scenefuse.pick.clicks import Click, with_end, with_length
@@ -47,6 +49,18 @@ def test_known_lengths_are_read_back_by_the_page_and_by_the_workflow_one_end_or_
     metres, ends, clicks = read_ends(path)
     assert metres == {"north door": 2.05} and ends == {"north door": ["a", "b"]}
     assert clicks.pixels.tolist() == [[3, 4], [5, 6]]
+
+
+def test_a_file_from_a_spreadsheet_is_edited_with_the_names_that_the_photos_have(path):
+    own, quoted = unicodedata.normalize("NFD", "Füße 2.jpg"), '"7" inch.jpg'
+    path.write_text(f"# by hand\n{TEXT}inside\tFüße 2.jpg\t10.5\t20\t\n", encoding="utf-16")
+    document = Document(path, "labels", [own, quoted])
+    assert document.rows == (Click("inside", own, 10.5, 20),) and not document.trouble
+    document.change((*document.rows, Click("outside", quoted, 1, 2)))
+    document.save()
+    assert read_points(path).photos == [own, quoted] and path.read_text().startswith("# by hand\n")
+    path.write_text(TEXT.replace("\n", "\t\n"), encoding="utf-16")
+    assert Document(path, "labels").rows == () and not Document(path, "labels").trouble
 
 
 def test_a_table_of_lengths_that_is_none_is_kept_beside(path):

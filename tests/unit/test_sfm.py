@@ -7,13 +7,14 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
+from scenefuse.sfm.frames import FrameSettings, extract_frames
 from scenefuse.sfm.geodesy import LocalFrame
 from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import match_features
 from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
-from scenefuse.sfm.photos import Photo, list_photos, write_photos
+from scenefuse.sfm.photos import Photo, list_photos, read_photos, write_photos
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import fit_sim3
@@ -65,6 +66,16 @@ def test_sequential_pairs_close_loops():
     assert len(pairs) == 8 + 7 + 3
 
 
+def test_photos_counted_without_leading_zeros_are_paired_in_the_order_they_were_taken_in():
+    photos = [photo(name) for name in sorted(f"b/IMG_{k}.JPG" for k in range(1, 31))]
+    kind, _, pairs = choose_pairs(photos, False, PAIRS)
+    names = [p.name for p in photos]
+    assert kind == "sequential" and pairs == sorted(pairs, key=lambda p: (names.index(p[0]), names.index(p[1])))
+    assert all(names.index(a) < names.index(b) for a, b in pairs)
+    found = {frozenset(int(name[6:-4]) for name in pair) for pair in pairs}
+    assert all(frozenset((k, k + step)) in found for step in (1, 2) for k in range(1, 31 - step))
+
+
 def test_cameras_are_shared_by_size_model_and_focal_length():
     photos = [photo("a/1"), photo("a/2", camera="X", focal=500.0), photo("b/3"), photo("b/4", camera="X", focal=700.0)]
     assert camera_groups(photos, "auto") == [["a/1", "b/3"], ["a/2"], ["b/4"]]
@@ -73,6 +84,26 @@ def test_cameras_are_shared_by_size_model_and_focal_length():
     assert len(camera_groups(photos, "per_photo")) == 4
     with pytest.raises(StageError, match=r"differ in size: 640x480 \(a/1\), 320x240 \(c\)"):
         camera_groups([*photos, photo("c", size=(320, 240))], "single")
+
+
+def test_a_zoom_lens_that_does_not_tell_its_35_mm_equivalent_is_a_camera_for_each_focal_length(tmp_path):
+    folder = tmp_path / "p"
+    folder.mkdir()
+    for number, focal_mm in enumerate((18.0, 55.0, 55.2, 18.0, 200.0, None)):
+        exif = Image.Exif()
+        exif[0x0110], exif[0x0112] = "EOS 600D", 6 if number % 2 else 1
+        if focal_mm:
+            exif[0x8769] = {0x920A: focal_mm}
+        Image.new("RGB", (40, 40), (number, 0, 0)).save(folder / f"{number}.jpg", exif=exif)
+    wanted = [["0.jpg", "3.jpg"], ["1.jpg", "2.jpg"], ["4.jpg"], ["5.jpg"]]
+    list_photos(folder=folder, upright=tmp_path / "upright", photos=tmp_path / "scene.json")
+    settings = FrameSettings(max_width_px=20)
+    extract_frames(source=folder, frames=tmp_path / "frames", photos=tmp_path / "object.json", settings=settings)
+    for name in ("scene", "object"):
+        assert camera_groups(read_photos(tmp_path / f"{name}.json"), "auto") == wanted
+    # The equivalent says the same, and more; a lens that tells a little more at another distance stays one camera.
+    prime = [replace(photo(f"{mm}", focal=900.0), focal_mm=mm) for mm in (35.0, 36.4)]
+    assert len(camera_groups(prime, "auto")) == 1
 
 
 def test_an_error_in_a_worker_reaches_the_caller():

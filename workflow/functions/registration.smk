@@ -26,6 +26,8 @@ def crop_marks(wildcards):
     place where shared features give no alignment."""
     mode = crop_mode(wildcards)
     clicked = own_file("object", wildcards.object, "fiducials") if mode else []
+    if clicked:
+        check_clicks(wildcards.object, "fiducials")
     own = dict(zip(["fiducials"], clicked))
     if mode == "masks":
         folder = f"results/objects/{wildcards.object}"

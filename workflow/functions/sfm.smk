@@ -113,6 +113,42 @@ def lengths_flag(wildcards):
     )
 
 
+def names_in(folder, where):
+    """Names of the photos in a cell's folder; None where it is no folder, or a rule makes it."""
+    if not folder or made_here(folder) or not Path(folder).is_dir():
+        return None
+    return [
+        Path(file).relative_to(folder).as_posix() for file in photos_in(folder, where)
+    ]
+
+
+@cache
+def check_clicks(name, column):
+    """Stop before hours of work where prompts or fiducials cannot be read, or are in photos that will not be used."""
+    from scenefuse.sfm.frames import frame_name, thin_out
+    from scenefuse.sfm.survey.check import check_marks
+
+    row, used = object_row(name), None
+    if column == "prompts":
+        photos = names_in(row.get("photos"), f"{config['objects']}, object '{name}'")
+        if photos:
+            frames = PROJECT.of("object", name)["object"]["frames"]
+            photos = [frame_name(photo) for photo in photos]
+            chosen = thin_out(len(photos), frames["frame_step"], frames["max_frames"])
+            used = [photos[index] for index in chosen]
+    else:
+        folder = scene_row(row["scene"]).get("photos")
+        photos = names_in(folder, f"{config['scenes']}, scene '{row['scene']}'")
+    for file in own_file("object", name, column):
+        if not made_here(file):
+            try:
+                check_marks(Path(file), photos, used)
+            except StageError as error:
+                raise WorkflowError(
+                    f"{config['objects']}, object '{name}': {error}"
+                ) from None
+
+
 @cache
 def check_lengths(name):
     """Stop before hours of matching where their file cannot be read or names photos that the object lacks."""

@@ -12,7 +12,7 @@ from snakemake.exceptions import WorkflowError
 from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
 from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
-from scenefuse.machine import has_gpu, memory_mb
+from scenefuse.machine import has_gpu, megapixels, memory_mb
 from scenefuse.sfm.photo_files import GEO_FILE, camera_files, photo_files
 from scenefuse.stage import StageError
 
@@ -325,6 +325,32 @@ def by_size(least, **per_mb):
         return attempt * round(least + sum(per_mb[name] * mb[name] for name in per_mb))
 
     return amount
+
+
+def by_photos(least, base, bytes_each, folder):
+    """Resources function: so many MB at least; some, and so many bytes for each pixel of the pictures in a folder, where this is
+    more; more with each attempt. `folder` tells it by wildcards and input, and how wide they are read, or None for as they are.
+    """
+
+    def amount(wildcards, input, attempt):
+        # Snakemake says <TBD> only where the error names an input, which a folder in it is not.
+        for path in input:
+            os.stat(path)
+        pixels = megapixels(*folder(wildcards, input))
+        return attempt * max(least, round(base + bytes_each * pixels))
+
+    return amount
+
+
+def masked_photos(wildcards, input):
+    """An object's masks, which are as large as its photos, and how wide these are in its NeRF."""
+    width_px = settings_of(wildcards)["object"]["nerf"]["width_px"]
+    return Path(input.masks), width_px
+
+
+def undistorted_photos(wildcards, input):
+    """An object's undistorted photos, as they are."""
+    return Path(input.workspace) / "images", None
 
 
 def megabytes(files):

@@ -50,7 +50,7 @@ rule make_masks:
         "../../envs/reconstruction.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_photos(4000, 1500, 12, undistorted_photos),
         runtime=lambda wildcards, attempt: 120 * attempt,
     params:
         options=mask_options,

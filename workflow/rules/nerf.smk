@@ -25,7 +25,7 @@ rule train_object_nerf:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 8000 * attempt,
+        mem_mb=by_photos(8000, 1000, 100, masked_photos),
         runtime=lambda wildcards, attempt: 480 * attempt,
         gpu=config["gpu"],
     params:
@@ -92,7 +92,7 @@ rule make_object_cloud:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_photos(4000, 1000, 80, masked_photos),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=settings("object.cloud"),

@@ -1,16 +1,23 @@
 """Clicks that say what is the object in single photos: inside, outside, or the corners of a box."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import Labels
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, posed_images, read_model
+
+if TYPE_CHECKING:
+    import pycolmap
 
 ENOUGH = 3
 """Clicks inside that make a mask by themselves: fewer may be on one part of the object only."""
@@ -59,61 +66,77 @@ class PhotoClicks:
         """Whether they say what the object is without any other photo: a box, or three inside."""
         return int(self.inside.sum()) >= ENOUGH or self.box is not None
 
-    def only(self, keep: NDArray[np.bool_]) -> "PhotoClicks":
+    def only(self, keep: NDArray[np.bool_]) -> PhotoClicks:
         """The clicks of the rows (N,) to keep, and the box."""
         points = None if self.points is None else self.points[keep]
         return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points)
 
 
 def clicks_per_photo(
-    labels: Labels, sparse: Path, views: list[View], sizes: Mapping[str, tuple[int, int]]
-) -> dict[int, PhotoClicks]:
+    labels: Labels, sparse: Path, views: list[View], sizes: Mapping[str, tuple[int, int]] | None
+) -> tuple[dict[int, PhotoClicks], list[str]]:
     """The clicks of each clicked photo, by its row in `views`, in pixels of the undistorted photo.
 
     Args:
         labels: the file, in pixels of the original photos.
         sparse: COLMAP model of the photos before undistortion.
         views: undistorted photos.
-        sizes: photo name -> (width, height) of the photos clicked in, of all photos, also those without a camera.
+        sizes: photo name -> (width, height) of the photos clicked in, of all photos, also those without a camera; None
+            where these are not known, and photos have the size of their cameras.
+
+    Returns:
+        The clicks, and a sentence for each that is left out since its photo has no camera.
 
     Raises:
-        StageError: a photo that does not exist or has no camera, a click outside its photo, a box that is not two
-            corners, only clicks outside.
+        StageError: a photo that does not exist, a click outside its photo, a box that is not two corners, no click
+            inside and no box in a photo with a camera.
     """
-    images = {image.name: image for image in posed_images(read_model(sparse))}
-    rows = {view.name: k for k, view in enumerate(views)}
+    images = {composed(image.name): image for image in posed_images(read_model(sparse))}
+    rows = {composed(view.name): k for k, view in enumerate(views)}
+    listed = None if sizes is None else {composed(name): size for name, size in sizes.items()}
+    left_out: list[str] = []
     found: dict[int, list[tuple[str, Array]]] = {}
-    for label, photo, pixel in zip(labels.labels, labels.photos, labels.pixels):
-        if photo not in images or photo not in rows:
-            known = "has no camera (it could not be registered)" if photo in sizes else "is not among the photos"
-            some = ", ".join(sorted(images)[:3])
-            raise StageError(
-                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) is in {photo}, which {known}; "
-                f"click in one of the {len(images)} photos with a camera ({some}, ...)"
-            )
-        camera, view = images[photo].camera, views[rows[photo]]
-        assert camera is not None
-        width, height = sizes.get(photo, (camera.width, camera.height))
-        if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
-            raise StageError(
-                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) lies outside {photo}, which has "
-                f"{width} x {height} pixels; correct the click"
-            )
-        ray = camera.cam_from_img(pixel * [camera.width / width, camera.height / height])
-        undistorted = (view.intrinsics @ [*np.asarray(ray).ravel(), 1.0])[:2]
-        edge = np.array([view.width, view.height]) - 1e-3
-        if label == "box":
-            undistorted = np.clip(undistorted, 0, edge)
-        elif (undistorted < 0).any() or (undistorted > edge).any():
-            raise StageError(
-                f"{labels.path}: the click {label} at ({pixel[0]:g}, {pixel[1]:g}) in {photo} is cut away with the "
-                "photo's edge when its lens distortion is removed; click farther from the edge"
-            )
-        found.setdefault(rows[photo], []).append((label, undistorted))
+    advice = f"; click in one of the {len(images)} photos with a camera ({', '.join(sorted(images)[:3])}, ...)"
+    why = ", or is none of the photos" if listed is None else ""
+    for label, photo, pixel in zip(labels.labels, map(composed, labels.photos), labels.pixels):
+        click = f"the click {label} at ({pixel[0]:g}, {pixel[1]:g})"
+        if photo in images and photo in rows:
+            view, size = views[rows[photo]], (listed or {}).get(photo)
+            undistorted = _undistorted(f"{labels.path}: {click}", label, pixel, images[photo], view, size)
+            found.setdefault(rows[photo], []).append((label, undistorted))
+        elif listed is None or photo in listed:
+            left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
+        else:
+            raise StageError(f"{labels.path}: {click} is in {photo}, which is not among the photos{advice}")
     clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
     if not any(clicks.prompt for clicks in clicked.values()):
+        if left_out:
+            raise StageError(f"{labels.path} has no other click inside: {'; '.join(left_out)}{advice}")
         raise StageError(f"{labels.path} holds only clicks outside the object; add a few inside it, or a box around it")
-    return clicked
+    return clicked, left_out
+
+
+def _undistorted(
+    click: str, label: str, pixel: Array, image: pycolmap.Image, view: View, size: tuple[int, int] | None
+) -> Array:
+    """A click (2,) in pixels of the undistorted photo; a corner of a box is moved into it. StageError where it lies
+    outside, or is cut away."""
+    camera = image.camera
+    assert camera is not None
+    width, height = size or (camera.width, camera.height)
+    if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
+        raise StageError(f"{click} lies outside {image.name}, which has {width} x {height} pixels; correct the click")
+    ray = camera.cam_from_img(pixel * [camera.width / width, camera.height / height])
+    undistorted: Array = (view.intrinsics @ [*np.asarray(ray).ravel(), 1.0])[:2]
+    edge = np.array([view.width, view.height]) - 1e-3
+    if label == "box":
+        return np.clip(undistorted, 0, edge)
+    if (undistorted < 0).any() or (undistorted > edge).any():
+        raise StageError(
+            f"{click} in {image.name} is cut away with the photo's edge when its lens distortion is removed; click"
+            " farther from the edge"
+        )
+    return undistorted
 
 
 def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array]]) -> PhotoClicks:

@@ -43,7 +43,7 @@ class SceneClicks:
         inside: (F, 3) where they are, in the scene frame.
         outside: (O, 3) the same of clicks outside.
         boxes: photos with the box that was clicked in them.
-        left_out: clicks where the scene has no point, a sentence each.
+        left_out: clicks where the scene has no point, or whose photo has no camera, a sentence each.
     """
 
     names: list[str]
@@ -78,9 +78,10 @@ def locate_clicks(labels: Labels, sparse: Path, scene: TiledCloud) -> SceneClick
     step = scene.spacing()
     names: list[str] = []
     sides: tuple[list[Array], list[Array]] = ([], [])
-    left_out: list[str] = []
     boxes = []
-    for row, clicks in clicks_per_photo(labels, sparse, views, {}).items():
+    clicked, lost = clicks_per_photo(labels, sparse, views, None)
+    left_out = [f"{sentence}: left out of {labels.path}" for sentence in lost]
+    for row, clicks in clicked.items():
         view = views[row]
         points = scene.read(_behind(clicks.pixels, scene, step, view))[1].points
         pixels, depth = view.project(points)

@@ -56,7 +56,7 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
 def _local_from_chunk(chunk: ET.Element) -> Sim3 | None:
     """Where a chunk lies in local coordinates, by scale bars or markers: those of its exported clouds.
 
-    None where it was never placed, or on the earth: its clouds are exported in a CRS then; its cameras stay as they are.
+    None where it was never placed, or on the earth: its clouds are exported in a CRS then, and its cameras stay put.
     """
     reference = (chunk.findtext("reference") or "").strip()
     placed = [*chunk.iterfind("components/component/transform"), *chunk.iterfind("transform")]

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import intersect, model_pixel
 from scenefuse.sfm.photos import Photo
 from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
@@ -91,11 +92,12 @@ def sight(
     Raises:
         StageError: a click in a photo that does not exist, or outside its photo.
     """
-    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = {composed(name): size for name, size in sizes.items()}
     sightings, notes = [], []
     for point in control.points:
         seen, lost = [], []
-        for photo, pixel in point.clicks:
+        for photo, pixel in ((composed(name), pixel) for name, pixel in point.clicks):
             if photo not in sizes:
                 raise unknown_photo(control.path, point.name, photo, sizes)
             if photo in images:

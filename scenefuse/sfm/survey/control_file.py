@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from scenefuse.io.tables import read_lines
+from scenefuse.io.tables import comma_advice, read_lines
 from scenefuse.sfm.survey.crs import read_crs, to_wgs84
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -96,7 +96,7 @@ def _row(cells: list[str], where: str) -> tuple[str, Row]:
         if not (np.isfinite(numbers[[0, 1, 3, 4]]).all() and photo):
             raise ValueError
     except (ValueError, IndexError):
-        raise StageError(f"{where}: expected {LAYOUT}, got '{' '.join(cells)}'") from None
+        raise StageError(f"{where}: expected {LAYOUT}, got '{' '.join(cells)}'{comma_advice(cells[:5])}") from None
     name = cells[6] if len(cells) > 6 and cells[6] else f"{cells[0]} {cells[1]} {cells[2]}"
     stated = [number for cell in cells[7:9] if (number := _number(cell)) is not None]
     if any(sd <= 0 for sd in stated):

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import pycolmap
 
-from scenefuse.io.tables import read_lines
+from scenefuse.io.tables import comma_advice, read_cells
 from scenefuse.sfm.fiducials import Clicks, triangulate
 from scenefuse.sfm.survey.control import CLICK_LIMIT
 from scenefuse.stage import StageError
@@ -111,7 +111,7 @@ def read_end_clicks(path: Path) -> list[EndClick]:
         StageError: no such file, a line that is not well formed, a length that is not positive or given twice with
             different values.
     """
-    rows = [(number, [cell.strip() for cell in line.split("\t")]) for number, line in read_lines(path)]
+    rows = read_cells(path)
     if not rows or rows[0][1] != COLUMNS or len(rows) == 1:
         raise StageError(
             f"{path} has to begin with the tab-separated header '{' '.join(COLUMNS)}', and to go on with clicks"
@@ -125,7 +125,10 @@ def read_end_clicks(path: Path) -> list[EndClick]:
             if len(cells) != 6 or not np.isfinite([long, x, y]).all():
                 raise ValueError
         except (ValueError, IndexError):
-            raise StageError(f"{path}, line {number}: expected {' '.join(COLUMNS)}, got '{' '.join(cells)}'") from None
+            raise StageError(
+                f"{path}, line {number}: expected {' '.join(COLUMNS)}, got '{' '.join(cells)}'"
+                f"{comma_advice([cells[1], *cells[4:]] if len(cells) > 1 else [])}"
+            ) from None
         if long <= 0 or metres.setdefault(name, long) != long:
             raise StageError(f"{path}, line {number}: {name} is {long:g} m here; give one positive length, in metres")
         found.append(EndClick(name, long, end, photo, x, y))
