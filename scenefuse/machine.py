@@ -1,5 +1,6 @@
 """What this machine has, for the limits of jobs that run on it side by side, and what photos take."""
 
+import contextlib
 import os
 import shutil
 from pathlib import Path
@@ -26,20 +27,16 @@ def megapixels(folder: Path, width_px: int | None = None) -> float:
     """Millions of pixels of the pictures in a folder, each on a sheet that holds the widest and the highest.
 
     Args:
-        folder: of them; only their headers are read.
+        folder: of them; only their headers are read. What is no picture takes nothing.
         width_px: the widest is scaled down to this.
-
-    Raises:
-        FileNotFoundError: there is no such folder yet.
     """
     # Every run of the workflow imports this module; few come here.
     from PIL import Image
 
     sizes = []
-    for path in sorted(folder.iterdir()):
-        if not path.name.startswith("."):
-            with Image.open(path) as picture:
-                sizes.append(picture.size)
+    for path in sorted(folder.glob("[!.]*")):
+        with contextlib.suppress(OSError), Image.open(path) as picture:
+            sizes.append(picture.size)
     widest, highest = (max(sides, default=0) for sides in (zip(*sizes) if sizes else ((), ())))
     scale = min(1.0, width_px / widest) if width_px and widest else 1.0
     return len(sizes) * widest * highest * scale**2 / 1e6

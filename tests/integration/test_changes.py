@@ -4,7 +4,7 @@ import os
 import shutil
 
 import pytest
-from support.user_project import Project, planned
+from support.user_project import CLICKS, Project, planned
 
 from scenefuse.pick.clicks import Click
 from scenefuse.pick.document import Document
@@ -20,7 +20,7 @@ def finished(tmp_path_factory, snakemake):
     project.photos("flight")
     project.photos("close")
     for name in ("clicks.tsv", "prompts.tsv"):
-        (project.path / name).write_text("new")
+        (project.path / name).write_text(CLICKS)
     config = project.write()
     listed = snakemake(project.path, "--summary", CROP, MASKS, config=config).stdout
     for name in [line.split("\t")[0] for line in listed.splitlines() if line.startswith("results/")]:
@@ -51,7 +51,7 @@ def replace(name: str):
     """An edit that puts another file in the place of one, with an older date as `cp -p`, rsync and unzip do."""
 
     def edit(path):
-        (path / name).write_bytes(b"other")
+        (path / name).write_bytes(CLICKS.replace("40", "41").encode() if name.endswith(".tsv") else b"other")
         os.utime(path / name, (1_000_000_000, 1_000_000_000))
 
     return edit

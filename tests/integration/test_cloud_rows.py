@@ -12,7 +12,7 @@ import pytest
 import yaml
 from support.cloud_files import UTM
 from support.planted import errors, plant
-from support.user_project import Project, planned
+from support.user_project import CLICKS, Project, planned
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.stage import read_json, value
@@ -149,7 +149,7 @@ def yard(tmp_path):
     for name in ("flight", "close"):
         project.photos(name)
         (project.path / f"{name}.json").write_text("{}")
-    for name in ("yard.ply", "shed.ply", "clicks.tsv"):
-        (project.path / name).write_text("")
+    for name, content in (("yard.ply", ""), ("shed.ply", ""), ("clicks.tsv", CLICKS)):
+        (project.path / name).write_text(content)
     project.scenes = f"scene{POSED}\nyard\tflight\tflight.json\tyard.ply\n"
     return project

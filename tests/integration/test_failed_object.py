@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 import yaml
 from support.changed_scene import write_changes
+from support.user_project import CLICKS
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.stage import quantity, write_json
@@ -74,7 +75,7 @@ def project(tmp_path, snakemake):
     rows = [f"{name}\tyard\t{name}\tclicks.tsv\tprompts.tsv" for name in ("shed", "barn")]
     (tmp_path / "objects.tsv").write_text("\n".join(["object\tscene\tphotos\tfiducials\tprompts", *rows]) + "\n")
     for name in ("clicks.tsv", "prompts.tsv"):
-        (tmp_path / name).write_text("")
+        (tmp_path / name).write_text(CLICKS)
         os.utime(tmp_path / name, (1e9, 1e9))
     registration = {"variants": ["full"], "crop": {"mode": "fiducials"}}
     config = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": registration}

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.user_project import planned
+from support.user_project import CLICKS, planned
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 
@@ -52,8 +52,8 @@ def yard(project):
     """A user's project with photos and clicks, and its settings in mine.yaml."""
     project.photos("flight")
     project.photos("close")
-    (project.path / "clicks.tsv").touch()
-    (project.path / "prompts.tsv").touch()
+    for name in ("clicks.tsv", "prompts.tsv"):
+        (project.path / name).write_text(CLICKS)
     project.write()
     return project.path
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 from support.browser import chromium
-from support.user_project import Project
+from support.user_project import CLICKS, Project
 
 from scenefuse.pick.pictures import Picture
 from scenefuse.sfm.fiducials import read_points
@@ -369,7 +369,7 @@ def test_the_page_fits_a_laptop_s_screen_and_says_what_comes_next(page):
 
 
 def test_a_dry_run_says_which_rules_a_correction_runs(page, yard):
-    (yard.path / "clicks.tsv").write_text("new")
+    (yard.path / "clicks.tsv").write_text(CLICKS)
     page.click(*DISC[0])
     page.marks(1)
     page.save()

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import yaml
 
+CLICKS = "label\tphoto\tx_px\ty_px\n" + "".join(f"inside\t0.jpg\t{x}\t20\n" for x in (20, 30, 40))
+"""Clicks on an object, in a photo of `Project.photos`."""
 HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\ttruth\n"
 
 
