@@ -3,7 +3,6 @@
 make bench-registration, or a part of it: PYTHONPATH=tests python tests/benchmarks/shared_photos.py --trials 30
 """
 
-import os
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -12,62 +11,28 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
+from support.photo_trials import FEW, FIRST_SEED, MEASURES, drawn, modelled, off_by, quiet
 from support.photographed_place import Kind
-from support.planted import AXES, deviations, errors
-from support.planted_photos import PhotoTrial, Plan, Truth, calibrated, mapped, plant_photos, truth
+from support.planted import AXES, deviations
+from support.planted_photos import PhotoTrial, Truth, truth
 
 from scenefuse.registration.decision import MOST_BENT, FineSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.registration.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm.bundle.spread import Spread, spread_of
 from scenefuse.stage import run, value
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Sim3
 
-# The seeds of development are to be looked at; what is published has seeds that nobody has tuned anything on.
-FIRST_SEED = {"development": 0, "published": 100_000}
 # As in registration.py.
 SCALE_PCT, ROTATION_DEG, SHIFT_PCT = 2.0, 2.0, 1.0
 # A pose at least so far off has the object in another place.
 ELSEWHERE_DEG, ELSEWHERE_PCT = 30.0, 30.0
-FEW = 40
-MEASURES = ("scale_pct", "rotation_deg", "shift_pct")
-
-
-def drawn(seed: int, bend: float = 1.0) -> Plan:
-    """What the trial of a seed is like: kinds alternate, one in four shares few features, one in five has a twin."""
-    rng = np.random.default_rng([seed, 1])
-    kinds = get_args(Kind)
-    least, most = (10, FEW) if seed // len(kinds) % 4 == 0 else (FEW, 400)
-    return Plan(
-        kind=kinds[seed % len(kinds)],
-        scene_photos=int(rng.integers(15, 61)),
-        object_photos=int(rng.integers(10, 41)),
-        alike=round(float(np.exp(rng.uniform(np.log(least), np.log(most))))),
-        strange=float(rng.uniform(0, 0.5)),
-        twin=bool(rng.random() < 0.2),
-        bend=bend,
-        noise_px=(float(rng.uniform(0.3, 0.8)), float(rng.uniform(0.3, 0.8))),
-    )
-
-
-def _quiet() -> None:
-    """Drop what a worker prints: COLMAP reports every adjustment, whatever its log level."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
 
 
 def one(seed: int, bend: float) -> dict[str, Any]:
     """A trial: mapped, aligned, compared with the truth."""
     start, plan = time.perf_counter(), drawn(seed, bend)
-    trial = plant_photos(seed, plan)
-    choices = []
-    for side in (trial.obj, trial.scene):
-        mapped(side)
-        choices.append(calibrated(side))
-    trial.scene.move(trial.scene.world_from_model())
-    trial.obj.move(_anywhere(seed))
+    trial, choices = modelled(seed, plan)
     spreads = [spread_of(s.model, c.lens, c.next)[0] for s, c in zip((trial.obj, trial.scene), choices)]
     planted = time.perf_counter()
     content = align_landmarks(trial.obj.landmarks(), trial.scene.landmarks(), AlignmentSettings(), seed)
@@ -77,17 +42,11 @@ def one(seed: int, bend: float) -> dict[str, Any]:
         "object_photos": len(trial.obj.capture.photos), "alike": trial.alike, "strange": plan.strange,
         "twin": plan.twin, "diagonal": trial.diagonal, "found": value(content, "found"),
         "shared": value(content, "shared_points"), "matches": value(content, "matches"),
-        **_errors("scene", known.here, known.scene_from_object, known.centre, trial.diagonal),
+        **off_by("scene", known.here, known.scene_from_object, known.centre, trial.diagonal),
         "misfit_pct": 100 * known.misfit,
         **(_compared(content, known, trial, spreads) if value(content, "found") else {"accepted": False}),
         "planting_s": planted - start, "aligning_s": aligned - planted, "reason": value(content, "reason"),
     }  # fmt: skip
-
-
-def _anywhere(seed: int) -> Sim3:
-    """The frame that the object's model happens to be in."""
-    rng = np.random.default_rng([seed, 2])
-    return Sim3(float(np.exp(rng.uniform(-2, 2))), Rotation.random(random_state=rng).as_matrix(), rng.normal(0, 9, 3))
 
 
 def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads: list[Spread]) -> dict[str, Any]:
@@ -110,15 +69,9 @@ def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads:
     row = {"sd_scale_pct": 100 * scale, "sd_rotation_deg": angle, "sd_shift_pct": 100 * shift / trial.diagonal}
     for name, true, stated in (("true", known.scene_from_object, world), ("here", known.here, here)):
         deviation = np.sqrt(np.diag(stated.covariance))
-        row |= _errors(name, pose, true, known.centre, trial.diagonal)
+        row |= off_by(name, pose, true, known.centre, trial.diagonal)
         row |= {f"{name}_over_sd_{k}": off for k, off in zip(AXES, deviations(pose, true, at) / deviation)}
     return {**row, "strict": strict, "accepted": here.size(trial.diagonal) <= MOST_BENT}
-
-
-def _errors(name: str, pose: Sim3, true: Sim3, centre: Array, diagonal: float) -> dict[str, float]:
-    """Scale in %, rotation in degrees, shift of the object's centre in % of its diagonal."""
-    scale, angle, shift = errors(pose, true, centre, diagonal)
-    return {f"{name}_scale_pct": scale, f"{name}_rotation_deg": angle, f"{name}_shift_pct": 100 * shift}
 
 
 def shared_photos(
@@ -146,7 +99,7 @@ def shared_photos(
         jobs: processes, one thread each.
     """
     begin = FIRST_SEED[seeds] + first
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_quiet) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=quiet) as pool:
         table = pd.DataFrame(list(pool.map(one, range(begin, begin + trials), [bend] * trials)))
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.5g")

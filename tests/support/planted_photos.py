@@ -1,6 +1,6 @@
 """Planted trials of shared photos: two captures of one place as sparse models, bent by mapping as real ones are."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pycolmap
@@ -109,6 +109,7 @@ class Plan:
         bend: 1: true cameras as different from what mapping assumes as real ones are; 0: not different.
         noise_px: of the observations of the object's and of the scene's photos.
         points: features made for the object's and for the scene's photos.
+        apart_px: how far off, along the surface and in pixels of the scene's nearest photo, close-ups find a feature.
     """
 
     kind: Kind = "orbit"
@@ -120,6 +121,7 @@ class Plan:
     bend: float = 1.0
     noise_px: tuple[float, float] = (0.5, 0.5)
     points: tuple[int, int] = (3600, 4500)
+    apart_px: float = 0.0
 
 
 def plant_photos(seed: int, plan: Plan) -> PhotoTrial:
@@ -152,7 +154,28 @@ def _photographed(rng: np.random.Generator, plan: Plan) -> tuple[float, Features
         scene_photos(rng, where, plan.kind, plan.scene_photos, cameras[1]),
     ]
     found = features(rng, where, list(zip(cameras, photos, plan.points)))
-    return where.diagonal, found, [captured(rng, where, found, c, p) for c, p in zip(cameras, photos)]
+    captures = [captured(rng, where, found, c, p) for c, p in zip(cameras, photos)]
+    if plan.apart_px:
+        captures[0] = _elsewhere(captures[0], found, plan.apart_px * _pixel(found, captures[1]))
+    return where.diagonal, found, captures
+
+
+def _pixel(found: Features, capture: Capture) -> Array:
+    """(P,) what a pixel of the nearest photo covers at each feature."""
+    centres = np.array([photo.centre for photo in capture.photos]).reshape(-1, 3)
+    distance = np.min([np.linalg.norm(found.x - c, axis=1) for c in centres], axis=0, initial=np.inf)
+    return distance / capture.camera.mean_focal_length()
+
+
+def _elsewhere(capture: Capture, found: Features, by: Array) -> Capture:
+    """A capture that finds each feature a little off, `by` (P,) metres along its surface, the same in all photos."""
+    step = np.random.default_rng(len(found.x)).normal(0, 1, found.x.shape) * by[:, None]
+    moved = found.x + step - (step * found.normal).sum(1, keepdims=True) * found.normal
+    pixels = []
+    for photo, rows in zip(capture.photos, capture.shown):
+        local = (moved[rows] - photo.centre) @ photo.rotation.T
+        pixels.append(np.asarray(capture.camera.img_from_cam(local)).reshape(-1, 2))
+    return replace(capture, pixels=pixels)
 
 
 def _tells(diagonal: float, found: Features, captures: list[Capture]) -> bool:
@@ -267,17 +290,17 @@ def truth(trial: PhotoTrial) -> Truth:
     x = trial.features.x
     rows, points, photos = trial.obj.points()
     mine = trial.features.owner[rows] == "object"
-    world_from_object = _fitted(points[mine], x[rows[mine]], photos[mine])
+    world_from_object = fitted(points[mine], x[rows[mine]], photos[mine])
     centre = np.median(points[mine], axis=0)
     rows, points, photos = trial.scene.points()
     near = np.linalg.norm(x[rows], axis=1) < trial.diagonal
-    here = _fitted(x[rows[near]], points[near], photos[near])
+    here = fitted(x[rows[near]], points[near], photos[near])
     misfit = np.median(np.linalg.norm(here.inverse().apply(points[near]) - x[rows[near]], axis=1)) / trial.diagonal
     scene_from_object = trial.scene.world_from_model().inverse() @ world_from_object
     return Truth(scene_from_object, here @ world_from_object, centre, float(misfit))
 
 
-def _fitted(a: Array, b: Array, photos: Rows) -> Sim3:
+def fitted(a: Array, b: Array, photos: Rows) -> Sim3:
     """The similarity b_from_a, without pairs that are off by more than three medians; the more photos, the more weight.
 
     A point in two photos has a weight of 1, because they leave it one observation more than it has coordinates.

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from benchmarks.shared_photos import drawn
+from benchmarks.joint_adjustment import joined
+from support.photo_trials import drawn
 from support.photographed_place import HALF_ANGLE_DEG, HALF_SCALE_LOG
 from support.planted import errors
 from support.planted_photos import Plan, mapped, plant_photos, truth
@@ -72,3 +73,24 @@ def test_the_same_seed_gives_the_same_trial():
     np.testing.assert_array_equal(a.obj.looks, b.obj.looks)
     np.testing.assert_array_equal(a.scene.points()[1], b.scene.points()[1])
     assert drawn(SEED) == drawn(SEED)
+
+
+def test_close_ups_may_find_features_a_little_elsewhere(straight):
+    apart = plant_photos(SEED, replace(TINY, apart_px=1.0))
+    for side, off in (("obj", True), ("scene", False)):
+        before, after = (getattr(trial, side).capture for trial in (straight, apart))
+        moved = np.concatenate(after.pixels) - np.concatenate(before.pixels)
+        assert (0.1 < np.median(np.linalg.norm(moved, axis=1)) < 10) if off else (moved == 0).all()
+
+
+def test_a_joint_model_has_all_observations_and_shared_points_once(straight):
+    sides = straight.obj.model, straight.scene.model
+    ids = sorted(set(sides[0].points3D) & set(sides[1].points3D))
+    pose = straight.scene.world_from_model().inverse() @ straight.obj.world_from_model()
+    joint = joined(*sides, pose, np.stack([ids, ids], axis=1))
+    assert len(ids) > 20
+    assert joint.model.num_points3D() == sum(side.num_points3D() for side in sides) - len(ids)
+    assert joint.model.compute_num_observations() == sum(side.compute_num_observations() for side in sides)
+    there = np.array([joint.model.points3D[i].xyz for i in joint.object_ids.tolist()])
+    off = np.linalg.norm(there - pose.apply(straight.obj.points()[1]), axis=1)
+    assert np.median(off) < 0.01 * straight.diagonal
