@@ -45,6 +45,8 @@ the sparser side where that is more; never farther than this share of the diagon
 CLEARLY = 1.5
 """The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
 denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise."""
+CONSISTENT = 2.0
+"""Standard deviations of the object within which a point that the scene did not measure may be right."""
 OUTNUMBERED = 2.0
 """Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser."""
 SMOOTH_POINTS = 8
@@ -135,7 +137,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
     contradicted = behind.through >= LEAST_THROUGH
     added = on_obj & ~contradicted
-    worse, better = _compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal, share)
+    worse, better = compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal, share)
     reason[(reason == KEPT) & worse] = REPLACED
     added &= ~better
     if nerf_only:
@@ -264,7 +266,7 @@ def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float
     return see(points, surface, views, spacing(surface.points), MARGIN * diagonal)
 
 
-def _compare(
+def compare(
     obj: Cloud, of_obj: Array, on_obj: NDArray[np.bool_], scene: Cloud, of_scene: Array, on_scene: NDArray[np.bool_],
     diagonal: float, share: float,
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
@@ -301,6 +303,10 @@ def _compare(
     # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
     worse &= ~on_scene | (_beside(scene.points, first[partner]) <= coarse)
     if len(second):
+        # What it did not measure stays where an object that measures less exactly than the scene does not speak against
+        # it either.
+        inexact = (mine[partner] > CLEARLY * typical) & (distance <= CONSISTENT * mine[partner])
+        worse &= on_scene | ~inexact
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())
         # A better point of a sparser side stands for what lies within a spacing of the object's.
         there = same(distance, mine, other[partner], SAME_SPACINGS * coarse)

@@ -284,3 +284,20 @@ def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
     obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
     found = weigh(Side(obj, near), Side(floating, far), nerf_only=False)
     assert found.added.mean() > 0.9 and (found.reason != KEPT).mean() > 0.9
+
+
+@pytest.mark.parametrize(("inexact", "stay"), [(0.02, True), (0.004, False)])
+def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exactly(inexact, stay):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04, z=0.01)
+    measured = scene.points[:, 0] < 0
+    every = np.ones(len(obj), dtype=bool)
+    worse, better = evidence.compare(
+        obj, np.full(len(obj), inexact), every, scene, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
+    )
+    assert (not worse[~measured].any()) if stay else worse[~measured].all()
+    # What lies farther off than the object's own deviation explains goes.
+    away = replace(scene, points=scene.points + [0, 0, 0.035])
+    worse, _ = evidence.compare(
+        obj, np.full(len(obj), 0.02), every, away, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
+    )
+    assert worse[~measured].mean() > 0.95
