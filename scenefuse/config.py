@@ -119,7 +119,7 @@ SECTIONS: dict[str, list[Any]] = {
     "demo": [DemoSettings()],
     "demo.flight": [FlightSettings()],
     "demo.orbit": [OrbitSettings()],
-    "demo.fiducials": [ClickSettings()],
+    "demo.fiducials": [ClickSettings(least_miss_px=0, most_miss_px=2)],
     "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
     "demo.clicks": [PromptSettings(inside=3, box=True)],
     "scene": [ChunkSettings()],

@@ -1,4 +1,4 @@
-"""Points clicked in photos of the demo, as a person would: corners and tips that are visible, a pixel off."""
+"""Points clicked in photos of the demo, as a person would: corners and tips that are visible, some pixels off."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +16,16 @@ HIDDEN_M = 0.06
 
 @dataclass(frozen=True)
 class ClickSettings:
-    """Clicks of the demo."""
+    """Points clicked in several photos."""
 
     photos: int = setting(6, least=0)
     """Photos used at most."""
     separation_deg: float = setting(12, unit="deg", least=0)
     """Smallest angle at the object between the views of two photos used."""
-    noise_px: float = setting(1, unit="px", least=0)
-    """Standard deviation of a click."""
+    least_miss_px: float = setting(3, unit="px", least=0)
+    """How far a click is off the point that it was meant for, at least."""
+    most_miss_px: float = setting(10, unit="px", least=0)
+    """The same, at most."""
 
 
 def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSettings, seed: int) -> None:
@@ -37,7 +39,7 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
         cameras: the capture's cameras.json.
         clicks: output table, .tsv.
         settings: how they are clicked.
-        seed: of the world, as for rendering, and of the clicks' noise.
+        seed: of the world, as for rendering, and of the clicks' misses.
 
     Raises:
         StageError: an unknown object, or fewer than four points that two photos see.
@@ -54,17 +56,23 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
             f"only {len(names)} points of {name} are visible in two of the {len(used)} photos used from {cameras}; "
             "render more photos, or allow more photos or a smaller separation for the clicks"
         )
-    rng = np.random.default_rng(seed)
+    misses = random_misses(len(landmarks) * len(used), settings.least_miss_px, settings.most_miss_px, seed)
     lines = ["point\tphoto\tx_px\ty_px"]
     for k, point in enumerate(landmarks):
-        for photo in used:
-            noise = rng.normal(0.0, settings.noise_px, 2)
+        for photo, miss in zip(used, misses[k * len(used) :]):
             if point in names and seen[photo, k]:
-                x, y = np.clip(pixels[photo, k] + noise, 0, [capture.width, capture.height])
+                x, y = np.clip(pixels[photo, k] + miss, 0, [capture.width, capture.height])
                 lines.append(f"{point}\t{capture.names[photo]}\t{x:.2f}\t{y:.2f}")
     with atomic_file(clicks) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     print(f"{name}: {len(names)} points in {len(used)} photos", flush=True)
+
+
+def random_misses(count: int, least: float, most: float, seed: int | np.random.Generator) -> NDArray[np.float64]:
+    """(count, 2) by how much clicks are off, in random directions and as far as this."""
+    rng = np.random.default_rng(seed)
+    angles, off = rng.uniform(0, 2 * np.pi, count), rng.uniform(least, most, count)
+    return off[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
 def _choose(seen: NDArray[np.bool_], towards: NDArray[np.float64], settings: ClickSettings) -> list[int]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from scenefuse.demo.clicks import random_misses
 from scenefuse.io.pictures import read_mask
 from scenefuse.stage import StageError, atomic_file, setting
 
@@ -75,7 +76,5 @@ def clicks_on(
         rows, columns = np.nonzero(mask)
         spots += [np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1.0]
         labels += ["box"] * 2
-    angles = rng.uniform(0, 2 * np.pi, len(spots))
-    off = rng.uniform(settings.least_miss_px, settings.most_miss_px, len(spots))
-    found = np.array(spots) + off[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    found = np.array(spots) + random_misses(len(spots), settings.least_miss_px, settings.most_miss_px, rng)
     return labels, np.clip(found, 1.0, np.array(mask.shape[::-1]) - 1.0)

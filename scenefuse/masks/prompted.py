@@ -1,11 +1,12 @@
 """Masks from prompts: points triangulated from several photos, or clicks in one, carried on to the others."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.masks.clicked.carry import carry
 from scenefuse.masks.clicked.click_depth import with_depth
@@ -16,13 +17,16 @@ from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
 from scenefuse.mvs.visual_hull import Mask
-from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, triangulate_consistent
+from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, marked_size, triangulate_consistent
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 from scenefuse.workspace import Workspace, read_model
 
 LEAST_POINTS = 3
 """Prompts that span an object."""
+SLOPPY = 0.03
+"""Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
+a hand misses, or that are none (a hat's brim)."""
 CARRIED_WIDTHS = 2
 """GrabCut carries masks on at photos so many times as wide as those of its first cut: what one mask lacks is missing
 from the next."""
@@ -85,8 +89,8 @@ def masks_from_prompts(
             masks = segment_by_grabcut(target, photos, settings, carried.clicked)
         masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
         return Prompted(masks, target, carried.reasons, left_out + carried.left_out)
-    points, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
-    target = target_from_points(points, photos, up, seed)
+    points, exact, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
+    target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:
         return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out)
     return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out)
@@ -105,17 +109,20 @@ def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: Ph
 
 def _points(
     marked: Clicks | ScenePoints, sparse: Path, sizes: Mapping[str, tuple[int, int]], max_residual_px: float
-) -> tuple[Array, list[str]]:
-    """(N, 3) prompts in the object's frame, and the points and clicks that are left out."""
+) -> tuple[Array, NDArray[np.bool_], list[str]]:
+    """(N, 3) prompts in the object's frame, (N,) which are exact, and the points and clicks that are left out."""
     left_out: list[str] = []
     if isinstance(marked, ScenePoints):
-        names, points = marked.points, marked.positions
+        names, points, exact = marked.points, marked.positions, np.ones(len(marked.points), dtype=bool)
     else:
-        names, points, _, left_out = triangulate_consistent(marked, read_model(sparse), max_residual_px, sizes)
+        model = read_model(sparse)
+        limit = max(max_residual_px, SLOPPY * marked_size(marked, model, sizes))
+        names, points, residuals, left_out = triangulate_consistent(marked, model, limit, sizes)
+        exact = residuals <= max_residual_px
     if len(points) < LEAST_POINTS:
         wrong = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
             f"{marked.path} holds {len(names)} points on the object that can be used, three or more are needed{wrong};"
             " mark some at its ends"
         )
-    return points, left_out
+    return points, exact, left_out

@@ -181,9 +181,10 @@ def _enlarged(logits: NDArray[np.float32], size: tuple[int, int]) -> list[Mask]:
 
 
 def segment(network: Sam2, target: Target, view: View, outline: Mask | None, clicks: PhotoClicks | None = None) -> Mask:
-    """The object in one photo, prompted by all points, as this photo sees them, and the box around them.
+    """The object in one photo, prompted by all exact points, as this photo sees them, and the box around all.
 
-    A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same.
+    A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same. Where
+    no point is exact, all prompt.
 
     Args:
         network: SAM 2.
@@ -203,11 +204,13 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
     inside = front & (pixels >= 0).all(1) & (pixels < size[::-1]).all(1)
     if not inside.any():
         return np.zeros(size, dtype=bool)
+    exact = inside.copy()
+    exact[target.inexact] = False
     spanned = pixels[front] if outline is None or not outline.any() else np.argwhere(outline)[:, ::-1] + 0.5
     low, high = spanned.min(0), spanned.max(0)
     grow = BOX_GROWTH * (high - low).max()
     box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
-    on, off = pixels[inside], NONE
+    on, off = pixels[exact if exact.any() else inside], NONE
     if clicks is not None:
         on, off, box = np.concatenate([clicks.on, on]), clicks.off, box if clicks.box is None else clicks.box
     found, quality = network.masks(network.encode(view.pixels), size, on, box, off)

@@ -1,6 +1,6 @@
 """Where an object is, by the sparse model and a few points on it: box, ground, and which sparse points are its own."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class Target:
         parts: (K, 4) rows of them whose tetrahedron is taken for object.
         sparse: (P, 3) sparse points.
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
+        inexact: (K,) rows of the prompts that say how far the object reaches, but may lie beside it in a photo.
     """
 
     box: Box
@@ -50,6 +51,7 @@ class Target:
     parts: NDArray[np.intp]
     sparse: Array
     kind: NDArray[np.int8]
+    inexact: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, np.intp))
 
     def outline(self, view: View) -> Array:
         """Pixels (N, 2) in whose convex hull the object is; all of the photo where that ends behind the camera."""

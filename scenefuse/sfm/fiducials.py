@@ -206,6 +206,23 @@ def triangulate_consistent(
     return names, np.array(positions).reshape(-1, 3), np.array(residuals), left_out
 
 
+def marked_size(
+    clicks: Clicks, model: pycolmap.Reconstruction, sizes: Mapping[str, tuple[int, int]] | None = None
+) -> float:
+    """How large what is clicked is in the photos: median diagonal of the box of a photo's clicks, in pixels of the
+    model's photos; 0 where no photo with a camera has two. Arguments as of `triangulate`."""
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = {} if sizes is None else {composed(name): size for name, size in sizes.items()}
+    photos, spans = np.array([composed(photo) for photo in clicks.photos]), []
+    for name in sorted(set(photos) & set(images)):
+        camera = images[name].camera
+        assert camera is not None
+        scale = camera.width / sizes.get(name, (camera.width, camera.height))[0]
+        if (photos == name).sum() > 1:
+            spans.append(scale * float(np.linalg.norm(np.ptp(clicks.pixels[photos == name], axis=0))))
+    return float(np.median(spans)) if spans else 0.0
+
+
 def _sightings(
     clicks: Clicks, images: Mapping[str, pycolmap.Image], sizes: Mapping[str, tuple[int, int]] | None
 ) -> tuple[dict[str, list[tuple[str, Array]]], list[str]]:

@@ -241,6 +241,10 @@ def _mapper_options(photos: int, calibrated: bool, seed: int) -> pycolmap.Increm
     options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
     options.mapper.filter_max_reproj_error = MAX_REPROJECTION_ERROR_PX
     options.min_model_size = MIN_PHOTOS
+    if calibrated:
+        # COLMAP leaves photos out whose lens looks like a failed adjustment: with coefficients over 1, as those of a
+        # rational lens, which nearly cancel. A lens that is known is not doubted.
+        options.max_extra_param = np.inf
     # A second attempt from another pair stops, by default, once it shares twenty photos with the first, however small
     # that one stayed; here every attempt goes on as far as it can, and the largest is taken.
     options.max_model_overlap = photos

@@ -56,6 +56,17 @@ def colmap(folder):
     return folder / "given"
 
 
+def rational(folder):
+    """A lens whose coefficients are large and cancel, as ours may have."""
+    sparse = colmap(folder) / "sparse"
+    model = pycolmap.Reconstruction(sparse)
+    for camera in model.cameras.values():
+        camera.model = pycolmap.CameraModelId.FULL_OPENCV
+        camera.params = [FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2, 2, -5, 0, 0, 22, 2, -5, 22]
+    model.write(sparse)
+    return folder / "given"
+
+
 def nerfstudio(folder):
     frames = []
     for view in FLIGHT.views:
@@ -132,7 +143,7 @@ def mapped(folder, cameras):
 
 
 @pytest.mark.parametrize(
-    "write", [colmap, nerfstudio, opensfm, lambda folder: opensfm(folder, "brown"), metashape, bundler]
+    "write", [colmap, rational, nerfstudio, opensfm, lambda folder: opensfm(folder, "brown"), metashape, bundler]
 )
 def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     with_database(tmp_path)

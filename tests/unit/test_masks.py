@@ -21,7 +21,7 @@ from scenefuse.masks.box import find_ground, upright_box
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
-from scenefuse.masks.sam2 import Sam2Transformers, check_weights
+from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
 from scenefuse.masks.sam2_weights import (
     PACKAGE,
     UnavailableError,
@@ -32,8 +32,9 @@ from scenefuse.masks.sam2_weights import (
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.target import target_from_points
 from scenefuse.mvs.visual_hull import carve, mask_iou, silhouette
+from scenefuse.sfm.fiducials import marked_size, read_points
 from scenefuse.stage import StageError, read_json, sha256, value, write_json
-from scenefuse.workspace import View, Workspace
+from scenefuse.workspace import View, Workspace, read_model, read_workspace
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
 SETTINGS = MaskSettings(method="grabcut", grabcut_width_px=120, hull_voxels=40, min_photos=4, max_click_residual_px=2)
@@ -285,6 +286,71 @@ def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_other
     assert network.segmented == [*range(PHOTOS), 5]
     assert min(iou_with_truth(capture, tmp_path)) > 0.95
     assert value(read_json(tmp_path / "masks.json"), "weights") == "own weights"
+
+
+MARKS = {
+    "top": (0, 0, 2),
+    "east": (1, 0, 1),
+    "west": (-1, 0, 1),
+    "north": (0, 1, 1),
+    "south": (0, -1, 1),
+    "foot": (0, 0, 0.05),
+}
+
+
+def sloppy_clicks(capture, miss_px, wrong=None):
+    """Marks on the ball clicked in four photos, each off by so much, and the one on `wrong` by much more in one."""
+    turn = np.random.default_rng(1)
+    lines = ["point\tphoto\tx_px\ty_px"]
+    for name, place in MARKS.items():
+        for k in (0, 2, 4, 6):
+            angle = turn.uniform(0, 2 * np.pi)
+            off = 20.0 if (name, k) == (wrong, 4) else miss_px
+            x, y = view(k).project(np.array([place], float))[0][0] + off * np.array([np.cos(angle), np.sin(angle)])
+            lines.append(f"{name}\tf{k}.png\t{x:.2f}\t{y:.2f}")
+    (capture / "sloppy.tsv").write_text("\n".join(lines) + "\n")
+
+
+def test_clicks_that_miss_by_little_beside_the_object_still_span_it_and_a_wrong_one_is_named(capture, tmp_path):
+    sloppy_clicks(capture, 1.5)
+    run_stage(capture, tmp_path, prompts="sloppy.tsv", max_click_residual_px=0.5)
+    assert value(read_json(tmp_path / "masks.json"), "clicks_left_out") == []
+    assert min(iou_with_truth(capture, tmp_path)) > 0.93
+    sloppy_clicks(capture, 1.5, wrong="foot")
+    run_stage(capture, tmp_path, prompts="sloppy.tsv", max_click_residual_px=0.5)
+    (sentence,) = value(read_json(tmp_path / "masks.json"), "clicks_left_out")
+    assert sentence.startswith("the clicks on point foot miss each other by")
+
+
+def test_what_is_clicked_is_as_large_as_its_clicks_in_most_photos(capture):
+    sloppy_clicks(capture, 0.0)
+    marked, model = read_points(capture / "sloppy.tsv"), read_model(capture / "undistorted" / "sparse")
+    spans = [np.ptp(view(k).project(np.array(list(MARKS.values()), float))[0], axis=0) for k in (0, 2, 4, 6)]
+    size = np.median(np.linalg.norm(spans, axis=1))
+    assert marked_size(marked, model) == pytest.approx(size, abs=0.1)
+    assert marked_size(marked, model, {f"f{k}.png": (2 * WIDTH, 2 * HEIGHT) for k in range(PHOTOS)}) == pytest.approx(
+        size / 2, abs=0.1
+    )
+
+
+def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypatch):
+    asked = []
+
+    class Network:
+        def encode(self, image):
+            return None
+
+        def masks(self, image, size, points_px, box_px, outside_px):
+            asked.append((points_px, box_px))
+            return [np.ones(size, dtype=bool)] * 3, np.ones(3)
+
+    photos = read_workspace(capture / "undistorted")
+    target = target_from_points(np.array(list(MARKS.values()), float), photos, np.array([0, 0, 1.0]), 0)
+    photo = photos.rgb(photos.views[0])
+    for inexact in ([], [0, 1], list(range(6))):
+        segment(Network(), dataclasses.replace(target, inexact=np.array(inexact, int)), photo, None)
+    assert [len(points) for points, _ in asked] == [6, 4, 6]
+    assert all((box == asked[0][1]).all() for _, box in asked)
 
 
 def test_wrong_or_missing_weights_are_named(tmp_path):
