@@ -61,6 +61,9 @@ class RunSettings:
     gpu: int | Literal["auto"] = setting("auto", least=0)
     """GPUs that a stereo or training job asks the scheduler for; `auto` is 1 where Snakemake runs on a machine with an
     NVIDIA card, else 0. On a cluster, say it."""
+    keep_maps: bool = setting(True)
+    """Whether depth maps and the maps of the object's stages, most of what a run takes on the disk, stay. Otherwise
+    each goes when no job needs it any more, and a rerun that needs it makes it again."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud, plane_normals, sampled, spacing
 from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.registration.agreement import NORMAL_NEIGHBOURS, AgreementSettings
-from scenefuse.stage import quantity, setting, threads
+from scenefuse.stage import quantity, threads
 from scenefuse.transforms import Array
 
 # Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
@@ -25,7 +25,7 @@ class MetricSettings:
 
     agreement: AgreementSettings = AgreementSettings()
     """When points correspond."""
-    sample: int = setting(4000, least=0)
+    sample: int = 4000
     """Points at which a completion metric is measured, chosen by the seed."""
     variation_spacings: float = 8
     """Radius of the surface variation, in spacings of the scene crop."""

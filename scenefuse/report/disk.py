@@ -80,7 +80,7 @@ def forecast_note(needed: Mapping[Path, int | None]) -> str:
         f"disk: scenes and objects will take about {_size(sum(known.values()))} ({_size(sum(taken.values()))} now),"
         f" {_size(free)} are free"
         + (f"; not counted: {', '.join(unknown)}" if unknown else "")
-        + ("; that is too little: free some space" if more > free else "")
+        + ("; that is too little: free some space, or set `keep_maps: false`" if more > free else "")
     )
 
 

@@ -126,6 +126,21 @@ def test_an_edited_setting_reruns_only_what_depends_on_it(finished, snakemake, t
     assert planned(snakemake(finished, "--dry-run", config=tmp_path / "edited.yaml").stdout) == rules | SUMMARY
 
 
+def test_maps_go_when_no_job_needs_them_only_where_that_is_wanted(finished, snakemake, tmp_path):
+    tiny = yaml.safe_load((ROOT / "tests/data/tiny.yaml").read_text())
+    (tmp_path / "small.yaml").write_text(yaml.safe_dump(tiny | {"keep_maps": False}))
+    gone = {
+        line.split("Would remove temporary output ")[1]
+        for line in snakemake(finished, "--dry-run", "--forceall", config=tmp_path / "small.yaml").stdout.splitlines()
+        if "Would remove temporary output " in line
+    }
+    assert gone == {
+        *(f"results/scenes/demo/depth/{chunk}" for chunk in range(2)),
+        *(f"results/objects/house/stage{stage}" for stage in range(1, 5)),
+    }
+    assert "temporary output" not in snakemake(finished, "--dry-run", "--forceall").stdout
+
+
 def test_the_scene_with_one_object_is_a_target(finished, snakemake):
     result = snakemake(finished, "results/objects/house/fused_scene.laz", "--dry-run")
     assert planned(result.stdout) == {"complete_scene_with_object"}

@@ -294,6 +294,11 @@ def state_of(files):
     )
 
 
+def maps(folder):
+    """Output: a folder of maps, which goes when no job needs it any more, unless `keep_maps`."""
+    return directory(folder) if config["keep_maps"] else temp(directory(folder))
+
+
 def script(name):
     """A stage's script on a command line. Not by its path: what is in `params` may not depend on where the project lies."""
     return f'"$SCENEFUSE/scripts/{name}"'

@@ -24,7 +24,7 @@ rule train_depth:
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
     output:
-        stage=directory("results/objects/{object}/stage1"),
+        stage=maps("results/objects/{object}/stage1"),
         report="results/objects/{object}/stage1.json",
     log:
         "results/logs/train_depth/{object}.log",
@@ -64,7 +64,7 @@ rule refine_depth:
         rendered="results/objects/{object}/stage2",
         rendered_json="results/objects/{object}/stage2.json",
     output:
-        stage=directory("results/objects/{object}/stage3"),
+        stage=maps("results/objects/{object}/stage3"),
         report="results/objects/{object}/stage3.json",
     log:
         "results/logs/refine_depth/{object}.log",

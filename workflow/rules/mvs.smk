@@ -14,7 +14,7 @@ rule estimate_depth_maps:
         workspace="results/scenes/{scene}/undistorted",
         report="results/scenes/{scene}/undistorted.json",
     output:
-        depth=directory("results/scenes/{scene}/depth/{chunk}"),
+        depth=maps("results/scenes/{scene}/depth/{chunk}"),
         report="results/scenes/{scene}/depth/{chunk}.json",
     log:
         "results/logs/estimate_depth_maps/{scene}-{chunk}.log",

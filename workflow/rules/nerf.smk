@@ -15,7 +15,7 @@ rule train_object_nerf:
         prior="results/objects/{object}/stage1",
         prior_json="results/objects/{object}/stage1.json",
     output:
-        stage=directory("results/objects/{object}/stage2"),
+        stage=maps("results/objects/{object}/stage2"),
         report="results/objects/{object}/stage2.json",
     log:
         "results/logs/train_object_nerf/{object}.log",
@@ -55,7 +55,7 @@ use rule train_object_nerf as retrain_object_nerf with:
         previous="results/objects/{object}/stage2",
         previous_json="results/objects/{object}/stage2.json",
     output:
-        stage=directory("results/objects/{object}/stage4"),
+        stage=maps("results/objects/{object}/stage4"),
         report="results/objects/{object}/stage4.json",
     log:
         "results/logs/retrain_object_nerf/{object}.log",

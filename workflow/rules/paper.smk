@@ -31,7 +31,7 @@ rule estimate_as_paper:
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
     output:
-        stage=directory("results/objects/{object}/stage1"),
+        stage=maps("results/objects/{object}/stage1"),
         report="results/objects/{object}/stage1.json",
         posed=directory("results/objects/{object}/poses"),
         posed_json="results/objects/{object}/poses.json",
@@ -70,7 +70,7 @@ rule train_nerf_as_paper:
         prior="results/objects/{object}/stage1",
         prior_json="results/objects/{object}/stage1.json",
     output:
-        stage=directory("results/objects/{object}/stage2"),
+        stage=maps("results/objects/{object}/stage2"),
         report="results/objects/{object}/stage2.json",
     log:
         "results/logs/train_nerf_as_paper/{object}.log",
@@ -111,7 +111,7 @@ rule refine_as_paper:
         rendered="results/objects/{object}/stage2",
         rendered_json="results/objects/{object}/stage2.json",
     output:
-        stage=directory("results/objects/{object}/stage3"),
+        stage=maps("results/objects/{object}/stage3"),
         report="results/objects/{object}/stage3.json",
         posed=directory("results/objects/{object}/refined_poses"),
         posed_json="results/objects/{object}/refined_poses.json",
@@ -151,7 +151,7 @@ use rule train_nerf_as_paper as retrain_nerf_as_paper with:
         prior="results/objects/{object}/stage3",
         prior_json="results/objects/{object}/stage3.json",
     output:
-        stage=directory("results/objects/{object}/stage4"),
+        stage=maps("results/objects/{object}/stage4"),
         report="results/objects/{object}/stage4.json",
     log:
         "results/logs/retrain_nerf_as_paper/{object}.log",
