@@ -111,6 +111,7 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         missing = replace(missing, notes=(*missing.notes, "points far from the object were thinned to plan stations"))
     higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
     content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
+    content |= {"of": quantity("its surface" if masks else "what its own cloud holds", "")}
     content |= {"seconds": quantity(time.perf_counter() - start, "s")}
     write_json(outputs.report, content)
 

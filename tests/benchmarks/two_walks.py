@@ -1,7 +1,6 @@
 """Real scenes laid on each other by their clouds alone, measured against the photos that they share.
 
-snakemake --configfile config/examples/two_walks/config.yaml --cores 2 \\
-    results/scenes/{walk1,walk2,boulder,boulder_section}/dense.ply
+snakemake --configfile config/examples/two_walks/config.yaml --cores 2
 python tests/benchmarks/two_walks.py --results results --pictures results/two_walks
 """
 

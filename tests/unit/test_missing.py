@@ -193,6 +193,9 @@ def test_the_stage_writes_cells_photos_and_shares(files):
     features = json.loads(outputs.geojson.read_text())["features"]
     assert len(rows) == len(features) == 3 * value(report, "stations") > 0
     assert features[0]["geometry"]["coordinates"] == [float(rows[0][k]) for k in COLUMNS[5:8]]
+    assert value(report, "of") == "its surface"
+    find_missing(inputs=replace(inputs, masks=None), outputs=outputs)
+    assert value(read_json(outputs.report), "of") == "what its own cloud holds"
 
 
 def test_of_a_large_scene_what_is_far_from_the_object_is_thinned(files, monkeypatch):
