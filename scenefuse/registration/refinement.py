@@ -181,7 +181,9 @@ class _Work:
 
         Where the alignment differs from the clouds' pose, its own is refined on the clouds. Of the refined pose and the
         alignment's own the less uncertain one is taken; the worse the clouds score at the alignment's pose, the less
-        uncertain that must be. A refinement that leaves the alignment's valley is dropped.
+        uncertain that must be. Where they score as well there, what they differ by beyond the alignment's uncertainty
+        counts as theirs: surfaces err alike, which their scatter does not show. A refinement that leaves the
+        alignment's valley is dropped.
         """
         alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
         if alignment is None:
@@ -193,6 +195,8 @@ class _Work:
         by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        if own is not None and worth > ASTRAY:
+            own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
         if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
             ranked, own = [by_photos, *ranked], alignment.uncertainty
         return ranked, own, "both" if agree else "photos"

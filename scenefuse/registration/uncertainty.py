@@ -61,13 +61,30 @@ class Uncertainty:
         turn, shift = np.radians(self.rotation_sd_deg) / 2, self.translation_sd / diagonal
         return float(np.sqrt((self.scale_sd_log / 2) ** 2 + turn**2 + shift**2))
 
+    @property
+    def deviations(self) -> Array:
+        """(3,) standard deviations of log scale, of the rotation (degrees) and of the shift (scene units)."""
+        return np.array([self.scale_sd_log, self.rotation_sd_deg, self.translation_sd])
+
     def with_difference(self, pose: Sim3, other: Sim3, at: Array) -> "Uncertainty":
         """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
-        return Uncertainty.even(
-            float(np.hypot(self.scale_sd_log, np.log(other.scale / pose.scale))),
-            float(np.hypot(self.rotation_sd_deg, rotation_angle_deg(other.rotation @ pose.rotation.T))),
-            float(np.hypot(self.translation_sd, np.linalg.norm(other.apply(at) - pose.apply(at)))),
-        )
+        return Uncertainty.even(*np.hypot(self.deviations, _apart(pose, other, at)))
+
+    def unless_apart(self, pose: Sim3, other: Sim3, at: Array, of_other: "Uncertainty") -> "Uncertainty":
+        """At least what two estimates differ by beyond the other's own uncertainty; see `with_difference`."""
+        beyond = np.sqrt(np.maximum(_apart(pose, other, at) ** 2 - of_other.deviations**2, 0))
+        if (beyond <= self.deviations).all():
+            return self
+        return Uncertainty.even(*np.maximum(self.deviations, beyond))
+
+
+def _apart(pose: Sim3, other: Sim3, at: Array) -> Array:
+    """(3,) differences of log scale, rotation (degrees), and where (3,) in the object's frame lies (scene units)."""
+    return np.array([
+        abs(np.log(other.scale / pose.scale)),
+        rotation_angle_deg(other.rotation @ pose.rotation.T),
+        np.linalg.norm(other.apply(at) - pose.apply(at)),
+    ])  # fmt: skip
 
 
 def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_scene: Array | None) -> Uncertainty:

@@ -332,6 +332,22 @@ def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house
         assert (outcome.ranked[0].pose.scale == near.scale) == by_photos
 
 
+def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_they_differ(house):
+    truth = house.scene_from_object
+    alone = refined(house, truth)
+    apart = 6 * alone.uncertainty.translation_sd
+    beside = Sim3(1.0, np.eye(3), np.array([apart, 0, 0])) @ truth
+    # Half as certain as the clouds say, and yet less uncertain than what both differ by.
+    sure = Uncertainty.even(*2 * alone.uncertainty.deviations)
+    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, sure, 40, None)))
+    assert outcome.ranked[0].pose is beside and outcome.uncertainty is sure
+    # The photos are so uncertain that the difference is theirs.
+    unsure = Uncertainty.even(*9 * alone.uncertainty.deviations)
+    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, unsure, 40, None)))
+    assert outcome.ranked[0].pose is not beside
+    np.testing.assert_allclose(outcome.uncertainty.deviations, alone.uncertainty.deviations)
+
+
 def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncertain(house):
     truth = house.scene_from_object
     beside = Sim3(1.0, np.eye(3), np.array([0.03 * house.diagonal, 0, 0])) @ truth
