@@ -29,8 +29,8 @@ MAX_TRAVERSAL_DEPTH = 100
 """Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
 CACHED_MAPS = 64
 """Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50."""
-BYTES_A_PIXEL = 20
-"""Of a photo with its maps."""
+MAP_BYTES, PHOTO_BYTES = 16, 3
+"""A pixel of a photo's depth and normal map; a pixel of the photo, which COLMAP keeps at its own size."""
 OUTLIER_NEIGHBOURS = 8
 """Neighbours whose mean distance tells a point far from all others."""
 OUTLIER_RATIO = 4.0
@@ -151,7 +151,9 @@ def _fuse(
     Raises:
         StageError: no point at all.
     """
-    most = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
+    largest = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
+    photo = max(view.width * view.height for view in read_views(workspace / "sparse"))
+    cached = CACHED_MAPS * (MAP_BYTES * largest + PHOTO_BYTES * photo)
     widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
     with linked_workspace(workspace, beside, widths) as folder:
         for name, source in maps.items():
@@ -165,7 +167,7 @@ def _fuse(
         (folder / "stereo" / "fusion.cfg").write_text("".join(f"{name}\n" for name in sorted(maps)))
         path = folder / "fused.ply"
         fused = cancellable(
-            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings, most), "PLY"
+            pycolmap.stereo_fusion, path, folder, "COLMAP", "option-all", "geometric", _options(settings, cached), "PLY"
         )
         if not path.is_file() or (fused is not None and fused.num_points3D() == 0 and path.stat().st_size < 1000):
             raise _no_points(settings)
@@ -173,8 +175,8 @@ def _fuse(
     return Cloud(cloud.points, cloud.normals, cloud.colors, {"views": views}), 1 - left / max(measured, 1)
 
 
-def _options(settings: DenseCloudSettings, most_pixels: int) -> pycolmap.StereoFusionOptions:
-    """COLMAP's own settings; most_pixels: of the largest map."""
+def _options(settings: DenseCloudSettings, cached_bytes: int) -> pycolmap.StereoFusionOptions:
+    """COLMAP's own settings; cached_bytes: of the photos and maps that it keeps in memory."""
     options = pycolmap.StereoFusionOptions()
     options.num_threads = 1  # With more, which thread comes first decides the points.
     options.min_num_pixels = settings.min_photos
@@ -182,7 +184,7 @@ def _options(settings: DenseCloudSettings, most_pixels: int) -> pycolmap.StereoF
     options.max_depth_error = settings.max_depth_error
     options.max_normal_error = settings.max_normal_error_deg
     options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
-    options.use_cache, options.cache_size = True, CACHED_MAPS * most_pixels * BYTES_A_PIXEL / 1e9
+    options.use_cache, options.cache_size = True, cached_bytes / 1e9
     return options
 
 
