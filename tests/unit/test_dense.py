@@ -210,7 +210,7 @@ def test_what_colmap_keeps_in_memory_is_room_for_photos_that_are_larger_than_the
         report=tmp_path / "dense.json",
     )
     of_photo, of_maps = 3 * WIDTH * HEIGHT, (1 + 3) * 4 * (WIDTH // 2) * (HEIGHT // 2)
-    assert kept == [pytest.approx(5 * (of_photo + of_maps) / 1e9)]
+    assert kept == [pytest.approx(5 * (of_photo + of_maps) / 1e9, rel=1e-3)]  # with the header of a map
 
 
 def test_neighbours_in_a_large_cloud_are_those_of_the_whole(monkeypatch):
