@@ -49,8 +49,9 @@ class MaskSettings:
     min_agreement: float = setting(0.6, least=0, most=1)
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
-    """Largest reprojection error of a clicked prompt, and how far a click inside or outside may lie on the wrong side
-    of its mask's outline; others are left out and named."""
+    """Largest reprojection error of a prompt clicked in several photos, if 3 % of what is clicked in one is not more;
+    and how far a click inside or outside may lie on the wrong side of its mask's outline. Others are left out and
+    named."""
     min_photos: int = 5
     """Fewest good masks to go on with."""
     hull_voxels: int = 160
