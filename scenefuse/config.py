@@ -63,7 +63,8 @@ class RunSettings:
     NVIDIA card, else 0. On a cluster, say it."""
     keep_maps: bool = setting(True)
     """Whether depth maps and the maps of the object's stages, most of what a run takes on the disk, stay. Otherwise
-    each goes when no job needs it any more, and a rerun that needs it makes it again."""
+    each goes when no job needs it any more; a later run that needs it again, for a new gate, picture or object, makes
+    it and all that follows from it again."""
 
 
 @dataclass(frozen=True)

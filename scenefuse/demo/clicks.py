@@ -70,6 +70,8 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
 
 def random_misses(count: int, least: float, most: float, seed: int | np.random.Generator) -> NDArray[np.float64]:
     """(count, 2) by how much clicks are off, in random directions and as far as this."""
+    if least > most:
+        raise StageError(f"clicks cannot miss by {least:g} px at least and {most:g} px at most; change one of the two")
     rng = np.random.default_rng(seed)
     angles, off = rng.uniform(0, 2 * np.pi, count), rng.uniform(least, most, count)
     return off[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)

@@ -303,8 +303,7 @@ def compare(
     # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
     worse &= ~on_scene | (_beside(scene.points, first[partner]) <= coarse)
     if len(second):
-        # What it did not measure stays where an object that measures less exactly than the scene does not speak against
-        # it either.
+        # What it did not measure may well be right where the object measures less exactly than the scene.
         inexact = (mine[partner] > CLEARLY * typical) & (distance <= CONSISTENT * mine[partner])
         worse &= on_scene | ~inexact
         distance, partner = cKDTree(second.points).query(first.points, workers=threads())

@@ -83,6 +83,8 @@ def make_masks(
     made, found, by = _make(inputs, photos, settings, seed)
     for sentence in found.left_out:
         print(f"left out of {inputs.prompts}: {sentence}", flush=True)
+    for note in found.notes:
+        print(f"note: {note}", flush=True)
     for name, reason in sorted(made.dropped.items()):
         print(f"{name} left out: {reason}", flush=True)
     kept = [view.name for view in photos.views if view.name not in made.dropped]
@@ -192,6 +194,7 @@ def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], se
         "median_agreement": quantity(float(np.median([made.scores[name] for name in kept])), "1"),
         "ground": quantity("measured" if found.target.ground_found else "not found; bottom of the box", ""),
         "clicks_left_out": quantity(found.left_out, ""),
+        "notes": quantity(list(found.notes), ""),
         "hull_voxel": quantity(made.hull.voxel, "object units"),
         "dropped": made.dropped,
         "per_photo": per_photo,

@@ -41,12 +41,14 @@ class Prompted:
         target: where the object is.
         reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
         left_out: clicks that contradict the others, or whose photo has no camera, a sentence each.
+        notes: what else a user should know of the clicks.
     """
 
     masks: list[Mask]
     target: Target
     reasons: dict[str, str]
     left_out: list[str]
+    notes: tuple[str, ...] = ()
 
 
 def masks_from_prompts(
@@ -89,11 +91,11 @@ def masks_from_prompts(
             masks = segment_by_grabcut(target, photos, settings, carried.clicked)
         masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
         return Prompted(masks, target, carried.reasons, left_out + carried.left_out)
-    points, exact, left_out = _points(marked, sparse, sizes, settings.max_click_residual_px)
+    points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:
-        return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out)
-    return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out)
+        return Prompted(segment_by_sam2(network, target, photos, settings), target, {}, left_out, notes)
+    return Prompted(segment_by_grabcut(target, photos, settings), target, {}, left_out, notes)
 
 
 def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: PhotoClicks | None) -> Mask:
@@ -109,9 +111,11 @@ def _own_parts(mask: Mask, target: Target, photos: Workspace, k: int, clicks: Ph
 
 def _points(
     marked: Clicks | ScenePoints, sparse: Path, sizes: Mapping[str, tuple[int, int]], max_residual_px: float
-) -> tuple[Array, NDArray[np.bool_], list[str]]:
-    """(N, 3) prompts in the object's frame, (N,) which are exact, and the points and clicks that are left out."""
+) -> tuple[Array, NDArray[np.bool_], list[str], tuple[str, ...]]:
+    """(N, 3) prompts in the object's frame, (N,) which are exact, the points and clicks left out, and a note on the
+    others that are not exact."""
     left_out: list[str] = []
+    notes: tuple[str, ...] = ()
     if isinstance(marked, ScenePoints):
         names, points, exact = marked.points, marked.positions, np.ones(len(marked.points), dtype=bool)
     else:
@@ -119,10 +123,16 @@ def _points(
         limit = max(max_residual_px, SLOPPY * marked_size(marked, model, sizes))
         names, points, residuals, left_out = triangulate_consistent(marked, model, limit, sizes)
         exact = residuals <= max_residual_px
+        off = [f"{name} {px:.1f} px" for name, px in zip(names, residuals) if px > max_residual_px]
+        if off:
+            notes = (
+                f"the clicks on {len(off)} of {len(names)} points miss each other by more than {max_residual_px:g} px"
+                f" ({', '.join(off)}): these points say how far the object reaches, and do not prompt SAM 2",
+            )
     if len(points) < LEAST_POINTS:
         wrong = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
             f"{marked.path} holds {len(names)} points on the object that can be used, three or more are needed{wrong};"
             " mark some at its ends"
         )
-    return points, exact, left_out
+    return points, exact, left_out, notes

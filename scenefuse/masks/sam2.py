@@ -184,7 +184,7 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
     """The object in one photo, prompted by all exact points, as this photo sees them, and the box around all.
 
     A point that the photo does not see is hidden by the object itself, so its pixel is the object's all the same. Where
-    no point is exact, all prompt.
+    the photo shows no exact point, all prompt.
 
     Args:
         network: SAM 2.

@@ -63,11 +63,12 @@ def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> 
     return round(count * (pixels + FEATURE_BYTES * own["features"]["max_features"]))
 
 
-def forecast_note(needed: Mapping[Path, int | None]) -> str:
+def forecast_note(needed: Mapping[Path, int | None], keep_maps: bool = True) -> str:
     """What a run needs beside what is free, in a sentence; "" where nothing of it can be told.
 
     Args:
         needed: bytes by folder of results, which need not exist; None where they are unknown.
+        keep_maps: whether maps stay; otherwise less is needed at a time.
     """
     known = {folder: size for folder, size in needed.items() if size is not None}
     if not known:
@@ -76,11 +77,13 @@ def forecast_note(needed: Mapping[Path, int | None]) -> str:
     taken = {folder: sum(parts_of(folder).values()) for folder in known}
     free, more = shutil.disk_usage(there).free, sum(max(0, size - taken[folder]) for folder, size in known.items())
     unknown = [folder.name for folder in needed if folder not in known]
+    amount = "about" if keep_maps else "less than, as maps go (keep_maps: false),"
+    advice = "free some space, or set `keep_maps: false`" if keep_maps else "free some space, unless few run at a time"
     return (
-        f"disk: scenes and objects will take about {_size(sum(known.values()))} ({_size(sum(taken.values()))} now),"
+        f"disk: scenes and objects will take {amount} {_size(sum(known.values()))} ({_size(sum(taken.values()))} now),"
         f" {_size(free)} are free"
         + (f"; not counted: {', '.join(unknown)}" if unknown else "")
-        + ("; that is too little: free some space, or set `keep_maps: false`" if more > free else "")
+        + (f"; that is too little: {advice}" if more > free else "")
     )
 
 

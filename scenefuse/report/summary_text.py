@@ -320,7 +320,7 @@ def _still_missing(fusion: Fields) -> str:
     shares = [
         f"{name.replace('_', ' ')} {_three(100 * find(fusion, f'missing.{name}'))} %" for name in CLASSES.values()
     ]
-    text = f"{_three(100 * share)} % of {find(fusion, 'missing.of')} ({', '.join(shares)})"
+    text = f"{_three(100 * share)} % of {find(fusion, 'missing.of') or 'its surface'} ({', '.join(shares)})"
     stations, shows = find(fusion, "missing.stations"), find(fusion, "missing.stations_show")
     if not stations:
         return text

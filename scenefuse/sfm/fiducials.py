@@ -197,7 +197,7 @@ def triangulate_consistent(
             where = ", ".join(f"{name} {px:.1f} px" for (name, _), px in zip(observed, off))
             left_out.append(
                 f"the clicks on point {point} miss each other by {residual:.1f} px"
-                f" (limit {max_residual_px:g} px): {where}"
+                f" (limit {max_residual_px:.3g} px): {where}"
             )
         else:
             names.append(point)

@@ -63,6 +63,8 @@ def test_a_note_says_when_the_disk_is_too_small(tmp_path):
     assert "too little" not in forecast_note({house: 10**6}) and "about 1 MB" in forecast_note({house: 10**6})
     assert "1e+06 TB (0 MB now)" in forecast_note({house: 10**18})
     assert forecast_note({house: 10**18}).endswith("; that is too little: free some space, or set `keep_maps: false`")
+    passing = forecast_note({house: 10**18}, keep_maps=False)
+    assert "take less than, as maps go (keep_maps: false), 1e+06 TB" in passing and "or set" not in passing
     # What one has too much is no room for the other.
     house.mkdir(parents=True)
     (house / "cloud.ply").write_bytes(bytes(5 * 10**6))

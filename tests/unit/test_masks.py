@@ -21,6 +21,7 @@ from scenefuse.masks.box import find_ground, upright_box
 from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
 from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
+from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
 from scenefuse.masks.sam2_weights import (
     PACKAGE,
@@ -314,12 +315,31 @@ def sloppy_clicks(capture, miss_px, wrong=None):
 def test_clicks_that_miss_by_little_beside_the_object_still_span_it_and_a_wrong_one_is_named(capture, tmp_path):
     sloppy_clicks(capture, 1.5)
     run_stage(capture, tmp_path, prompts="sloppy.tsv", max_click_residual_px=0.5)
-    assert value(read_json(tmp_path / "masks.json"), "clicks_left_out") == []
+    report = read_json(tmp_path / "masks.json")
+    assert value(report, "clicks_left_out") == [] and value(report, "notes")[0].startswith(
+        "the clicks on 6 of 6 points"
+    )
     assert min(iou_with_truth(capture, tmp_path)) > 0.93
     sloppy_clicks(capture, 1.5, wrong="foot")
     run_stage(capture, tmp_path, prompts="sloppy.tsv", max_click_residual_px=0.5)
     (sentence,) = value(read_json(tmp_path / "masks.json"), "clicks_left_out")
     assert sentence.startswith("the clicks on point foot miss each other by")
+
+
+def test_of_points_in_several_photos_the_exact_ones_prompt_sam2(capture, monkeypatch):
+    sloppy_clicks(capture, 0.0)
+    marked = read_points(capture / "sloppy.tsv")
+    pixels = marked.pixels.copy()
+    pixels[np.array(marked.points) == "top"] += np.random.default_rng(0).normal(0, 1.0, (4, 2))
+    targets = []
+    monkeypatch.setattr("scenefuse.masks.prompted.segment_by_sam2", lambda network, target, *_: targets.append(target))
+    photos, settings = read_workspace(capture / "undistorted"), dataclasses.replace(SETTINGS, max_click_residual_px=0.2)
+    prompted = masks_from_prompts(
+        dataclasses.replace(marked, pixels=pixels), capture / "undistorted/sparse", {}, photos,
+        np.array([0, 0, 1.0]), "network", settings, 0,
+    )  # fmt: skip
+    assert targets[0].inexact.tolist() == [list(MARKS).index("top")] and len(targets[0].spanning) == len(MARKS)
+    assert prompted.notes[0].startswith("the clicks on 1 of 6 points miss each other by more than 0.2 px (top ")
 
 
 def test_what_is_clicked_is_as_large_as_its_clicks_in_most_photos(capture):

@@ -58,7 +58,11 @@ def cameras_of(kind):
 
     def files(wildcards):
         given = own_file(kind, wildcards[kind], "cameras")
-        return [str(file) for path in given for file in camera_files(Path(path))]
+        return [
+            str(file)
+            for path in given
+            for file in ([path] if made_here(path) else camera_files(Path(path)))
+        ]
 
     return files
 

@@ -245,7 +245,8 @@ onstart:
             )
             for kind, rows in (("scene", SCENES), ("object", OBJECTS))
             for name, row in rows.items()
-        }
+        },
+        config["keep_maps"],
     )
     if note:
         print(note, file=sys.stderr)
