@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.fusion.photo_check import LEAST_PHOTOS, Matches, Photos, match_in, moved_photos
+from scenefuse.fusion.photo_check import LEAST_PHOTOS, MIN_MATCH, SLACK, Matches, Photos, match_in, moved_photos
 from scenefuse.fusion.settle import settle
 from scenefuse.fusion.visibility import Visibility, see
 from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing
@@ -19,12 +19,13 @@ UNCHECKED, MEASURED, NERF_ONLY, STEREO_ONLY = 0, 1, 2, 3
 """Values of the field `evidence`."""
 FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
 """What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
-KEPT, SEEN_THROUGH, ENCLOSED, REPLACED = 0, 1, 2, 3
+KEPT, SEEN_THROUGH, ENCLOSED, REPLACED, ELSEWHERE = 0, 1, 2, 3, 4
 """What becomes of a point of the scene, field `reason` of those taken away."""
 REASONS = {
     SEEN_THROUGH: "photos see a surface behind it",
     ENCLOSED: "no photo can see it: a measured surface stands before it in all",
     REPLACED: "the object measured the place better",
+    ELSEWHERE: "the object's photos match clearly better before or behind it",
 }
 NEAR = 0.05
 """The scene is checked in the object's box, widened by this share of its diagonal."""
@@ -37,6 +38,9 @@ SHARE_THROUGH = 0.3
 good points in some photos; a point that is not there has surfaces behind it in many."""
 MOST_CONFIRM = 0.5
 """A measured point of the scene that more than this share of the photos asked confirm is not seen through."""
+MOST_ELSEWHERE = 0.1
+"""Share of what the scene measured that the object's photos may match elsewhere: where it is more, the object's pose is
+off by pixels, and the photos say nothing of single points."""
 LEAST_VIEWS = 3
 """Photos that must have a point in their picture for it to count as enclosed."""
 SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
@@ -104,9 +108,10 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
     that hides and is seen. What photos see through is not there (a measured point of the scene where a larger share of
-    the photos that it is open to see through it than of those asked confirm it), nor what no photo can see. Where both
-    sides measured a place, the object's points stay unless the scene's standard deviation is clearly smaller; a clearly
-    denser scene stays unless the object's is.
+    the photos that it is open to see through it than of those asked confirm it), nor what no photo can see, nor what
+    the object's photos match clearly better elsewhere. Where both sides measured a place, the object's points stay
+    unless the scene's standard deviation is clearly smaller; a clearly denser scene stays unless the object's is. What
+    the scene measured goes only where something is left beside it.
 
     Args:
         obj: the object in the scene's frame, registered.
@@ -132,6 +137,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
+    elsewhere = _matched_elsewhere(across, of_scene.measured)
+    reason[elsewhere & (reason == KEPT)] = ELSEWHERE
     reason[is_seen_through(seen, sure, on_scene)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
@@ -140,6 +147,9 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     worse, better = compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal, share)
     reason[(reason == KEPT) & worse] = REPLACED
     added &= ~better
+    replaced = np.flatnonzero(left & (reason == REPLACED))
+    there = concatenate([obj.cloud[added], scene.cloud[reason == KEPT]])
+    reason[replaced[_alone(scene.cloud.points[replaced], there, SAME_SPACINGS * spacing(scene.cloud.points))]] = KEPT
     if nerf_only:
         added |= _gaps(obj.cloud.points, ~on_obj & ~contradicted, added, scene.cloud.points[reason == KEPT])
     return Weighed(
@@ -255,6 +265,26 @@ def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.boo
     least = np.where(measured, confirming, SHARE_THROUGH) * (seen.in_view - seen.hidden)
     least = np.where(measured & (confirming > MOST_CONFIRM), np.inf, least)
     return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
+
+
+def _matched_elsewhere(across: Matches, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) points that the scene's photos measured, but the object's match clearly better elsewhere along the ray and
+    confirm less than three times; none where that is said of many: then the object's pose is off."""
+    found = (
+        measured & (across.photos < LEAST_PHOTOS) & (across.best >= MIN_MATCH) & (across.best - across.match > SLACK)
+    )
+    confirmed = measured & across.measured
+    return found if found.sum() <= MOST_ELSEWHERE * (found | confirmed).sum() else np.zeros_like(found)
+
+
+def _alone(points: Array, others: Cloud, reach: float) -> NDArray[np.bool_]:
+    """(N,) points beside which, along the surface, none of the others lies within reach."""
+    if not len(points) or not len(others):
+        return np.full(len(points), not len(others))
+    count = min(SMOOTH_POINTS, len(others))
+    near = cKDTree(others.points).query(points, k=count, workers=threads())[1].reshape(-1)
+    beside = _beside(np.repeat(points, count, axis=0), others[near])
+    return np.asarray(beside.reshape(-1, count).min(1) > reach)
 
 
 def _seen(points: Array, surface: Cloud, obj: Side, scene: Side, diagonal: float) -> Visibility:

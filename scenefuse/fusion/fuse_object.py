@@ -17,7 +17,6 @@ from scenefuse.fusion.evidence import (
     NERF_ONLY,
     REASONS,
     REPLACED,
-    STEREO_ONLY,
     Side,
     Weighed,
     around,
@@ -321,7 +320,8 @@ def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
     """What photos say of both sides' points; without `evidence`, only what was taken away.
 
     `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added, better in the scene, or
-    contradicted.
+    contradicted. Of the others, `object_unasked` lie where fewer than three photos could be compared. `added_photos`
+    says how many photos confirm the measured points that were added.
     """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
     content = {"scene_removed": quantity(removed, "points")}
@@ -329,7 +329,7 @@ def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
     if weighed is None:
         return content | {"notes": quantity(["no photo was asked"], "")}
     kinds, left = weighed.obj.fields["evidence"], weighed.reason == KEPT
-    measured = kinds == MEASURED
+    measured, of_scene = kinds == MEASURED, weighed.scene.fields["evidence"] == MEASURED
     middle = float(np.median(weighed.obj.fields["deviation"][measured])) if measured.any() else None
     return content | {
         "object_points": quantity(len(kinds), "points"),
@@ -340,12 +340,25 @@ def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
         "object_better_in_scene": quantity(int((measured & ~weighed.contradicted & ~weighed.added).sum()), "points"),
         "object_added": quantity(int(weighed.added.sum()), "points"),
         "deviation_median": quantity(middle, unit),
+        "object_measured_share": quantity(float(measured.mean()) if len(measured) else None, "1"),
+        "object_unasked": quantity(int((~measured & np.isnan(weighed.obj.fields["match"])).sum()), "points"),
+        "added_photos": quantity(_quantiles(weighed.obj.fields["photos"][weighed.added & measured]), "photos"),
         "scene_checked": quantity(len(left), "points"),
-        "scene_measured": quantity(int((left & (weighed.scene.fields["evidence"] == MEASURED)).sum()), "points"),
-        "scene_stereo_only": quantity(int((left & (weighed.scene.fields["evidence"] == STEREO_ONLY)).sum()), "points"),
+        "scene_measured": quantity(int(of_scene.sum()), "points"),
+        "scene_stereo_only": quantity(int((~of_scene).sum()), "points"),
+        "scene_kept": quantity(int(left.sum()), "points"),
+        "scene_kept_measured": quantity(int((left & of_scene).sum()), "points"),
         "settled_by": quantity(weighed.moved, "diagonals"),
         "notes": quantity(list(weighed.notes), ""),
     }
+
+
+def _quantiles(values: NDArray[Any]) -> dict[str, float] | None:
+    """Least, median and largest of (N,) values, and the twentieth from below."""
+    if not len(values):
+        return None
+    places = {"least": 0.0, "5 %": 0.05, "median": 0.5, "largest": 1.0}
+    return {name: float(np.quantile(values, place, method="lower")) for name, place in places.items()}
 
 
 def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.fusion.evidence import NERF_ONLY
 from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
@@ -19,7 +20,7 @@ from scenefuse.stage import atomic_directory, read_json
 from scenefuse.transforms import Array, box_corners
 from scenefuse.workspace import read_views
 
-SCENE_COLOR, ADDED_COLOR = (205, 208, 212), (240, 120, 25)
+SCENE_COLOR, ADDED_COLOR, UNCONFIRMED_COLOR = (205, 208, 212), (240, 120, 25), (150, 60, 170)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
 MISSING_COLORS = {NEVER_SEEN: (214, 38, 31), UNTEXTURED: (52, 101, 196), CONTRADICTED: (150, 60, 170)}
 Discs = list[tuple[Cloud, NDArray[np.float32]]]
@@ -47,7 +48,9 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
         StageError: a cloud or JSON is missing or damaged.
     """
     join = read_surroundings(inputs)
-    clouds = [(cloud, point_radii(cloud.points)) for cloud in (join.before, join.after)]
+    clouds = [
+        (cloud, point_radii(cloud.points, source=cloud.fields.get("source"))) for cloud in (join.before, join.after)
+    ]
     azimuth_deg = _most_changed(clouds, join.framed)
     pictures = {
         "before_after": _before_after(inputs.name, join, clouds),
@@ -205,14 +208,20 @@ def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
 
 
 def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
-    """Scene points grey, added points coloured."""
+    """Scene points grey, added points coloured, those of them that no photo confirms in another colour."""
     tile, added = (430, 350), _added(join.after)
+    kinds = join.after.fields.get("evidence", np.zeros(len(added), np.uint8))
+    unconfirmed = added & (kinds == NERF_ONLY)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = (np.where(added[:, None], ADDED_COLOR, SCENE_COLOR) * shade).astype(np.uint8)
+    colors = np.where(added[:, None], ADDED_COLOR, SCENE_COLOR)
+    colors = (np.where(unconfirmed[:, None], UNCONFIRMED_COLOR, colors) * shade).astype(np.uint8)
     images: list[Image | None] = [
         render(join.after, orbit_camera(join.framed, a, 22.0, tile), radii, colors) for a in SIDES_DEG
     ]
-    note = f"grey: {(~added).sum():,} points of the scene; orange: {added.sum():,} points added from the object"
+    note = (
+        f"grey: {(~added).sum():,} points of the scene; orange: {(added & ~unconfirmed).sum():,} points added from the"
+        f" object; purple: {unconfirmed.sum():,} of its points that no photo confirms"
+    )
     columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG]
     return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
 

@@ -19,7 +19,7 @@ body { margin: 0 auto; max-width: 1180px; padding: 28px 20px 60px; background: #
 h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 20px; margin: 40px 0 8px; border-top: 1px solid var(--line);
   padding-top: 22px; } h3 { font-size: 16px; margin: 24px 0 6px; }
 p, figcaption { color: var(--soft); margin: 4px 0 10px; max-width: 88ch; } a { color: var(--accent); }
-nav a { margin-right: 14px; } figure { margin: 14px 0 22px; break-inside: avoid; }
+nav a { display: inline-block; margin-right: 14px; } figure { margin: 14px 0 22px; break-inside: avoid; }
 img { max-width: 100%; height: auto; display: block; }
 .badge { display: inline-block; font-size: 13px; padding: 1px 9px; border-radius: 9px; margin-left: 8px;
   border: 1px solid; vertical-align: 2px; font-weight: 500; } .ok { color: #1c6b35; } .no { color: #9c2b1f; }

@@ -101,8 +101,17 @@ def orbit_camera(
     return Camera(rotation, middle + distance * direction, float(focal), *size_px)
 
 
-def point_radii(points: Array, neighbours: int = 4, factor: float = 0.9, limit: float = 3.0) -> NDArray[np.float32]:
+def point_radii(
+    points: Array,
+    neighbours: int = 4,
+    factor: float = 0.9,
+    limit: float = 3.0,
+    source: NDArray[np.uint8] | None = None,
+) -> NDArray[np.float32]:
     """Disc radii (N,) in the cloud's unit: `factor` x the spacing around a point, at most `limit` x its median.
+
+    The median is that of all points of the same source (N,), where this is given: dense points that come into a sparse
+    cloud do not make its discs smaller.
 
     The spacing is the distance to the k-th neighbour, but not more than that of the neighbours themselves: a stray
     point off a dense surface is as small as the surface's points, and a sparse surface beside a dense one still closes.
@@ -118,7 +127,10 @@ def point_radii(points: Array, neighbours: int = 4, factor: float = 0.9, limit: 
         reach[part], nearest[part] = distance[:, neighbours], index[:, 1:]
     for part in parts:
         around[part] = np.median(reach[nearest[part]], axis=1)
-    middle = float(np.median(reach)) or 1e-9
+    middle = np.empty(len(points))
+    of = np.zeros(len(points), np.uint8) if source is None else source
+    for one in np.unique(of):
+        middle[of == one] = float(np.median(reach[of == one])) or 1e-9
     # Points that coincide still get a disc.
     spacing = np.clip(reach, around / 2, _STRAY * around)
     return (factor * np.clip(spacing, middle / 20, middle * limit)).astype(np.float32)

@@ -91,7 +91,7 @@ def write_report(
     body = [
         f"<h1>{escape(title)}</h1>",
         "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
-        "<nav>" + "".join(f'<a href="#{escape(to)}">{escape(name)}</a>' for to, name in links.items()) + "</nav>",
+        "<nav>" + " ".join(f'<a href="#{escape(to)}">{escape(name)}</a>' for to, name in links.items()) + "</nav>",
         *(_object_section(folder, tables["registration"], views.get(folder / "figures")) for folder in objects),
         *(_scene_section(folder, tables["scenes"], views.get(folder)) for folder in scenes),
         *(_table_section(name, rows) for name, rows in tables.items() if rows),

@@ -8,6 +8,7 @@ from support.photographed_plane import BLANK, photographs
 
 from scenefuse.fusion import evidence
 from scenefuse.fusion.evidence import (
+    ELSEWHERE,
     ENCLOSED,
     FIELDS,
     KEPT,
@@ -17,6 +18,7 @@ from scenefuse.fusion.evidence import (
     SEEN_THROUGH,
     STEREO_ONLY,
     Side,
+    _matched_elsewhere,
     is_seen_through,
     weigh,
     with_pose_uncertainty,
@@ -98,6 +100,35 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     last = np.arange(len(obj)) >= len(obj) - len(floating)
     last &= np.abs(obj.points[:, 1]) < 0.6
     assert not found.added[last].any() and found.contradicted[last].all()
+
+
+def test_what_close_ups_match_elsewhere_goes_unless_that_is_said_of_many(near, far, monkeypatch):
+    count = 40
+    match, best, photos = np.full(count, 0.9), np.full(count, 0.95), np.full(count, 6)
+    # Clearly better elsewhere; so, but confirmed; no better; nowhere good; not measured by the scene.
+    match[:5], best[:5], photos[:5] = [0.5, 0.5, 0.9, 0.2, 0.5], [0.9, 0.9, 0.95, 0.5, 0.9], [1, 3, 1, 0, 1]
+    measured = np.arange(count) != 4
+    zeros = np.zeros(count)
+    across = Matches(match, best, photos, np.full(count, 9), zeros, zeros, np.ones(count))
+    assert np.flatnonzero(_matched_elsewhere(across, measured)).tolist() == [0]
+    across.match[10:20], across.photos[10:20] = 0.5, 1
+    assert not _matched_elsewhere(across, measured).any()
+
+    obj, scene = sheet(-0.8, -0.2, 0.03), sheet(-0.8, 0.8, 0.06)
+    beyond = scene.points[:, 0] > 0.5
+    monkeypatch.setattr(evidence, "_matched_elsewhere", lambda *_: beyond)
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    assert ((found.reason == ELSEWHERE) == beyond).all()
+
+
+def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(near, far, monkeypatch):
+    obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
+    holed = obj.points[:, 0] > 0.1
+    monkeypatch.setattr(evidence, "compare", lambda *_: (np.ones(len(scene), dtype=bool), holed))
+    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    assert (found.reason[scene.points[:, 0] < 0.0] == REPLACED).all()
+    inside = (scene.points[:, 0] > 0.25) & (scene.points[:, 0] < 0.35) & (np.abs(scene.points[:, 1]) < 0.8)
+    assert inside.any() and (found.reason[inside] == KEPT).all()
 
 
 def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
@@ -219,8 +250,12 @@ def test_every_point_says_what_is_known_of_it(near, far):
     beyond = fused.scene.points[:, 0] > 5
     assert not fused.scene.fields["evidence"][beyond].any() and np.isnan(fused.scene.fields["deviation"][beyond]).all()
     report = evidence_report(fused, "m")
-    kept = value(report, "scene_measured") + value(report, "scene_stereo_only")
-    assert kept + sum(value(report, "scene_removed").values()) == value(report, "scene_checked") == len(fused.rows)
+    checked = value(report, "scene_checked")
+    assert value(report, "scene_measured") + value(report, "scene_stereo_only") == checked == len(fused.rows)
+    assert value(report, "scene_kept") + sum(value(report, "scene_removed").values()) == checked
+    assert value(report, "scene_kept_measured") <= value(report, "scene_measured")
+    photos = fused.added.fields["photos"]
+    assert value(report, "added_photos")["least"] == photos.min() and value(report, "object_measured_share") > 0.9
     measured = [f"object_{name}" for name in ("added", "better_in_scene", "measured_contradicted")]
     assert sum(value(report, name) for name in measured) == value(report, "object_measured")
     assert value(report, "object_measured") + value(report, "object_nerf_only") == value(report, "object_points")

@@ -99,6 +99,16 @@ def test_radii_follow_the_local_spacing():
     assert np.median(radii[len(dense) :]) == pytest.approx(16 / 39, rel=1e-4)
 
 
+def test_dense_points_that_come_in_leave_the_discs_of_a_sparse_scene_as_they_are():
+    sparse, dense = plane(0, RED, size=8.0, count=40), plane(0, RED, size=1.0, count=200)
+    around = sparse[np.abs(sparse.points[:, :2]).max(1) > 1.2]
+    points = np.concatenate([around.points, dense.points])
+    source = np.repeat(np.array([0, 1], np.uint8), [len(around), len(dense)])
+    discs = point_radii(points, source=source)
+    np.testing.assert_allclose(np.median(discs[: len(around)]), np.median(point_radii(sparse.points)), rtol=1e-4)
+    assert np.median(point_radii(points)[: len(around)]) < 0.5 * np.median(discs[: len(around)])
+
+
 @pytest.mark.parametrize("height", [0.3, 50.0])
 def test_a_stray_point_is_hardly_larger_than_those_of_the_surface(height):
     points = np.concatenate([plane(0, RED).points, [[0.0, 0.0, height]]])

@@ -144,7 +144,7 @@ def _planes(cells: NDArray[np.int64], cloud: Cloud) -> tuple[dict[str, Bytes], d
         red, green, blue = cloud.colors.T
         # Bytes wrap around; differences to green compress better than red and blue do.
         planes |= {"green": green, "red_less_green": red - green, "blue_less_green": blue - green}
-    radii = _radii(cloud.points, cloud.fields["shown"])
+    radii = _radii(cloud)
     planes["radius_before"], planes["radius_after"], about["radius"] = _log_bytes(radii)
     planes["shade"] = np.rint(LEVELS * _shade(cloud)).astype(np.uint8)
     planes |= {name: cloud.fields[name].astype(np.uint8) for name in ("source", "evidence") if name in cloud.fields}
@@ -170,11 +170,13 @@ def _difference_planes(name: str, column: NDArray[np.int64]) -> dict[str, Bytes]
     return {f"{name}_low": (folded & 255).astype(np.uint8), f"{name}_high": (folded >> 8).astype(np.uint8)}
 
 
-def _radii(points: Array, shown: Bytes) -> NDArray[np.float32]:
+def _radii(cloud: Cloud) -> NDArray[np.float32]:
     """(2, N) disc radii before and after, from the spacing of what is shown with a point; 0 where it is not shown."""
-    radii = np.zeros((2, len(points)), dtype=np.float32)
+    radii = np.zeros((2, len(cloud)), dtype=np.float32)
     for row, absent in zip(radii, (AFTER, BEFORE)):
-        row[shown != absent] = point_radii(points[shown != absent], factor=_RADIUS)
+        shown = cloud.fields["shown"] != absent
+        part = cloud[shown]
+        row[shown] = point_radii(part.points, factor=_RADIUS, source=part.fields.get("source"))
     return radii
 
 
