@@ -38,9 +38,11 @@ SHARE_THROUGH = 0.3
 good points in some photos; a point that is not there has surfaces behind it in many."""
 MOST_CONFIRM = 0.5
 """A measured point of the scene that more than this share of the photos asked confirm is not seen through."""
+CERTAIN_STEPS = 0.5
+"""Of a step along the ray (about a pixel), the most that the object's pose may be off for its photos to say that they
+match a single point of the scene elsewhere."""
 MOST_ELSEWHERE = 0.1
-"""Share of what the scene measured that the object's photos may match elsewhere: where it is more, the object's pose is
-off by pixels, and the photos say nothing of single points."""
+"""Share of what the scene measured of which they may say so: where it is more, the pose is off after all."""
 LEAST_VIEWS = 3
 """Photos that must have a point in their picture for it to count as enclosed."""
 SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
@@ -137,7 +139,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
-    elsewhere = _matched_elsewhere(across, of_scene.measured)
+    elsewhere = _matched_elsewhere(across, of_scene.measured, np.inf if certain is None else certain * diagonal)
     reason[elsewhere & (reason == KEPT)] = ELSEWHERE
     reason[is_seen_through(seen, sure, on_scene)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
@@ -267,14 +269,14 @@ def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.boo
     return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
 
 
-def _matched_elsewhere(across: Matches, measured: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _matched_elsewhere(across: Matches, measured: NDArray[np.bool_], off: float) -> NDArray[np.bool_]:
     """(N,) points that the scene's photos measured, but the object's match clearly better elsewhere along the ray and
-    confirm less than three times; none where that is said of many: then the object's pose is off."""
-    found = (
-        measured & (across.photos < LEAST_PHOTOS) & (across.best >= MIN_MATCH) & (across.best - across.match > SLACK)
-    )
-    confirmed = measured & across.measured
-    return found if found.sum() <= MOST_ELSEWHERE * (found | confirmed).sum() else np.zeros_like(found)
+    confirm less than three times; none where the pose is uncertain, or off: it may be `off` (unit of the points)."""
+    better = (across.best >= MIN_MATCH) & (across.best - across.match > SLACK)
+    found = measured & better & (across.photos < LEAST_PHOTOS)
+    both = found | (measured & across.measured)
+    sure = both.any() and off <= CERTAIN_STEPS * np.median(across.step[both])
+    return found if sure and found.sum() <= MOST_ELSEWHERE * both.sum() else np.zeros_like(found)
 
 
 def _alone(points: Array, others: Cloud, reach: float) -> NDArray[np.bool_]:
