@@ -13,8 +13,9 @@ from support.photographed_plane import photographs
 from scenefuse.masks.clicked.carry import carry, one_photo
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
+from scenefuse.masks.clicked.parts import with_parts
 from scenefuse.masks.clicked.space import Space
-from scenefuse.masks.clicked.votes import voter_of
+from scenefuse.masks.clicked.votes import Voter, known_points, voter_of
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.prompted import masks_from_prompts
@@ -189,6 +190,33 @@ def test_a_part_that_the_network_prefers_to_leave_out_is_asked_for_alone(photos)
     for inside, outside in (([MIDDLE, (100, 20)], [(101, 21), (99, 19)]), ([MIDDLE, (5, 5)], [])):
         mask, _, _, notes = one_photo(ask_for_the_clearest, view, clicks(inside, outside), 2)
         assert (mask == true_mask(view)).all() and "click inside" in notes[0]
+
+
+def test_what_the_objects_points_enclose_is_asked_about_and_never_said_to_be_outside():
+    points = np.concatenate([np.random.default_rng(0).uniform(-1, 1, (300, 3)), [[0, 0, 0.1], [0.1, 0, 0], [5, 5, 5]]])
+    photos = Workspace(Path(), [], points, [], [])
+    empty = np.zeros((HEIGHT, WIDTH), dtype=bool)
+
+    def known(foreign):
+        rows, inside = np.arange(302), np.arange(302) < foreign
+        voters = [Voter(empty, 0.9, 1.0, np.append(rows, 302), np.append(inside, False), PhotoClicks(NONE, NONE[:, 0]))]
+        return known_points(photos, dict(enumerate(voters)))
+
+    kind, enclosed = known(300)
+    assert (
+        (kind[:300] == 1).all() and kind[300:].tolist() == [0, 0, -1] and enclosed[300:].tolist() == [True, True, False]
+    )
+    # Where many lie among the object's, a mask took in what is around them.
+    kind, enclosed = known(200)
+    assert (kind[200:] == -1).all() and not enclosed.any()
+
+
+def test_a_part_that_the_objects_points_enclose_is_added(photos):
+    view, inside = photos.views[0], np.array([MIDDLE])
+    at = np.argwhere(hat(view))[::20, ::-1] + 0.5
+    for enclosed, whole in ((at, true_mask(view) | hat(view)), (at[:2], true_mask(view))):
+        found = with_parts(ask_for_the_clearest, view, true_mask(view), (inside, NONE), (NONE, NONE), enclosed, 2)
+        assert (found == whole).all()
 
 
 def test_a_click_that_missed_the_outline_is_no_part(photos):

@@ -14,9 +14,11 @@ from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
     LEAST_QUALITY,
     SURE,
+    Known,
     Voter,
     agreement_of,
     known_pixels,
+    known_points,
     shares_of,
     voter_of,
 )
@@ -132,15 +134,15 @@ def _make(
 ) -> tuple[Voter, list[str]]:
     """A photo's mask from its clicks, the others' votes and the space that they leave; and the clicks left out as they
     contradict it."""
-    inside, outside = known_pixels(photos, k, others)
+    known = known_pixels(photos, k, others)
     keep, view = np.ones(len(clicks.pixels), dtype=bool), photos.views[k]
     notes: list[str] = []
     voter = voter_of(photos, k, np.zeros((view.height, view.width), dtype=bool), 0.0, 0.0, NO_CLICKS)
     for _ in range(2):
         kept = clicks.only(keep)
-        if len(inside) < LEAST_KNOWN and not kept.prompt:
+        if len(known.inside) < LEAST_KNOWN and not kept.prompt:
             break
-        found = _asked(ask, view, (kept.on, inside), (kept.off, outside), clicks.box, tolerance_px, space)
+        found = _asked(ask, view, kept, known, clicks.box, tolerance_px, space)
         voter = voter_of(photos, k, *found, kept)
         wrong = keep & ~_agreeing(voter.mask, clicks, tolerance_px)
         if not wrong.any():
@@ -165,9 +167,9 @@ def _extended(
     ask: Ask, photos: Workspace, k: int, voter: Voter, others: dict[int, Voter], tolerance_px: float
 ) -> Voter:
     """A photo's mask with the parts that it lacks by the votes of all others."""
-    known_on, known_off = known_pixels(photos, k, others)
-    inside, outside = (voter.clicks.on, known_on), (voter.clicks.off, known_off)
-    mask = with_parts(ask, photos.views[k], voter.mask, inside, outside, tolerance_px)
+    known = known_pixels(photos, k, others)
+    inside, outside = (voter.clicks.on, known.inside), (voter.clicks.off, known.outside)
+    mask = with_parts(ask, photos.views[k], voter.mask, inside, outside, known.enclosed, tolerance_px)
     if (mask == voter.mask).all():
         return voter
     print(f"{photos.views[k].name}: {mask.sum() / voter.mask.sum() - 1:.1%} added", flush=True)
@@ -177,8 +179,8 @@ def _extended(
 def _asked(
     ask: Ask,
     view: View,
-    inside: tuple[Array, Array],
-    outside: tuple[Array, Array],
+    clicks: PhotoClicks,
+    known: Known,
     box: Array | None,
     tolerance_px: float,
     space: Left | None,
@@ -188,6 +190,7 @@ def _asked(
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and what comes of it
     is taken if it agrees as well, fills the space better and is not beyond it; but not for another seam alone.
     """
+    inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
     best = max(found, key=lambda one: one.score)
     if space is not None and box is None:
@@ -196,7 +199,7 @@ def _asked(
             [best, *more], key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask)
         )
         best = other if mask_iou(other.mask, best.mask) < SAME else best
-    mask = with_parts(ask, view, best.mask, inside, outside, tolerance_px)
+    mask = with_parts(ask, view, best.mask, inside, outside, known.enclosed, tolerance_px)
     return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
 
 
@@ -247,9 +250,8 @@ def _carried(photos: Workspace, made: dict[int, Voter], left_out: list[str]) -> 
                 f"the mask from the clicks has quality {made[k].quality:.2f} (least {LEAST_QUALITY}) and agrees with"
                 f" {made[k].agreement:.2f} of its prompts (least {LEAST_AGREEMENT})"
             )
-    shares = shares_of(photos, made)
     counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
-    kind = np.where(shares >= SURE, 1, np.where(shares <= 1 - SURE, -1, 0)).astype(np.int8)
+    kind, _ = known_points(photos, made)
     kind[counts < 3] = 0
     return Carried(
         masks, reasons, kind, left_out, {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}

@@ -32,19 +32,26 @@ what comes of that, if anything, is told by itself."""
 
 
 def with_parts(
-    ask: Ask, view: View, mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float
+    ask: Ask,
+    view: View,
+    mask: Mask,
+    inside: tuple[Array, Array],
+    outside: tuple[Array, Array],
+    enclosed: Array,
+    tolerance_px: float,
 ) -> Mask:
     """A mask with the parts that it lacks: of several things that prompt it, a network takes the clearest.
 
     Each group of pixels inside that the mask does not hold, near each other, prompts alone. What it gives is a part of
     the object if it holds them, few pixels known to be outside beside those known to be inside, and is no larger than
-    the mask.
+    the mask. Pixels of points that the object's enclose, (N, 2), are asked about likewise.
     """
     whole = mask
     if agrees(mask, inside, outside, tolerance_px) < PART_AGREEMENT:
         return whole
     missed_px = max(tolerance_px, NEAR_MISS * max(mask.shape))
-    lacking = inside[0][~held(mask, inside[0], missed_px)], inside[1][~held(mask, inside[1], 0)]
+    perhaps = np.concatenate([inside[1], enclosed])
+    lacking = inside[0][~held(mask, inside[0], missed_px)], perhaps[~held(mask, perhaps, 0)]
     for group in _groups(*lacking, PART_GAP * max(mask.shape)):
         on = np.concatenate(group)
         # What is clicked in a photo beats what other photos say of it.
@@ -55,7 +62,7 @@ def with_parts(
         masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None, None)
         for row in np.argsort(-quality):
             part = prompted_parts(cleaned(masks[row], view.pixels), on, off)
-            own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate(inside), off))
+            own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate([inside[0], perhaps]), off))
             holds = part.any() and share_in(part, on, 1.0) >= SURE
             if quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign) and part.sum() <= mask.sum():
                 whole = whole | part

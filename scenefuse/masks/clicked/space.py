@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.masks.clicked.votes import SURE, Voter, shares_of
+from scenefuse.masks.clicked.votes import SURE, Voter, central, shares_of
 from scenefuse.masks.grabcut import fill_hull
 from scenefuse.mvs.visual_hull import Box, Hull, Mask, Outline, count_silhouettes, mask_iou, silhouette
 from scenefuse.transforms import Array
@@ -23,8 +23,6 @@ DRAWN_PX = 480
 REACH = 0.5
 """Growth of the grid beyond the points known to be the object's on each side, as a share of their diagonal: parts
 without texture have none."""
-OUTERMOST = 1.0
-"""Percentage of these points that are taken for mismatched at each side, where there are a hundred."""
 LEAST_POINTS = 4
 """Points that a grid surrounds."""
 LEAST_VOTERS = 3
@@ -109,10 +107,7 @@ class Space:
             return True
         own = self._photos.points[shares_of(self._photos, voters) >= SURE]
         placed = [voter.clicks.placed for voter in voters.values()]
-        if len(own):
-            low = np.percentile(own, OUTERMOST, axis=0, method="lower")
-            high = np.percentile(own, 100 - OUTERMOST, axis=0, method="higher")
-            placed.append(own[((own >= low) & (own <= high)).all(1)])
+        placed.append(central(own))
         points = np.concatenate([np.zeros((0, 3)), *placed])
         grow = REACH * float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) >= LEAST_POINTS else 0.0
         if grow == 0.0:

@@ -1,11 +1,14 @@
 """What the masks of photos say of the sparse points, and so of each other."""
 
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import QhullError, cKDTree
 
+from scenefuse.masks.box import in_hull
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.pixels import distance_to, pixel_of, share_in
 from scenefuse.mvs.visual_hull import Mask
@@ -22,6 +25,14 @@ SURE = 0.8
 NEIGHBOURS = 7
 """A known point prompts where most of so many known points around it in the photo say the same: it may be mismatched,
 and it is hidden points' neighbours that differ."""
+OUTERMOST = 1.0
+"""Percentage of the points known to be the object's that are taken for mismatched at each side, where there are a
+hundred."""
+LEAST_SPANNING = 8
+"""Of these points span the object."""
+MOST_FOREIGN = 0.1
+"""Points voted off the object in the hull of its own, for each of these, from which the hull is not its own: a mask took
+in the ground."""
 EDGE = 0.003
 """Half width of the band along a mask's outline in which no point votes, as a share of the photo's longer side."""
 
@@ -71,12 +82,48 @@ def shares_of(photos: Workspace, made: dict[int, Voter]) -> Array:
         return votes / total
 
 
-def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> tuple[Array, Array]:
-    """Pixels (N, 2) of a photo's points on the object and (M, 2) of those off it, by the votes of the others; those
-    clicked in the others, where this photo has them in its frame: what hides them is mostly the object."""
-    share = shares_of(photos, others)[photos.seen[k]]
-    known = (share >= SURE) | (share <= 1 - SURE)
-    pixels, own = photos.seen_at[k][known], share[known] >= SURE
+def central(points: Array) -> Array:
+    """Of (N, 3) points of the object those that are not the OUTERMOST along an axis."""
+    if not len(points):
+        return points
+    low = np.percentile(points, OUTERMOST, axis=0, method="lower")
+    high = np.percentile(points, 100 - OUTERMOST, axis=0, method="higher")
+    return points[((points >= low) & (points <= high)).all(1)]
+
+
+def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
+    """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others; and (P,) those
+    of the others that the object's enclose.
+
+    In the convex hull of the object's points no mask says that a point is not on it: a first mask that lacks a part (a
+    wall in the shade) would have all others asked to leave it out.
+    """
+    share = shares_of(photos, made)
+    known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
+    own, enclosed = central(photos.points[known > 0]), np.zeros(len(known), dtype=bool)
+    if len(own) >= LEAST_SPANNING:
+        with suppress(QhullError):  # of points in a plane, which enclose nothing
+            inner = in_hull(photos.points, own)
+            enclosed = (known <= 0) & inner
+            if (inner & (known < 0)).sum() > MOST_FOREIGN * (inner & (known > 0)).sum():
+                enclosed[:] = False
+    known[enclosed] = 0
+    return known, enclosed
+
+
+class Known(NamedTuple):
+    """Pixels of a photo's points on the object (N, 2), off it (M, 2), and of those that are perhaps a part of it."""
+
+    inside: Array
+    outside: Array
+    enclosed: Array
+
+
+def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Known:
+    """What the votes of the others say of a photo's points; those clicked in the others are inside where this photo has
+    them in its frame: what hides them is mostly the object."""
+    kind, enclosed = (values[photos.seen[k]] for values in known_points(photos, others))
+    pixels, own = photos.seen_at[k][kind != 0], kind[kind != 0] > 0
     if len(pixels) > NEIGHBOURS:
         near = cKDTree(pixels).query(pixels, NEIGHBOURS + 1)[1][:, 1:]
         agree = (own[near] == own[:, None]).mean(1) > 0.5
@@ -84,10 +131,10 @@ def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> tuple[A
     view, clicked = photos.views[k], [voter.clicks.placed for voter in others.values() if voter.votes]
     points = np.concatenate([np.zeros((0, 3)), *clicked])
     shown = view.project(points[view.visible(points)[0]])[0]
-    return np.concatenate([shown, pixels[own]]), pixels[~own]
+    return Known(np.concatenate([shown, pixels[own]]), pixels[~own], photos.seen_at[k][enclosed])
 
 
 def agreement_of(photos: Workspace, k: int, mask: Mask, others: dict[int, Voter]) -> float:
     """How well a mask agrees with the votes of the others, at most 1; 1 where these know nothing of its photo."""
-    inside, outside = known_pixels(photos, k, others)
+    inside, outside, _ = known_pixels(photos, k, others)
     return share_in(mask, inside, 1.0) - share_in(mask, outside, 0.0)
