@@ -37,10 +37,10 @@ class CompletionInputs:
 def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: Path, report: Path) -> None:
     """Put into the scene what every object adds, and leave out what any takes away (method F3).
 
-    The scene is read and written part by part, so that memory does not grow with it. Where objects overlap, a later
-    one's points that lie on an earlier one's are left out. The field `source` is 0 on the scene's points and the
-    object's place among the scene's objects, counted from 1, on what it added; the others keep their number when one
-    fails.
+    The scene is read and written part by part, so that memory does not grow with it. Where objects overlap, the points
+    of the less exactly measured one that lie on the other's are left out. The field `source` is 0 on the scene's points
+    and the object's place among the scene's objects, counted from 1, on what it added; the others keep their number
+    when one fails.
 
     Args:
         inputs: see CompletionInputs.
@@ -65,9 +65,11 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
             unregistered[folder.name] = value(fusion, "reason")
             continue
         changes.append(read_changes(folder / "checked.ply"))
-        mine = with_source(_apart(added_by(folder / "fused.ply"), added), number)
-        added.append(mine)
-        print(f"{folder.name}: {len(mine)} points", flush=True)
+        added.append(with_source(added_by(folder / "fused.ply"), number))
+    added = without_overlaps(added)
+    for cloud in added:
+        if len(cloud):
+            print(f"{inputs.objects[cloud.fields['source'][0] - 1].name}: {len(cloud)} points", flush=True)
     frame = None if inputs.georeference_json is None else scene_frame(read_json(inputs.georeference_json))
     counts = _write(scene, merged(changes), added, frame, completed, completed_laz)
     content = _report(counts, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
@@ -120,6 +122,22 @@ def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
         colors=None if like.colors is None else cloud.colors,
         fields={name: cloud.fields[name] for name in like.fields},
     )
+
+
+def without_overlaps(clouds: list[Cloud]) -> list[Cloud]:
+    """The clouds, each without its points on one that is measured more exactly, by the median standard deviation."""
+    order = sorted(range(len(clouds)), key=lambda k: _deviation(clouds[k]))
+    left = list(clouds)
+    for place, k in enumerate(order):
+        left[k] = _apart(clouds[k], [left[before] for before in order[:place]])
+    return left
+
+
+def _deviation(cloud: Cloud) -> float:
+    """Median standard deviation of the points for which one is known."""
+    known = cloud.fields.get("deviation", np.zeros(0))
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else np.inf
 
 
 def _apart(cloud: Cloud, before: list[Cloud]) -> Cloud:

@@ -28,6 +28,7 @@ from scenefuse.fusion.evidence import (
 from scenefuse.fusion.modes import (
     FEATHER_SPACINGS,
     FILL_SPACINGS,
+    GAINS,
     NEAR_SPACINGS,
     FusionSettings,
     feathered,
@@ -154,6 +155,12 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         notes.append("the object has no colours: its points are grey in the scene")
         grey = np.full((len(fused.added), 3), GREY, np.uint8)
         fused = replace(fused, added=replace(fused.added, colors=grey))
+    if np.isin(fused.gain, GAINS).any():
+        notes.append(
+            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
+            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
+            " fusion.match_colors: false leaves them as they are"
+        )
     for note in notes:
         print(note, flush=True)
     _write(fused, rows, crop_json, outputs)

@@ -13,6 +13,8 @@ from scenefuse.transforms import Array, Sim3
 
 FILL_SPACINGS = 1.5
 """Points farther than so many spacings of the scene from all of its points are new to it."""
+GAINS = (0.5, 2.0)
+"""Least and largest gain of an object's colours."""
 FILL_RESIDUALS = 1.5
 """Points are new at no less than this many median distances between the clouds where both exist, so that noise does not
 add a second layer."""
@@ -114,7 +116,7 @@ def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Arr
     middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
     wide_a = np.abs(mine - middle_a).mean(0)
     wide_b = np.abs(theirs - middle_b).mean(0)
-    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), 0.5, 2.0)
+    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), *GAINS)
     return gain, middle_b - gain * middle_a
 
 

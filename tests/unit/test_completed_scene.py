@@ -5,7 +5,7 @@ from dataclasses import replace
 import laspy
 import numpy as np
 
-from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
+from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene, without_overlaps
 from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
@@ -91,6 +91,17 @@ def test_what_two_objects_share_is_added_once(tmp_path):
     assert value(report, "added_points")["first"] > 100 and value(report, "added_points")["second"] == 0
 
 
+def test_where_objects_overlap_the_more_exactly_measured_one_stays():
+    def measured(deviation, low, high):
+        cloud = strip(low, high)
+        return replace(cloud, fields={"deviation": np.full(len(cloud), deviation, np.float32)})
+
+    coarse, fine, unknown = measured(0.1, 0, 3), measured(0.01, 2, 5), measured(np.nan, 4, 7)
+    left = without_overlaps([coarse, unknown, fine])
+    assert len(left[2]) == len(fine)
+    assert left[0].points[:, 0].max() < 1.95 and left[1].points[:, 0].min() > 4.95
+
+
 def test_replace_takes_the_scene_away_and_counts_it(tmp_path):
     scene = strip(0, 20)
     whole, report = run(tmp_path, scene, {"left": strip(0, 3), "right": strip(10, 13)}, mode="replace")
@@ -98,6 +109,14 @@ def test_replace_takes_the_scene_away_and_counts_it(tmp_path):
     assert value(report, "removed_points") == len(scene) - len(left) > 0
     for low, high in ((0, 2.5), (10.5, 12.5)):
         assert not ((left[:, 0] > low) & (left[:, 0] < high)).any()
+
+
+def test_colours_that_are_changed_by_the_most_that_is_done_are_named(tmp_path):
+    scene, obj = strip(0, 20), strip(0.03, 3, 0.04)
+    run(tmp_path, scene, {"like": obj})
+    assert not any("match_colors" in note for note in value(read_json(tmp_path / "like/fusion.json"), "notes"))
+    run(tmp_path, replace(scene, colors=(100 + scene.colors // 8).astype(np.uint8)), {"vivid": obj})
+    assert any("match_colors: false" in note for note in value(read_json(tmp_path / "vivid/fusion.json"), "notes"))
 
 
 def test_an_unregistered_object_is_named_and_changes_nothing(tmp_path):

@@ -246,6 +246,7 @@ def test_a_phone_shows_turns_and_measures_without_scrolling_sideways(page):
     with chromium(phone=True) as phone:
         phone.open(page)
         ready(phone)
+        phone.value("const n = document.querySelector('nav'); n.innerHTML += Array(6).fill(n.innerHTML).join('');")
         assert phone.value("return [innerWidth, document.documentElement.scrollWidth];") == [390, 390]
         boxes = phone.value(
             "return [...document.querySelectorAll(given[0])].map((b) => b.getBoundingClientRect().toJSON());",

@@ -31,8 +31,8 @@ hundred."""
 LEAST_SPANNING = 8
 """Of these points span the object."""
 MOST_FOREIGN = 0.1
-"""Points voted off the object in the hull of its own, for each of these, from which the hull is not its own: a mask took
-in the ground."""
+"""Points voted off the object in the hull of its own, for each of these, from which on a mask must have taken in what
+is around it."""
 EDGE = 0.003
 """Half width of the band along a mask's outline in which no point votes, as a share of the photo's longer side."""
 
