@@ -197,16 +197,17 @@ def test_what_the_objects_points_enclose_is_asked_about_and_never_said_to_be_out
     photos = Workspace(Path(), [], points, [], [])
     empty = np.zeros((HEIGHT, WIDTH), dtype=bool)
 
-    def known(foreign):
+    def known(foreign, votes=2):
         rows, inside = np.arange(302), np.arange(302) < foreign
-        voters = [Voter(empty, 0.9, 1.0, np.append(rows, 302), np.append(inside, False), PhotoClicks(NONE, NONE[:, 0]))]
-        return known_points(photos, dict(enumerate(voters)))
+        voter = Voter(empty, 0.9, 1.0, np.append(rows, 302), np.append(inside, False), PhotoClicks(NONE, NONE[:, 0]))
+        return known_points(photos, dict.fromkeys(range(votes), voter))
 
     kind, enclosed = known(300)
     assert (
         (kind[:300] == 1).all() and kind[300:].tolist() == [0, 0, -1] and enclosed[300:].tolist() == [True, True, False]
     )
-    # Where many lie among the object's, a mask took in what is around them.
+    # By a single mask nothing is known, and where many lie among the object's, masks took in what is around them.
+    assert not known(300, votes=1)[1].any()
     kind, enclosed = known(200)
     assert (kind[200:] == -1).all() and not enclosed.any()
 

@@ -28,8 +28,8 @@ and it is hidden points' neighbours that differ."""
 OUTERMOST = 1.0
 """Percentage of the points known to be the object's that are taken for mismatched at each side, where there are a
 hundred."""
-LEAST_SPANNING = 8
-"""Of these points span the object."""
+LEAST_SPANNING, SPANNING_VOTES = 8, 2
+"""So many of these points, on which so many photos vote, span the object: a single mask may hold what is around it."""
 MOST_FOREIGN = 0.1
 """Points voted off the object in the hull of its own, for each of these, from which on a mask must have taken in what
 is around it."""
@@ -100,7 +100,10 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     """
     share = shares_of(photos, made)
     known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
-    own, enclosed = central(photos.points[known > 0]), np.zeros(len(known), dtype=bool)
+    rows = [voter.rows for voter in made.values() if voter.votes]
+    counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
+    own = central(photos.points[(known > 0) & (counts >= SPANNING_VOTES)])
+    enclosed = np.zeros(len(known), dtype=bool)
     if len(own) >= LEAST_SPANNING:
         with suppress(QhullError):  # of points in a plane, which enclose nothing
             inner = in_hull(photos.points, own)
