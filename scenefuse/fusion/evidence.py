@@ -139,7 +139,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     seen = _seen(scene.cloud.points, surface, obj, scene, diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= LEAST_VIEWS)] = ENCLOSED
-    elsewhere = _matched_elsewhere(across, of_scene.measured, np.inf if certain is None else certain * diagonal)
+    elsewhere = matched_elsewhere(across, of_scene.measured, np.inf if certain is None else certain * diagonal)
     reason[elsewhere & (reason == KEPT)] = ELSEWHERE
     reason[is_seen_through(seen, sure, on_scene)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
@@ -269,7 +269,7 @@ def is_seen_through(seen: Visibility, matches: Matches, measured: NDArray[np.boo
     return np.asarray(seen.through >= np.maximum(LEAST_THROUGH, least))
 
 
-def _matched_elsewhere(across: Matches, measured: NDArray[np.bool_], off: float) -> NDArray[np.bool_]:
+def matched_elsewhere(across: Matches, measured: NDArray[np.bool_], off: float) -> NDArray[np.bool_]:
     """(N,) points that the scene's photos measured, but the object's match clearly better elsewhere along the ray and
     confirm less than three times; none where the pose is uncertain, or off: it may be `off` (unit of the points)."""
     better = (across.best >= MIN_MATCH) & (across.best - across.match > SLACK)

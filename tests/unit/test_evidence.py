@@ -18,8 +18,8 @@ from scenefuse.fusion.evidence import (
     SEEN_THROUGH,
     STEREO_ONLY,
     Side,
-    _matched_elsewhere,
     is_seen_through,
+    matched_elsewhere,
     weigh,
     with_pose_uncertainty,
 )
@@ -110,14 +110,14 @@ def test_what_close_ups_match_elsewhere_goes_unless_that_is_said_of_many(near, f
     measured = np.arange(count) != 4
     zeros = np.zeros(count)
     across = Matches(match, best, photos, np.full(count, 9), zeros, zeros, np.ones(count))
-    assert np.flatnonzero(_matched_elsewhere(across, measured, 0.4)).tolist() == [0]
-    assert not _matched_elsewhere(across, measured, 0.6).any()
+    assert np.flatnonzero(matched_elsewhere(across, measured, 0.4)).tolist() == [0]
+    assert not matched_elsewhere(across, measured, 0.6).any()
     across.match[10:20], across.photos[10:20] = 0.5, 1
-    assert not _matched_elsewhere(across, measured, 0.4).any()
+    assert not matched_elsewhere(across, measured, 0.4).any()
 
     obj, scene = sheet(-0.8, -0.2, 0.03), sheet(-0.8, 0.8, 0.06)
     beyond = scene.points[:, 0] > 0.5
-    monkeypatch.setattr(evidence, "_matched_elsewhere", lambda *_: beyond)
+    monkeypatch.setattr(evidence, "matched_elsewhere", lambda *_: beyond)
     found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
     assert ((found.reason == ELSEWHERE) == beyond).all()
 
