@@ -45,6 +45,17 @@ def _split(fields: Fields) -> Iterator[str]:
         )
 
 
+def _misplaced(fields: Fields) -> Iterator[str]:
+    """Photos whose matches the model does not explain."""
+    doubtful = find(fields, "sparse.doubtful_photos") or {}
+    if doubtful:
+        yield (
+            f"photos that may stand in wrong places ({len(doubtful)}): {named(sorted(doubtful))}; the model does not"
+            " explain their matches with others. Look at their masks, photograph the steps between them and the others,"
+            " or leave them out"
+        )
+
+
 def _one_side(fields: Fields) -> Iterator[str]:
     """A side from which there is no photo."""
     gap, between = find(fields, "undistorted.largest_gap_deg"), find(fields, "undistorted.gap_between")
@@ -96,4 +107,4 @@ def _unlinked(fields: Fields) -> Iterator[str]:
         )
 
 
-CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _one_side, _masks, _exposed, _unlinked)
+CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _misplaced, _one_side, _masks, _exposed, _unlinked)

@@ -20,10 +20,12 @@ from scenefuse.sfm.bundle.adjustment import (
     adjust,
     drop_outliers,
 )
+from scenefuse.sfm.bundle.explained import STRONG_PAIR, doubtful_photos, explained_matches
 from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
 from scenefuse.sfm.frames import original_sizes
 from scenefuse.sfm.given.cameras import triangulated
 from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.matches import MIN_INLIERS
 from scenefuse.sfm.photos import read_photos
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.stage import (
@@ -39,6 +41,10 @@ from scenefuse.stage import (
 
 # Fewest matches of the first pair of photos; COLMAP's own.
 INIT_MIN_INLIERS = 100
+# A second mapping that explains this share of the matches that the first explains is the better one: less is chance.
+AS_MANY = 0.999
+# Mappings are tried with so many seeds while photos seem to stand in wrong places.
+ATTEMPTS = 3
 # The smallest model that has a shape.
 MIN_PHOTOS = 3
 
@@ -122,20 +128,48 @@ def _mapped(
     settings: MappingSettings,
     seed: int,
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
-    """The model of photos by name, and what it is, as quantities."""
-    ranked = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
+    """The model of photos by name, and what it is, as quantities: of a few attempts the one that explains most matches.
+
+    One attempt is enough where no photo is doubtful.
+    """
+    attempts: list[tuple[int, pycolmap.Reconstruction, dict[str, Any]]] = []
+    for attempt in range(ATTEMPTS):
+        model, content = _attempt(names, folder, database, sparse, calibrated, settings, seed + attempt)
+        found = explained_matches(model, database)
+        doubtful = doubtful_photos(model, found)
+        content["doubtful_photos"] = quantity(doubtful, "1")
+        content["notes"] = quantity([_doubt(doubtful)] if doubtful else [], "")
+        attempts.append((found.total, model, content))
+        if not doubtful:
+            break
+        print(f"attempt {attempt + 1} of {ATTEMPTS}: {_doubt(doubtful)}", flush=True)
+    _, model, content = max(attempts, key=lambda attempt: attempt[0])
+    return model, content | {"attempts": quantity(len(attempts), "1")}
+
+
+def _attempt(
+    names: list[str],
+    folder: Path,
+    database: Path,
+    sparse: Path,
+    calibrated: bool,
+    settings: MappingSettings,
+    seed: int,
+) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
+    """The model that one seed gives, and what it is, as quantities."""
+    ranked, least_matches = _mapped_first(names, folder, database, sparse, calibrated, seed)
     _check_registered(ranked, names, settings.min_registered_share)
     before_px = ranked[0].compute_mean_reprojection_error()
     adjust(ranked[0], (KNOWN if calibrated else HELD).freedom, ROUGH_TOLERANCE)
     drop_outliers(ranked[0])
     choice = choose_lens(ranked[0], (KNOWN,) if calibrated else DISTORTED)
     model = choice.lens.fit(ranked[0], TOLERANCE)
-    notes: list[str] = []
+    mappings = 1
     if choice.lens not in (HELD, KNOWN):
-        again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed))
-        notes = [] if again else ["a second mapping with the calibrated lens registers fewer photos; the first is kept"]
-        ranked = again or ranked
-        model = choice.lens.fit(ranked[0], TOLERANCE)
+        again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed, least_matches))
+        second = choice.lens.fit(again[0], TOLERANCE) if again else None
+        if second is not None and _explained(second, database) >= AS_MANY * _explained(model, database):
+            ranked, model, mappings = again, second, 2
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(choice, model)
     print(
@@ -151,16 +185,42 @@ def _mapped(
         }
         for m in ranked[1:]
     ]
-    for note in notes:
-        print(f"note: {note}", flush=True)
     for entry in left_out:
         print(f"note: a separate model of {len(entry['photos'])} photos is left out", flush=True)
     return model, {
         **summary,
         "mean_reprojection_error_before_last_adjustment_px": quantity(before_px, "px"),
+        "mappings": quantity(mappings, "1"),
+        "least_matches_of_a_pair": quantity(least_matches, "1"),
         "models_left_out": quantity(left_out, ""),
-        "notes": quantity(notes, ""),
     }
+
+
+def _mapped_first(
+    names: list[str], folder: Path, database: Path, sparse: Path, calibrated: bool, seed: int
+) -> tuple[list[pycolmap.Reconstruction], int]:
+    """Models from strong pairs alone, or, where these explain more, from all that were verified; fewest matches used.
+
+    Pairs that chance verified put photos in wrong places; but some photos have no other pairs.
+    """
+    strong = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed, STRONG_PAIR))
+    if strong and strong[0].num_reg_images() == len(names):
+        return strong, STRONG_PAIR
+    every = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
+    if every and (not strong or _explained(every[0], database) > _explained(strong[0], database)):
+        return every, MIN_INLIERS
+    return strong, STRONG_PAIR
+
+
+def _explained(model: pycolmap.Reconstruction, database: Path) -> int:
+    """Verified matches that a model explains."""
+    return explained_matches(model, database).total
+
+
+def _doubt(doubtful: dict[str, float]) -> str:
+    """A sentence on photos that may stand wrong, by name, with the share of their matches that the model explains."""
+    shares = ", ".join(f"{name} {share:.2f}" for name, share in doubtful.items())
+    return f"photos that may stand in wrong places, with the share of their matches that the model explains: {shares}"
 
 
 def _taken(
@@ -194,7 +254,7 @@ def _mapped_again(
     sparse: Path,
     options: pycolmap.IncrementalPipelineOptions,
 ) -> list[pycolmap.Reconstruction]:
-    """The models of another mapping that begins with the calibration of this one; none where fewer photos come in.
+    """The models of another mapping that begins with the calibration of this one.
 
     A photo that the wrong lens put at a wrong place stays there in an adjustment; a new mapping puts it right.
     """
@@ -206,9 +266,7 @@ def _mapped_again(
                 known = pycolmap.Camera(camera.todict())
                 known.has_prior_focal_length = True
                 opened.update_camera(known)
-        again = _models(calibrated, folder, sparse, options)
-    fewer = not again or again[0].num_reg_images() < model.num_reg_images()
-    return [] if fewer else again
+        return _models(calibrated, folder, sparse, options)
 
 
 def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any]:
@@ -230,8 +288,11 @@ def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any
     }
 
 
-def _mapper_options(photos: int, calibrated: bool, seed: int) -> pycolmap.IncrementalPipelineOptions:
+def _mapper_options(
+    photos: int, calibrated: bool, seed: int, least_matches: int = MIN_INLIERS
+) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
+    options.min_num_matches = least_matches
     options.ba_refine_focal_length = options.ba_refine_extra_params = not calibrated
     options.num_threads = threads()
     options.random_seed = seed

@@ -11,6 +11,7 @@ from scenefuse.transforms import look_at
 GOOD = {
     "sparse.not_registered": [],
     "sparse.models_left_out": [],
+    "sparse.doubtful_photos": {},
     "undistorted.largest_gap_deg": 20.0,
     "undistorted.gap_between": ["a.jpg", "b.jpg"],
     "masks.photos": 40,
@@ -41,6 +42,7 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
             {"sparse__not_registered": ["x.jpg", "y.jpg"], "sparse__models_left_out": [{"photos": ["y.jpg", "z.jpg"]}]},
             ["not with the others (1): y.jpg", "placed (1): x.jpg"],
         ),
+        ({"sparse__doubtful_photos": {"b.jpg": 0.6, "a.jpg": 0.7}}, ["in wrong places (2): a.jpg, b.jpg"]),
         ({"undistorted__largest_gap_deg": 190.0}, ["within 190 degrees, between a.jpg and b.jpg"]),
         ({"masks__photos_left_out": [f"{k}.jpg" for k in range(9)]}, ["9 of 40 masks", "and 4 more"]),
         ({"masks__median_agreement": 0.6}, ["agree by 0.60 only"]),

@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from scenefuse.sfm.bundle.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.frames import FrameSettings, extract_frames
 from scenefuse.sfm.geodesy import LocalFrame
@@ -349,3 +350,57 @@ def test_too_few_registered_photos(tmp_path):
             seed=0,
         )
     assert not (tmp_path / "sparse").exists() and not (tmp_path / "sparse.json").exists()
+
+
+def small_capture(tmp_path, weak=None):
+    """A model of eight photos and its database, where the pairs of the photo of number `weak` have 20 matches each."""
+    pycolmap.set_random_seed(0)
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=8, num_cameras_per_rig=1, num_frames_per_rig=1)
+    options.num_points3D = 200
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        synthetic = pycolmap.synthesize_dataset(options, database)
+        for other in [i for i in synthetic.reg_image_ids() if weak not in (None, i)]:
+            geometry = database.read_two_view_geometry(*sorted((weak, other)))
+            geometry.inlier_matches = geometry.inlier_matches[20 * other : 20 * other + 20]
+            database.update_two_view_geometry(*sorted((weak, other)), geometry)
+    names = [i.name for i in synthetic.images.values()]
+    write_photos(tmp_path / "photos.json", [photo(n) for n in names], tmp_path, "photos", [])
+    return synthetic
+
+
+def mapped(tmp_path):
+    map_photos(
+        folder=tmp_path,
+        photos=tmp_path / "photos.json",
+        database=tmp_path / "database.db",
+        sparse=tmp_path / "sparse",
+        report=tmp_path / "sparse.json",
+        settings=MAPPING,
+        seed=0,
+    )
+    return read_json(tmp_path / "sparse.json")
+
+
+def test_a_photo_in_a_wrong_place_is_named(tmp_path):
+    model = small_capture(tmp_path)
+    right = explained_matches(model, tmp_path / "database.db")
+    assert right.total == right.matches.sum() > 0 and doubtful_photos(model, right) == {}
+    moved = model.images[3]
+    turned = pycolmap.Rotation3d(np.array([0, np.radians(10), 0]))
+    model.frames[moved.frame_id].set_cam_from_world(
+        moved.camera_id, pycolmap.Rigid3d(turned, np.zeros(3)) * moved.cam_from_world()
+    )
+    assert list(doubtful_photos(model, explained_matches(model, tmp_path / "database.db"))) == [moved.name]
+
+
+def test_photos_with_weak_pairs_only_come_in_by_all_of_them(tmp_path):
+    small_capture(tmp_path, weak=8)
+    report = mapped(tmp_path)
+    assert value(report, "registered") == 8 and value(report, "least_matches_of_a_pair") == 15
+
+
+def test_weak_pairs_are_not_used_where_strong_ones_do(tmp_path):
+    small_capture(tmp_path)
+    report = mapped(tmp_path)
+    assert value(report, "registered") == 8 and value(report, "least_matches_of_a_pair") == 30
+    assert value(report, "doubtful_photos") == {}
