@@ -1,6 +1,6 @@
 """A user's cloud or mesh in the place of photos: a scene's dense cloud, or an object's."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,7 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
         unit, name = unit_and_name(crs)
     origin = near_origin(own.sample)
     shift = Sim3(1.0, np.eye(3), origin)
-    content = write_placed(cloud, source, parts, own, shift.inverse(), unit)
+    content = write_placed(cloud, source, parts, own, lambda part: part.transformed(shift.inverse()), unit)
     write_json(report, content | {"backend": quantity(IMPORTED, "")})
     place = {
         "length_unit": quantity(unit, ""),
@@ -159,7 +159,9 @@ def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
         yield Cloud(cloud.points, normals, None if own.most_color is None else cloud.colors)
 
 
-def write_placed(cloud: Path, source: Path, parts: ColumnParts, own: Survey, pose: Sim3, unit: str) -> dict[str, Any]:
+def write_placed(
+    cloud: Path, source: Path, parts: ColumnParts, own: Survey, move: Callable[[Cloud], Cloud], unit: str
+) -> dict[str, Any]:
     """Write a file's points in another frame, tile by tile; the report of it.
 
     Args:
@@ -167,14 +169,14 @@ def write_placed(cloud: Path, source: Path, parts: ColumnParts, own: Survey, pos
         source: the file.
         parts: its columns.
         own: what `survey` says of it.
-        pose: frame_from_file.
+        move: from the file's frame into another.
         unit: of lengths in that frame.
     """
 
     def placed() -> Iterator[Cloud]:
-        return (part.transformed(pose) for part in clouds_in_parts(parts, own))
+        return map(move, clouds_in_parts(parts, own))
 
-    write_tiled(cloud, placed, own.count, pose.apply(own.sample))
+    write_tiled(cloud, placed, own.count, move(Cloud(own.sample)).points)
     tiles = open_cloud(cloud)
     diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
     return import_report(source, own, tiles.spacing(), diagonal, unit)

@@ -11,16 +11,19 @@ from numpy.typing import NDArray
 from scenefuse.sfm.bundle.adjustment import Freedom, drop_outliers
 from scenefuse.sfm.bundle.lens import LENSES
 from scenefuse.sfm.geodesy import local_frame
+from scenefuse.sfm.given.place import Place, read_place
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.sfm.survey.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.sfm.survey.control import Control, read_sighted
+from scenefuse.sfm.survey.crs import grid_name
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.sfm.survey.placement import (
     MIN_GPS_PHOTOS,
     UP,
     GeoreferenceSettings,
     GpsCameras,
+    Placement,
     beside_gps,
     place_by_control,
     place_by_gps,
@@ -29,6 +32,7 @@ from scenefuse.sfm.survey.placement import (
 )
 from scenefuse.sfm.survey.residuals import Georeference, georeference_report, residuals_of, write_residuals
 from scenefuse.stage import atomic_directory, quantity, read_json, value, write_json
+from scenefuse.transforms import box_corners, fit_sim3
 from scenefuse.workspace import posed_images, read_model
 
 Array = NDArray[np.float64]
@@ -50,11 +54,12 @@ def georegister(
 ) -> None:
     """Move a sparse model into east, north, up in metres by control points or its photos' GPS, and adjust it to them.
 
-    Without either it is turned upright, and in metres only by known lengths.
+    Given cameras that another program placed on the earth stay there, unless there are control points. Without any of
+    these the model is turned upright, and in metres only by known lengths.
 
     Args:
         sparse: COLMAP model.
-        sparse_json: JSON of the mapping stage, for the lens.
+        sparse_json: JSON of the mapping stage, for the lens, and for where given cameras lie.
         photos: JSON list of the photos with their GPS positions.
         control: control and check points with their clicks, an OpenDroneMap gcp_list.txt.
         lengths: known lengths between clicked points, `lengths.tsv`; beside control points or GPS only measured.
@@ -73,7 +78,11 @@ def georegister(
     gps = gps_cameras(names, centres, listed, settings.gps_accuracy_m)
     up, cue = estimate_up(rotations, centres)
     surveyed = None if control is None else read_sighted(control, model, listed)
-    found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
+    place = read_place(read_json(sparse_json))
+    if place is not None and surveyed is None:
+        found = placed_as_given(place, model, gps)
+    else:
+        found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
     sizes = {p.name: (p.width, p.height) for p in listed}
     if lengths is not None and not found.metric:
         known = read_lengths(lengths, model, sizes)
@@ -127,6 +136,28 @@ def georeference(
     return Georeference(upright(up, reason if settings.use_gps else "GPS is switched off"), None, gps)
 
 
+def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCameras) -> Georeference:
+    """How a model is placed whose cameras another program placed on the earth: as they are there.
+
+    Args:
+        place: of the given cameras.
+        model: them and their points.
+        gps: photos with positions, to compare; they move nothing.
+
+    Raises:
+        StageError: the cameras lie nowhere near the area of the project's CRS.
+    """
+    _, _, centres = camera_poses(model)
+    inside = np.concatenate([centres, np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)])
+    corners = box_corners(inside.min(0), inside.max(0))
+    there = place.wgs84(corners, "the given cameras")
+    frame = replace(local_frame(there), grid=grid_name(place.crs))
+    reason = f"where its cameras were given, in {place.crs.name}"
+    none = np.zeros(0, dtype=bool)
+    placement = Placement("georeferenced", reason, fit_sim3(corners, frame.apply(there)), none, "measured", False)
+    return Georeference(placement, frame, gps)
+
+
 def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, freedom: Freedom) -> dict[str, Any]:
     """Adjust a georeferenced model in place to control points and positions, where these fix it (method M11).
 
@@ -142,6 +173,8 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
     places = frame.apply(gps.positions[chosen]) - placement.gps_shift
     photos = SurveyedPhotos([n for n, c in zip(gps.names, chosen) if c], places, gps.sd_m[chosen])
     used = [s for s, u in zip(found.sightings, placement.used) if u]
+    if not (used or photos.names):
+        return {}
     points = SurveyedPoints(
         frame.apply(np.array([s.point.position for s in used]).reshape(-1, 3)),
         np.array([s.point.sd_m for s in used]).reshape(-1, 2),

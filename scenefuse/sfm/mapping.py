@@ -23,7 +23,7 @@ from scenefuse.sfm.bundle.adjustment import (
 from scenefuse.sfm.bundle.explained import STRONG_PAIR, doubtful_photos, explained_matches
 from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
 from scenefuse.sfm.frames import original_sizes
-from scenefuse.sfm.given.cameras import triangulated
+from scenefuse.sfm.given.cameras import place_of, triangulated
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.matches import MIN_INLIERS
 from scenefuse.sfm.photos import read_photos
@@ -234,7 +234,9 @@ def _taken(
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
     print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
     notes = [f"cameras are those of {cameras.name}, held"]
-    return model, summary | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
+    place = place_of(cameras)
+    on_earth = {} if place is None else place.report()
+    return model, summary | on_earth | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 
 
 def _models(

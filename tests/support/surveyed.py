@@ -11,9 +11,10 @@ from scipy.spatial.transform import Rotation
 from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.bundle.lens import HELD
 from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.sfm.given.place import Place
 from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.stage import quantity, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, box_corners, fit_sim3
 from scenefuse.workspace import View
 
 FRAME = LocalFrame(47.37, 8.55, 430.0)
@@ -130,3 +131,18 @@ def in_crs(place: Array, crs: str) -> tuple[float, float, float]:
     latitude, longitude, height = FRAME.inverse(place[None])[0]
     x, y = pyproj.Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(longitude, latitude)
     return x, y, height
+
+
+def on_earth(kind: str) -> Place:
+    """Where the flight's model lies on the earth, as programs say it: about its centre, or in UTM less an offset.
+
+    In the latter the model itself is in these coordinates.
+    """
+    crs = pyproj.CRS("EPSG:32632")
+    if kind == "offset":
+        return Place(Sim3(1.0, np.eye(3), np.array([466_000.0, 5_246_000.0, 0.0])), False, crs)
+    corners = box_corners(np.full(3, -100.0), np.full(3, 100.0))
+    latitude, longitude, height = FRAME.inverse(corners).T
+    to_geocentric = pyproj.Transformer.from_crs(4979, 4978, always_xy=True)
+    earth = np.stack(to_geocentric.transform(longitude, latitude, height), axis=1)
+    return Place(fit_sim3(MODEL_FROM_LOCAL.apply(corners), earth), True, crs)

@@ -1,16 +1,18 @@
 """Cameras of other programs in the place of mapping: written by the test, read back, and triangulated."""
 
 import json
+from html import escape
 
 import cv2
 import numpy as np
 import pycolmap
+import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
 
 from scenefuse.sfm.georeference import camera_poses
-from scenefuse.sfm.given.cameras import read_given
+from scenefuse.sfm.given.cameras import place_of, read_given
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.photos import write_photos
 from scenefuse.stage import StageError, read_json, value
@@ -93,7 +95,8 @@ def opensfm(folder, kind="perspective"):
 LENS = {"f": FOCAL, "cx": 0.0, "cy": 0.0}
 
 
-EARTH = "<reference>GEOGCS[&quot;WGS 84&quot;]</reference><transform><scale>3</scale></transform>"
+PLACED = "<transform><translation>4.2e6 6e5 4.75e6</translation><scale>3</scale></transform>"
+EARTH = f"<reference>{escape(pyproj.CRS(4326).to_wkt('WKT1_GDAL'))}</reference>{PLACED}"
 
 
 def metashape(folder, lens=LENS, placed=EARTH):
@@ -193,6 +196,33 @@ def test_cameras_of_metashape_lie_where_a_chunk_in_local_coordinates_was_placed(
             pose = view.world_from_cam
             np.testing.assert_allclose(photo.object_from_cam[:3, 3], 2.5 * turn @ pose[:3, 3] + [1, 2, 3], atol=1e-9)
             np.testing.assert_allclose(photo.object_from_cam[:3, :3], turn @ pose[:3, :3], atol=1e-9)
+
+
+def test_where_a_project_lies_on_the_earth_is_read(tmp_path):
+    """Metashape's chunk about the earth's centre, OpenDroneMap's cameras less an offset in the CRS."""
+    utm = pyproj.CRS(32632).to_wkt("WKT1_GDAL").replace("PRIMEM", "TOWGS84[0,0,0,0,0,0,0],PRIMEM", 1)
+    place = place_of(metashape(tmp_path, placed=f"<reference>{escape(utm)}</reference>{PLACED}"))
+    assert place.crs == pyproj.CRS(32632) and place.geocentric
+    to_geocentric = pyproj.Transformer.from_crs(32632, 4978, always_xy=True)
+    x_in_chunk = np.array([[10.0, 20.0, 30.0], [-5.0, 0.0, 2.0]])
+    earth = np.stack(to_geocentric.transform(*place.in_crs(x_in_chunk).T), axis=1)
+    np.testing.assert_allclose(earth, 3 * x_in_chunk + [4.2e6, 6e5, 4.75e6], atol=1e-3)
+    np.testing.assert_allclose(place.model_from(place.in_crs(x_in_chunk), place.crs), x_in_chunk, atol=1e-6)
+    assert place_of(metashape(tmp_path, placed="<transform><scale>3</scale></transform>")) is None
+    with pytest.raises(StageError, match="PROJ does not know its coordinate system"):
+        place_of(metashape(tmp_path, placed=EARTH.replace("GEOGCS", "GEOG")))
+    path = opensfm(tmp_path)
+    assert place_of(path) is None
+    (path / "opensfm/reconstruction.topocentric.json").write_text("[]")
+    (tmp_path / "odm_georeferencing").mkdir()
+    coords = tmp_path / "odm_georeferencing/coords.txt"
+    coords.write_text("WGS84 UTM 32N\n466000 5246000\n12.5 8.1 430.0\n")
+    place = place_of(path)
+    assert place.crs == pyproj.CRS(32632)
+    np.testing.assert_allclose(place.in_crs(np.ones((1, 3))), [[466001, 5246001, 1]])
+    coords.write_text("WGS84 UTM 32N\n")
+    with pytest.raises(StageError, match=r"coords\.txt is damaged"):
+        place_of(path)
 
 
 def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):

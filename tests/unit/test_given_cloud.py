@@ -1,22 +1,25 @@
 """A cloud in the coordinates of given cameras: it goes where these went, and a cloud from elsewhere is refused."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pycolmap
+import pyproj
 import pytest
 from support.cloud_files import UTM
-from support.surveyed import FRAME, MODEL_FROM_LOCAL, fly, write_inputs
+from support.surveyed import FRAME, MODEL_FROM_LOCAL, fly, on_earth, write_inputs
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.registration.frame_ledger import write_frame_ledger
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.given.cloud import import_posed_cloud
 from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.transforms import fit_sim3
 from scenefuse.workspace import read_views
 
 FLIGHT = fly()
@@ -39,27 +42,31 @@ def given(tmp_path):
     return tmp_path
 
 
-def imported(folder, **more):
+def imported(folder, source=None, **more):
     """The imported cloud and its report."""
     files = {name: folder / name for name in ("sparse", "sparse.json")}
     out = {"cloud": folder / "out.ply", "report": folder / "out.json"}
-    source = folder / "cloud.ply"
+    source = source or folder / "cloud.ply"
     import_posed_cloud(source=source, sparse=files["sparse"], sparse_json=files["sparse.json"], **out, **more)
     return read_cloud(out["cloud"]), read_json(out["report"])
 
 
-def test_a_scene_s_cloud_goes_where_georeferencing_took_its_cameras(given):
+def georeferenced(folder):
     georegister(
-        sparse=given / "sparse",
-        sparse_json=given / "sparse.json",
-        photos=given / "photos.json",
+        sparse=folder / "sparse",
+        sparse_json=folder / "sparse.json",
+        photos=folder / "photos.json",
         held=True,
-        georeferenced=given / "georeferenced",
-        residuals=given / "residuals.tsv",
-        report=given / "georeference.json",
+        georeferenced=folder / "georeferenced",
+        residuals=folder / "residuals.tsv",
+        report=folder / "georeference.json",
         settings=GeoreferenceSettings(),
         seed=0,
     )
+
+
+def test_a_scene_s_cloud_goes_where_georeferencing_took_its_cameras(given):
+    georeferenced(given)
     cloud, report = imported(given, georeference_json=given / "georeference.json")
     place = read_json(given / "georeference.json")
     truth = scene_frame(place).apply(FRAME.inverse(field().points))
@@ -110,6 +117,61 @@ def test_what_lies_outside_an_object_s_masks_is_left_out(given):
         cv2.imwrite(str(mask), np.zeros((views[0].height, views[0].width), np.uint8))
     with pytest.raises(StageError, match="only 0 of 6000 points of .* lie inside the masks"):
         imported(given, workspace=given / "workspace", masks=given / "masks")
+
+
+@pytest.mark.parametrize("kind, off_m", [("geocentric", 0.002), ("offset", 0.02)])
+def test_a_scene_s_cloud_in_the_crs_lies_where_its_project_placed_cameras_on_the_earth(given, kind, off_m):
+    """Metashape places cameras about the earth's centre, OpenDroneMap in the CRS less an offset.
+
+    The latter takes UTM for a frame of straight axes, whose plane is 0.04 % smaller than its heights.
+    """
+    place = on_earth(kind)
+    write_json(given / "sparse.json", {"lens": quantity("held", "")} | place.report())
+    model, true = pycolmap.Reconstruction(given / "sparse"), MODEL_FROM_LOCAL
+    if kind == "offset":
+        # In the CRS less the offset, as its cameras are then.
+        corners = true.apply(field(100).points)
+        turned = fit_sim3(corners, place.earth_from_model.inverse().apply(on_earth("geocentric").in_crs(corners)))
+        model.transform(pycolmap.Sim3d(turned.scale, pycolmap.Rotation3d(turned.rotation), turned.translation))
+        model.write(given / "sparse")
+    in_crs = on_earth("geocentric").in_crs(true.apply(field().points))
+    write_cloud(given / "cloud.ply", Cloud(in_crs, field().normals))
+    georeferenced(given)
+    cloud, report = imported(given, georeference_json=given / "georeference.json")
+    content = read_json(given / "georeference.json")
+    # Where the file has it, although the photos' own positions are off.
+    assert value(report, "crs") == value(content, "crs") == "EPSG:32632" and value(content, "metric")
+    np.testing.assert_allclose(scene_frame(content).in_crs(cloud.points), in_crs, atol=off_m)
+    assert value(content, "up_cue") == "given cameras" and "UTM zone 32N" in value(content, "reason")
+    assert np.abs((cloud.normals * field().normals).sum(1) - 1).max() < 0.01
+    centres = camera_poses(pycolmap.Reconstruction(given / "georeferenced"))[2]
+    truth = scene_frame(content).apply(FRAME.inverse(FLIGHT.centres))
+    assert np.linalg.norm(centres - truth, axis=1).max() < 0.5  # as the model is bent
+
+
+def test_a_cloud_in_another_crs_than_its_project_s_lies_there_too(given):
+    write_json(given / "sparse.json", on_earth("geocentric").report())
+    there = on_earth("geocentric").in_crs(read_cloud(given / "cloud.ply").points)
+    other = np.stack(pyproj.Transformer.from_crs(32632, 3035, always_xy=True).transform(*there.T), axis=1)
+    among = read_cloud(given / "cloud.ply").points
+    write_laz(given / "cloud.laz", Cloud(other - other[0]), other[0], "EPSG:3035")
+    cloud, report = imported(given, source=given / "cloud.laz")
+    np.testing.assert_allclose(cloud.points, among, atol=2e-3 * MODEL_FROM_LOCAL.scale)
+    assert value(report, "crs") == "EPSG:3035"
+    # What lies in no CRS, and what lies elsewhere in it.
+    cloud, report = imported(given)
+    np.testing.assert_allclose(cloud.points, among, atol=1e-9)
+    assert value(report, "crs") is None
+    write_cloud(given / "cloud.ply", Cloud(there + [300, 0, 0]))
+    with pytest.raises(StageError, match="nor, taken as WGS 84 / UTM zone 32N, where these lie on the earth: only 0 %"):
+        imported(given)
+
+
+def test_heights_above_a_geoid_that_is_not_installed_are_one_sentence(given):
+    compound = replace(on_earth("geocentric"), crs=pyproj.CRS("EPSG:25832+5783"))
+    write_json(given / "sparse.json", {"lens": quantity("held", "")} | compound.report())
+    with pytest.raises(StageError, match=r"need a geoid that is not installed; export .* in ETRS89 / UTM zone 32N"):
+        georeferenced(given)
 
 
 @pytest.mark.parametrize(

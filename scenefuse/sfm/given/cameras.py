@@ -7,8 +7,9 @@ import numpy as np
 import pycolmap
 
 from scenefuse.sfm.given.bundler import read_bundler
-from scenefuse.sfm.given.metashape import read_metashape
-from scenefuse.sfm.given.opensfm import find_opensfm, read_opensfm
+from scenefuse.sfm.given.metashape import metashape_place, read_metashape
+from scenefuse.sfm.given.opensfm import find_opensfm, opensfm_place, read_opensfm
+from scenefuse.sfm.given.place import Place
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photo_files import BUNDLER
 from scenefuse.sfm.photos import SHAPE_TOLERANCE
@@ -88,6 +89,14 @@ def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
         return read_opensfm(file, folder)
     has_json = cameras.is_file() or any((cameras / f"transforms{end}.json").is_file() for end in ("", "_train"))
     return find_posed_photos(cameras, None if has_json else folder)[0]
+
+
+def place_of(cameras: Path) -> Place | None:
+    """Where the cameras that `read_given` gives lie on the earth; None where their project does not say."""
+    if cameras.suffix.lower() == ".xml":
+        return metashape_place(cameras)
+    file = find_opensfm(cameras)
+    return None if file is None else opensfm_place(file)
 
 
 def _by_name(photos: list[PosedPhoto], cameras: Path) -> dict[str, PosedPhoto]:

@@ -1,20 +1,24 @@
 """The dense cloud of another program's project, in the coordinates of the cameras that it found."""
 
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
+import pyproj
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, spacing, write_cloud
+from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, survey, write_placed
 from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
+from scenefuse.sfm.given.place import read_place
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, fit_sim3
 from scenefuse.workspace import View, posed_images, read_model, read_views, view_of, with_mask
 
 # So many photos have to frame a point for it to count as seen; fewer confirm none (method F4).
@@ -45,12 +49,15 @@ def import_posed_cloud(
     cloud: Path,
     report: Path,
 ) -> None:
-    """Take a cloud that lies in the coordinates of given cameras, into the frame that the cameras are in now (M12).
+    """Take the cloud of given cameras into the frame that these are in now (M12).
+
+    It lies in the coordinates of the cameras, or in a CRS where their project says how they lie on the earth.
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
         sparse: COLMAP model of the given cameras, with the points that the photos' own matches give.
-        sparse_json: its JSON; where known lengths scaled the model, they scale the cloud alike.
+        sparse_json: its JSON; where known lengths scaled the model, they scale the cloud alike; it knows where the
+            given cameras lie on the earth.
         georeference_json: JSON of a scene, with the similarity that georeferencing moved the model by; an object's
             model stays where it is.
         workspace: undistorted COLMAP workspace of an object, for the masks.
@@ -65,21 +72,71 @@ def import_posed_cloud(
     """
     parts = columns_in_parts(source)
     own = survey(source, parts)
-    given = _scaled(sparse_json)
-    fit = fit_to_cameras(given.apply(own.sample), sparse)
-    check_fit(source, fit)
+    way, fit = _way_to_cameras(source, own.sample, sparse, read_json(sparse_json))
     if georeference_json is None:
-        whole = concatenate(list(clouds_in_parts(parts, own))).transformed(given)
+        whole = way.apply(concatenate(list(clouds_in_parts(parts, own))))
         placed = whole if workspace is None or masks is None else _cut_out(whole, source, workspace, masks)
         write_cloud(cloud, placed)
         content = import_report(source, own, spacing(placed.points), placed.diagonal, "object units")
         content |= {"points": quantity(len(placed), "1"), "outside_masks": quantity(len(whole) - len(placed), "1")}
-        content |= {"object_from_file": quantity(given.matrix, "object units")}
+        content |= {"object_from_file": quantity(way.nearest.matrix, "object units")}
     else:
         moved = Sim3.from_matrix(np.array(value(read_json(georeference_json), "scene_from_sparse")))
-        content = write_placed(cloud, source, parts, own, moved @ given, length_unit(georeference_json))
+
+        def move(part: Cloud) -> Cloud:
+            return way.apply(part).transformed(moved)
+
+        content = write_placed(cloud, source, parts, own, move, length_unit(georeference_json))
         content |= {"backend": quantity(IMPORTED, "")}
-    write_json(report, content | fit)
+    write_json(report, content | fit | {"crs": quantity(way.crs, "")})
+
+
+@dataclass(frozen=True)
+class Way:
+    """From a cloud's file to the model of its cameras.
+
+    Attributes:
+        exact: (N, 3) to (N, 3).
+        nearest: the similarity that comes nearest to it over the cloud; normals turn by it.
+        crs: of the file; None where it lies in the coordinates of the cameras.
+    """
+
+    exact: Callable[[Array], Array]
+    nearest: Sim3
+    crs: str | None
+
+    def apply(self, cloud: Cloud) -> Cloud:
+        """The cloud among the cameras."""
+        return replace(cloud.transformed(self.nearest), points=self.exact(cloud.points))
+
+
+def _way_to_cameras(source: Path, sample: Array, sparse: Path, content: dict[str, Any]) -> tuple[Way, dict[str, Any]]:
+    """How a cloud comes among its cameras, and how well it fits there (`fit_to_cameras`).
+
+    Args:
+        source: its file.
+        sample: (N, 3) of its points.
+        sparse: model of the cameras.
+        content: of its JSON.
+
+    Raises:
+        StageError: it fits in no way.
+    """
+    scale = content.get("metres_per_unit", {}).get("value")
+    given = Sim3(1.0 if scale is None else scale, np.eye(3), np.zeros(3))
+    fit, place = fit_to_cameras(given.apply(sample), sparse), read_place(content)
+    if place is None or not misfit(fit):
+        check_fit(source, fit)
+        return Way(given.apply, given, None), fit
+    crs, place = pyproj.CRS.from_user_input(las_crs(source) or place.crs), place.after(given)
+
+    def exact(points: Array) -> Array:
+        return place.model_from(points, crs)
+
+    fit = fit_to_cameras(exact(sample), sparse)
+    check_fit(source, fit, f" nor, taken as {crs.name}, where these lie on the earth")
+    print(f"{source.name} lies in {crs.name}, its cameras where their project placed them there", flush=True)
+    return Way(exact, fit_sim3(sample, exact(sample)), crs.to_string()), fit
 
 
 def fit_to_cameras(points: Array, sparse: Path) -> dict[str, Any]:
@@ -96,19 +153,28 @@ def fit_to_cameras(points: Array, sparse: Path) -> dict[str, Any]:
     return {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
 
 
-def check_fit(source: Path, fit: dict[str, Any]) -> None:
-    """StageError where a cloud lies in other coordinates than the cameras; fit: of `fit_to_cameras`."""
+def misfit(fit: dict[str, Any]) -> str:
+    """What says that a cloud lies in other coordinates than the cameras; "" where nothing does. Of `fit_to_cameras`."""
     seen, met = value(fit, "seen_share"), value(fit, "met_share")
     if seen < LEAST_SEEN:
-        found = f"{100 * seen:.0f} % of its points are in the pictures of {LEAST_PHOTOS} photos"
-    elif met < LEAST_MET:
-        found = f"{100 * met:.0f} % of the points where the photos' matches meet lie on it"
-    else:
-        return
-    raise StageError(
-        f"{source} does not lie in the coordinates of the row's cameras: only {found}; export cloud and cameras in the"
-        " same coordinates, with the same axes, or empty the cell cameras or the cell cloud"
-    )
+        return f"{100 * seen:.0f} % of its points are in the pictures of {LEAST_PHOTOS} photos"
+    return f"{100 * met:.0f} % of the points where the photos' matches meet lie on it" if met < LEAST_MET else ""
+
+
+def check_fit(source: Path, fit: dict[str, Any], also: str = "") -> None:
+    """StageError where a cloud lies in other coordinates than the cameras.
+
+    Args:
+        source: its file.
+        fit: of `fit_to_cameras`.
+        also: where else it was looked for, for the message.
+    """
+    found = misfit(fit)
+    if found:
+        raise StageError(
+            f"{source} does not lie in the coordinates of the row's cameras{also}: only {found}; export cloud and"
+            " cameras in the same coordinates, with the same axes, or empty the cell cameras or the cell cloud"
+        )
 
 
 def inside_masks(points: Array, views: list[View]) -> NDArray[np.bool_]:
@@ -137,12 +203,6 @@ def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:
             " beside them, and correct the clicks"
         )
     return part
-
-
-def _scaled(sparse_json: Path) -> Sim3:
-    """model_from_given: what known lengths did to the given cameras."""
-    scale = read_json(sparse_json).get("metres_per_unit", {}).get("value")
-    return Sim3(1.0 if scale is None else scale, np.eye(3), np.zeros(3))
 
 
 def _seen(points: Array, views: list[View]) -> float:

@@ -5,11 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+import pyproj
 from scipy.optimize import least_squares
 
 from scenefuse.sfm.given.names import find_photo
+from scenefuse.sfm.given.place import Place
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.sfm.posed_photos import PosedPhoto
+from scenefuse.sfm.survey.crs import usable
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
 
@@ -17,6 +20,8 @@ from scenefuse.transforms import Array, Sim3
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # COLMAP's fullest lens has neither a fourth radial coefficient nor skew: one that is as good as this takes their place.
 MOST_OFF_PX = 0.5
+# How the CRS of a chunk that does not lie on the earth begins.
+LOCAL = "LOCAL_CS"
 # Rays that it is fitted to, in each direction over the photo.
 GRID = 33
 
@@ -53,14 +58,40 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
     return found
 
 
+def metashape_place(file: Path) -> Place | None:
+    """Where the cameras that `read_metashape` gives lie on the earth; None for a chunk that was not placed there.
+
+    Raises:
+        StageError: its CRS is none that is known, or one in which no cloud can lie.
+    """
+    chunk = ET.parse(file).getroot().find(".//chunk")
+    reference = "" if chunk is None else (chunk.findtext("reference") or "").strip()
+    earth_from_chunk = None if chunk is None else _outside_from_chunk(chunk)
+    if earth_from_chunk is None or not reference or reference.startswith(LOCAL):
+        return None
+    try:
+        crs = pyproj.CRS.from_wkt(reference)
+    except pyproj.exceptions.CRSError:
+        raise StageError(
+            f"{file}: PROJ does not know its coordinate system ({reference[:60]}); choose another for the chunk, and"
+            " export cameras and cloud again"
+        ) from None
+    return Place(earth_from_chunk, True, usable(crs, str(file)))
+
+
 def _local_from_chunk(chunk: ET.Element) -> Sim3 | None:
     """Where a chunk lies in local coordinates, by scale bars or markers: those of its exported clouds.
 
     None where it was never placed, or on the earth: its clouds are exported in a CRS then, and its cameras stay put.
     """
     reference = (chunk.findtext("reference") or "").strip()
+    return _outside_from_chunk(chunk) if not reference or reference.startswith(LOCAL) else None
+
+
+def _outside_from_chunk(chunk: ET.Element) -> Sim3 | None:
+    """A chunk's transform, into local or geocentric coordinates; None where it was never placed."""
     placed = [*chunk.iterfind("components/component/transform"), *chunk.iterfind("transform")]
-    if not placed or (reference and not reference.startswith("LOCAL_CS")):
+    if not placed:
         return None
     rotation, translation, scale = (placed[0].findtext(name) for name in ("rotation", "translation", "scale"))
     turn = np.eye(3) if rotation is None else np.array(rotation.split(), dtype=float).reshape(3, 3)

@@ -8,12 +8,18 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
+from scenefuse.io.tables import read_lines
+from scenefuse.sfm.given.place import Place
 from scenefuse.sfm.posed_photos import PosedPhoto
+from scenefuse.sfm.survey.crs import read_crs
 from scenefuse.stage import StageError
+from scenefuse.transforms import Sim3
 
 FILE = "reconstruction.json"
 # Where an OpenDroneMap project has it.
 PLACES = (FILE, f"opensfm/{FILE}")
+# What an OpenDroneMap project that lies on the earth has beside it, and beside its folder.
+TOPOCENTRIC, COORDS = "reconstruction.topocentric.json", "odm_georeferencing/coords.txt"
 
 
 def find_opensfm(data: Path) -> Path | None:
@@ -46,6 +52,29 @@ def read_opensfm(file: Path, folder: Path) -> list[PosedPhoto]:
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise StageError(f"{file} is no reconstruction of OpenSfM ({error!r}); export it again") from None
+
+
+def opensfm_place(file: Path) -> Place | None:
+    """Where the cameras of an OpenDroneMap project lie on the earth; None for any other.
+
+    Its reconstruction.json is in the CRS less the offset in odm_georeferencing/coords.txt, once
+    reconstruction.topocentric.json lies beside it; its clouds are in the CRS.
+
+    Raises:
+        StageError: coords.txt is damaged.
+    """
+    coords = file.parent.parent / COORDS
+    if not (file.with_name(TOPOCENTRIC).is_file() and coords.is_file()):
+        return None
+    lines = [line for _, line in read_lines(coords)]
+    try:
+        offset = np.array([*map(float, lines[1].split()[:2]), 0.0])
+        moved = Sim3(1.0, np.eye(3), offset)
+    except (IndexError, ValueError):
+        raise StageError(
+            f"{coords} is damaged: its second line gives no offset; copy it again out of the project"
+        ) from None
+    return Place(moved, False, read_crs(lines[0], str(coords)))
 
 
 def _camera(entry: dict[str, Any], where: str) -> pycolmap.Camera:

@@ -18,7 +18,7 @@ def read_crs(text: str, where: str) -> pyproj.CRS:
     """The CRS of a header: `EPSG:25832`, with heights `EPSG:25832+7837`, `WGS84 UTM 32N`, or a PROJ string.
 
     Raises:
-        StageError: `text` names none, or one whose heights have another unit than its plane.
+        StageError: `text` names none, or what `usable` says.
     """
     zone = UTM.fullmatch(text.strip())
     code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
@@ -29,6 +29,17 @@ def read_crs(text: str, where: str) -> pyproj.CRS:
             f"{where} begins with '{text.strip()[:60]}', which names no coordinate reference system; write one in the"
             " first line: EPSG:25832, with heights EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
         ) from None
+    return usable(crs, where)
+
+
+def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
+    """A CRS as its register has it, where it does.
+
+    Raises:
+        StageError: its heights have another unit than its plane, or it is neither projected nor geographic.
+    """
+    if crs.is_bound and crs.source_crs is not None:
+        crs = crs.source_crs  # Older WKT names a way to WGS84 as well; PROJ knows better ones.
     known = crs.to_epsg()
     crs = crs if known is None else pyproj.CRS.from_epsg(known)
     units = {axis.unit_name for axis in crs.axis_info}

@@ -116,6 +116,7 @@ def _cell(value: Any) -> str:
 def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg: float) -> dict[str, Any]:
     """Content of georeference.json; what matters of it is printed."""
     placement, gps, unit = found.placement, found.gps, "m" if found.metric else "scene units"
+    measured_by = "control points" if found.control else "GPS" if len(placement.inliers) else "given cameras"
     print(f"{placement.status}: {placement.reason}; unit: {unit}", flush=True)
     transform = placement.local_from_model
     content = {
@@ -127,7 +128,7 @@ def georeference_report(found: Georeference, left: Residuals, cue: str, roll_deg
         "scale": quantity(transform.scale, f"{unit} per unit of the sparse model"),
         "photos_with_gps": quantity(len(gps.names), "1"),
         "photos_with_gps_height": quantity(int(np.isfinite(gps.positions[:, 2]).sum()), "1"),
-        "up_cue": quantity(cue if placement.levelled else "control points" if found.control else "GPS", ""),
+        "up_cue": quantity(cue if placement.levelled else measured_by, ""),
         "camera_roll_median_deg": quantity(roll_deg, "deg"),
     }
     content |= {} if left.lengths is None else _of_lengths(left.lengths, found.placement.status)
