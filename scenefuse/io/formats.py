@@ -43,6 +43,7 @@ def read_columns(path: Path) -> Columns:
     if not path.is_file():
         raise StageError(f"{path} does not exist; give the path of a cloud ({', '.join(READERS)})")
     with readable(path):
+        check_projected(path)
         columns = reader(path)
     columns = checked(path, columns)
     if len(columns["x"]) == 0:
@@ -95,6 +96,16 @@ def las_crs(path: Path) -> str | None:
     with laspy.open(path) as file:
         crs = _crs(file.header)
     return None if crs is None else crs.to_wkt()
+
+
+def check_projected(path: Path) -> None:
+    """StageError where a LAS or LAZ file is in degrees."""
+    import pyproj
+
+    crs = las_crs(path)
+    if crs is not None and pyproj.CRS.from_wkt(crs).is_geographic:
+        name = pyproj.CRS.from_wkt(crs).name
+        raise StageError(f"{path} is in degrees ({name}); project it to metres first, to UTM for instance")
 
 
 def _common_name(name: str) -> str:
@@ -153,9 +164,6 @@ def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
     import laspy
 
     with laspy.open(path) as file:
-        crs = _crs(file.header)
-        if crs is not None and crs.is_geographic:
-            raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
         form, count = file.header.point_format, 0
         named = [*POSITION, *(COLOR if set(COLOR) <= set(form.dimension_names) else ())]
         for points in file.chunk_iterator(at_once):

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import laspy
 import numpy as np
 import pycolmap
 import pyproj
@@ -158,6 +159,17 @@ def test_a_cloud_in_another_crs_than_its_project_s_lies_there_too(given):
     cloud, report = imported(given, source=given / "cloud.laz")
     np.testing.assert_allclose(cloud.points, among, atol=2e-3 * MODEL_FROM_LOCAL.scale)
     assert value(report, "crs") == "EPSG:3035"
+    # In degrees, as Metashape's menu exports it where the photos have GPS and nobody chose a CRS.
+    degrees = np.stack(pyproj.Transformer.from_crs(32632, 4326, always_xy=True).transform(*there.T), axis=1)
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales, header.offsets = [1e-9, 1e-9, 1e-3], degrees[0]
+    header.add_crs(pyproj.CRS(4326))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = degrees.T
+    las.write(given / "degrees.laz")
+    cloud, report = imported(given, source=given / "degrees.laz")
+    np.testing.assert_allclose(cloud.points, among, atol=5e-3 * MODEL_FROM_LOCAL.scale)
+    assert value(report, "crs") == "EPSG:4326"
     # What lies in no CRS, and what lies elsewhere in it.
     cloud, report = imported(given)
     np.testing.assert_allclose(cloud.points, among, atol=1e-9)

@@ -3,17 +3,21 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from scenefuse.io.formats import Columns, checked, part_reader, read_columns, readable
+from scenefuse.io.formats import Columns, check_projected, checked, part_reader, read_columns, readable
 from scenefuse.io.tiles.tiled_cloud import AT_ONCE
 
 ColumnParts = Callable[[], Iterator[Columns]]
 
 
-def columns_in_parts(path: Path) -> ColumnParts:
+def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
     """The columns of a cloud file, as `read_columns` has them, AT_ONCE rows at a time each time this is called.
 
     LAS, LAZ (COPC too), E57 and binary PLY are read anew each time; PCD, text and meshes once, and held. Here colours
     of a LAS file may all be black.
+
+    Args:
+        path: of the file.
+        degrees: whether LAS and LAZ may be in degrees.
 
     Raises:
         StageError: the file is missing, damaged, of an unknown ending or without positions; in the middle, where it is
@@ -23,6 +27,10 @@ def columns_in_parts(path: Path) -> ColumnParts:
     if reader is None:
         whole = read_columns(path)
         return lambda: _slices(whole)
+
+    if not degrees:
+        with readable(path):
+            check_projected(path)
 
     def parts() -> Iterator[Columns]:
         with readable(path):

@@ -70,7 +70,7 @@ def import_posed_cloud(
         StageError: the file is missing, damaged, of an unknown ending, has too few different points, or lies in other
             coordinates than the cameras.
     """
-    parts = columns_in_parts(source)
+    parts = columns_in_parts(source, degrees=True)
     own = survey(source, parts)
     way, fit = _way_to_cameras(source, own.sample, sparse, read_json(sparse_json))
     if georeference_json is None:
