@@ -31,10 +31,12 @@ HALVINGS = 1
 """How often a point that photos match nowhere near is tried again in photos of half the size."""
 SEEN_SHARE = 0.02
 """A photo that has less of an object in its picture is not asked."""
-PIXEL_ERROR = 0.15
-"""Of a step (about a pixel): what is common to a point's matches, cameras and interpolation above all, and does not
-average out. With NOISE_FACTOR from the demo's house and sculpture."""
-NOISE_FACTOR = 3.0
+PEAK_FACTOR = 0.6
+"""Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
+next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth."""
+PIXEL_ERROR = 0.07
+"""Of a step (about a pixel): what is common to a point's matches, interpolation above all, and does not average out."""
+NOISE_FACTOR = 1.8
 """The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
 beside each other their pixels."""
 
@@ -175,7 +177,8 @@ def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Match
             photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
             curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
         )  # fmt: skip
-    deviation = np.sqrt((_peak(curve) * step) ** 2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
+    away = PEAK_FACTOR * _peak(curve) * step
+    deviation = np.sqrt(away**2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
     deviation = np.where(confirming > 0, deviation, np.inf)
     return Matches(curve[:, OFFSETS], curve.max(1), confirming, tested, deviation, texture, step)
 
