@@ -22,7 +22,7 @@ SLACK = 0.1
 """A photo whose score is better by more at another offset does not confirm a point."""
 LEAST_PHOTOS = 3
 """Photos that must confirm a point for it to be measured."""
-MOST_DEVIATION = 2.0
+MOST_DEVIATION = 1.2
 """Of a step (about a pixel), the largest standard deviation of a measured point: windows that match as well farther on
 measure nothing, sky and blank walls above all."""
 MOST_PHOTOS = 64
