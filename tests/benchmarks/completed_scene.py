@@ -226,7 +226,7 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
 
     Errors are vectors to the true surface. For `deviation`, an error within the object's frame, the added points are
     aligned to the truth by their surface; `shift_pct` is how far this moves them from where the object's cameras put
-    them: the model's own bending, which the pose's standard deviations hold. A surface has no place along itself: an axis
+    them: the model's own bending, which belongs to the pose. A surface has no place along itself: an axis
     counts where the surface faces it within 45 degrees.
     """
     folder = case.results / "objects" / case.name

@@ -284,8 +284,8 @@ def test_a_pot_before_a_wall_stays_where_most_photos_confirm_it():
     assert (found.reason[-len(pot) :] == KEPT).mean() > 0.95
 
 
-def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near, far):
-    obj, scene = sheet(-0.8, 0.8, 0.02), sheet(-0.8, 0.8, 0.12)
+def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
+    obj, scene, far = sheet(-0.8, 0.8, 0.02), sheet(-0.8, 0.8, 0.12), pack(photographs(8, 9.0, radius=6.0))
     found = weigh(Side(obj, far), Side(scene, near), nerf_only=False)
     inside = np.abs(obj.points[:, :2]).max(1) < 0.6
     distance = np.linalg.norm(obj.points[inside, None, :2] - scene.points[:, :2], axis=2).min(1)
