@@ -45,13 +45,13 @@ MOST_ELSEWHERE = 0.1
 """Share of what the scene measured of which they may say so: where it is more, the pose is off after all."""
 LEAST_VIEWS = 3
 """Photos that must have a point in their picture for it to count as enclosed."""
-SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 3.0, 1.5, 0.02
+SAME_DEVIATIONS, SAME_SPACINGS, SAME_MOST = 5.0, 1.5, 0.02
 """Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 the sparser side where that is more; never farther than this share of the diagonal."""
 CLEARLY = 1.5
 """The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
 denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise."""
-CONSISTENT = 2.0
+CONSISTENT = 3.5
 """Standard deviations of the object within which a point that the scene did not measure may be right."""
 OUTNUMBERED = 2.0
 """Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser."""
