@@ -334,6 +334,6 @@ def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exa
     # What lies farther off than the object's own deviation explains goes.
     away = replace(scene, points=scene.points + [0, 0, 0.035])
     worse, _ = evidence.compare(
-        obj, np.full(len(obj), 0.02), every, away, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
+        obj, np.full(len(obj), 0.012), every, away, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
     )
     assert worse[~measured].mean() > 0.95
