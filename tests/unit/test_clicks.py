@@ -212,6 +212,17 @@ def test_what_the_objects_points_enclose_is_asked_about_and_never_said_to_be_out
     assert (kind[200:] == -1).all() and not enclosed.any()
 
 
+def test_what_a_mask_takes_in_far_behind_the_object_prompts_no_other_photo():
+    near = np.random.default_rng(0).uniform(-1, 1, (300, 3))
+    points = np.concatenate([near, near[:10] + [3, 0, 0], near[:10] + [30, 0, 0]])
+    photos, empty = Workspace(Path(), [], points, [], []), np.zeros((HEIGHT, WIDTH), dtype=bool)
+    rows = np.arange(len(points))
+    voter = Voter(empty, 0.9, 1.0, rows, rows >= 0, PhotoClicks(NONE, NONE[:, 0]))
+    kind, _ = known_points(photos, {0: voter})
+    # A part that stands out is the object's, the trees behind it are not.
+    assert (kind[:310] == 1).all() and (kind[310:] == 0).all()
+
+
 def test_a_part_that_the_objects_points_enclose_is_added(photos):
     view, inside = photos.views[0], np.array([MIDDLE])
     at = np.argwhere(hat(view))[::20, ::-1] + 0.5

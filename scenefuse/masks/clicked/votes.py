@@ -28,6 +28,9 @@ and it is hidden points' neighbours that differ."""
 OUTERMOST = 1.0
 """Percentage of the points known to be the object's that are taken for mismatched at each side, where there are a
 hundred."""
+STRAY, FAR = 5.0, 1.0
+"""Percentage at each side of the object's points that may be far from the rest; how far a point may be from the box of
+the others, over its diagonal."""
 LEAST_SPANNING, SPANNING_VOTES = 8, 2
 """So many of these points, on which so many photos vote, span the object: a single mask may hold what is around it."""
 MOST_FOREIGN = 0.1
@@ -102,6 +105,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.votes]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
+    known[(known > 0) & ~_near_most(photos.points, known > 0)] = 0
     own = central(photos.points[(known > 0) & (counts >= SPANNING_VOTES)])
     enclosed = np.zeros(len(known), dtype=bool)
     if len(own) >= LEAST_SPANNING:
@@ -112,6 +116,16 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
                 enclosed[:] = False
     known[enclosed] = 0
     return known, enclosed
+
+
+def _near_most(points: Array, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(P,) which points are no farther from most of the object's own than these reach: a mask that leaks takes in what
+    is far behind the object, and would have the next photos look for that."""
+    if own.sum() < LEAST_SPANNING:
+        return np.ones(len(points), dtype=bool)
+    low, high = np.percentile(points[own], [STRAY, 100 - STRAY], axis=0)
+    reach = FAR * np.linalg.norm(high - low)
+    return np.asarray(((points >= low - reach) & (points <= high + reach)).all(1))
 
 
 class Known(NamedTuple):
