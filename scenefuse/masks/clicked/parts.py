@@ -71,10 +71,13 @@ def with_parts(
 
 
 def agrees(mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float) -> float:
-    """Share of the pixels inside that a mask holds, less the share of those outside that it holds."""
+    """Share of the pixels inside that a mask holds, less the share of those outside that it holds.
+
+    Of those inside one more counts as held: where four are known, one that is wrong is no reason to doubt the mask.
+    """
     within = np.concatenate([held(mask, inside[0], tolerance_px), held(mask, inside[1], 0)])
     spared = np.concatenate([held(~mask, outside[0], tolerance_px), held(~mask, outside[1], 0)])
-    return float((within.mean() if len(within) else 1.0) - ((~spared).mean() if len(spared) else 0.0))
+    return float((within.sum() + 1) / (len(within) + 1) - ((~spared).mean() if len(spared) else 0.0))
 
 
 def _near(pixels: Array, others: cKDTree, reach_px: float) -> Array:
