@@ -13,9 +13,9 @@ from support.photographed_plane import photographs
 from scenefuse.masks.clicked.carry import carry, one_photo
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
-from scenefuse.masks.clicked.parts import with_parts
+from scenefuse.masks.clicked.parts import agrees, with_parts
 from scenefuse.masks.clicked.space import Space
-from scenefuse.masks.clicked.votes import Voter, known_points, voter_of
+from scenefuse.masks.clicked.votes import LEAST_AGREEMENT, Voter, known_points, voter_of
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.prompted import masks_from_prompts
@@ -210,6 +210,14 @@ def test_what_the_objects_points_enclose_is_asked_about_and_never_said_to_be_out
     assert not known(300, votes=1)[1].any()
     kind, enclosed = known(200)
     assert (kind[200:] == -1).all() and not enclosed.any()
+
+
+def test_one_of_four_points_that_a_mask_lacks_is_no_reason_to_doubt_it():
+    mask = np.zeros((HEIGHT, WIDTH), dtype=bool)
+    mask[:, :50] = True
+    for on, off, voting in ((3, 1, True), (2, 2, False), (8, 2, True), (7, 3, False)):
+        inside = np.array([[10.0, 10.0]] * on + [[70.0, 10.0]] * off)
+        assert (agrees(mask, (NONE, inside), (NONE, NONE), 0) >= LEAST_AGREEMENT) == voting
 
 
 def test_what_a_mask_takes_in_far_behind_the_object_prompts_no_other_photo():
