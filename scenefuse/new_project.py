@@ -10,8 +10,8 @@ from scenefuse.io.formats import READERS
 from scenefuse.io.settings import ROOT, schema_of
 from scenefuse.stage import StageError
 
-SCENES = ("scene", "photos", "cloud")
-OBJECTS = ("object", "scene", "photos", "cloud", "prompts", "fiducials")
+SCENES = ("scene", "photos", "cameras", "cloud")
+OBJECTS = ("object", "scene", "photos", "cameras", "cloud", "prompts", "fiducials")
 SETTINGS = """\
 # Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
 # {root}/config/README.md
@@ -19,7 +19,8 @@ SETTINGS = """\
 README = """\
 # {name}
 
-1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud.
+1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud; or, of a
+   finished project of another program, its photos, its cameras and its dense cloud.
 2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
    Without a scene, an object's photos become a cloud by themselves.
    In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.

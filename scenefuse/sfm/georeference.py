@@ -19,6 +19,7 @@ from scenefuse.sfm.survey.control import Control, read_sighted
 from scenefuse.sfm.survey.crs import grid_name
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.sfm.survey.placement import (
+    ELSEWHERE_M,
     MIN_GPS_PHOTOS,
     UP,
     GeoreferenceSettings,
@@ -31,7 +32,7 @@ from scenefuse.sfm.survey.placement import (
     upright,
 )
 from scenefuse.sfm.survey.residuals import Georeference, georeference_report, residuals_of, write_residuals
-from scenefuse.stage import atomic_directory, quantity, read_json, value, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, read_json, value, write_json
 from scenefuse.transforms import box_corners, fit_sim3
 from scenefuse.workspace import posed_images, read_model
 
@@ -145,17 +146,31 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
         gps: photos with positions, to compare; they move nothing.
 
     Raises:
-        StageError: the cameras lie nowhere near the area of the project's CRS.
+        StageError: the cameras lie nowhere near the area of the project's CRS, or more than a kilometre from where GPS
+            saw them.
     """
     _, _, centres = camera_poses(model)
     inside = np.concatenate([centres, np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)])
     corners = box_corners(inside.min(0), inside.max(0))
     there = place.wgs84(corners, "the given cameras")
     frame = replace(local_frame(there), grid=grid_name(place.crs))
-    reason = f"where its cameras were given, in {place.crs.name}"
+    fitted, reason = fit_sim3(corners, frame.apply(there)), f"where its cameras were given, in {place.crs.name}"
+    if len(gps.names):
+        off = _middle(frame.apply(gps.positions) - fitted.apply(gps.centres))
+        if np.linalg.norm(off[:2]) > ELSEWHERE_M:
+            raise StageError(
+                f"the given cameras lie {np.linalg.norm(off[:2]) / 1000:.3g} km from where the photos' GPS saw them;"
+                " give the project of these photos, or one whose CRS is theirs"
+            )
+        reason += f" ({np.linalg.norm(off[:2]):.1f} m from the photos' GPS, {-off[2]:+.1f} m in height)"
     none = np.zeros(0, dtype=bool)
-    placement = Placement("georeferenced", reason, fit_sim3(corners, frame.apply(there)), none, "measured", False)
-    return Georeference(placement, frame, gps)
+    return Georeference(Placement("georeferenced", reason, fitted, none, "measured", False), frame, gps)
+
+
+def _middle(off: Array) -> Array:
+    """(3,) medians of (N, 3) differences; 0 where none is known."""
+    known = [column[np.isfinite(column)] for column in off.T]
+    return np.array([np.median(column) if len(column) else 0.0 for column in known])
 
 
 def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, freedom: Freedom) -> dict[str, Any]:

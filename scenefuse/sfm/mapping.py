@@ -227,14 +227,13 @@ def _taken(
     cameras: Path, folder: Path, names: list[str], database: Path, sparse: Path, settings: MappingSettings, seed: int
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The same from given cameras."""
-    work = sparse.with_name(f"{sparse.name}-given")
+    work, place = sparse.with_name(f"{sparse.name}-given"), place_of(cameras)
     model = triangulated(cameras, folder, database, work, _mapper_options(len(names), True, seed))
     _check_registered([model], names, settings.min_registered_share)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
     print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
     notes = [f"cameras are those of {cameras.name}, held"]
-    place = place_of(cameras)
     on_earth = {} if place is None else place.report()
     return model, summary | on_earth | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 

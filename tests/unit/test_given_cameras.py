@@ -220,9 +220,48 @@ def test_where_a_project_lies_on_the_earth_is_read(tmp_path):
     place = place_of(path)
     assert place.crs == pyproj.CRS(32632)
     np.testing.assert_allclose(place.in_crs(np.ones((1, 3))), [[466001, 5246001, 1]])
-    coords.write_text("WGS84 UTM 32N\n")
-    with pytest.raises(StageError, match=r"coords\.txt is damaged"):
-        place_of(path)
+    for text, message in (
+        ("WGS84 UTM 32N\n", "is damaged"),
+        ("WGS84 UTM 32N\n466000\n", "is damaged"),
+        ("WGS84 UTM 32N\n12.3 45.6 78.9\n", "is damaged"),
+        ("WGS84 UTM 32N\nnan nan\n", "is damaged"),
+        ("WGS84 UTM 0N\n466000 5246000\n", "names no coordinate reference system"),
+        ("EPSG:4326\n8.5 47.5\n", "is in degrees"),
+        ("EPSG:2263\n980000 200000\n", "does not count in metres"),
+    ):
+        coords.write_text(text)
+        with pytest.raises(StageError, match=message):
+            place_of(path)
+
+
+def test_of_a_chunk_of_metashape_the_active_component_is_taken(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for view in FLIGHT.views:
+        (tmp_path / "photos" / view.name).write_bytes(b"")
+    other = "<transform><scale>7</scale></transform>"
+    parts = f'<component id="1">{other}</component><component id="0">{PLACED}</component>'
+    utm = escape(pyproj.CRS(32632).to_wkt("WKT1_GDAL"))
+    path = metashape(tmp_path, placed=f'<components active_id="0">{parts}</components><reference>{utm}</reference>')
+    text = path.read_text().replace('<camera id="0" ', '<camera id="0" component_id="1" ')
+    path.write_text(text.replace('<camera id="1" ', '<camera id="1" enabled="false" '))
+    assert place_of(path).earth_from_model.scale == 3
+    assert [photo.name for photo in read_given(path, tmp_path / "photos")] == [n[:-4] for n in FLIGHT.names[2:]]
+
+
+def test_where_a_chunk_of_metashape_lies_has_to_be_known(tmp_path):
+    (tmp_path / "photos").mkdir()
+    for view in FLIGHT.views:
+        (tmp_path / "photos" / view.name).write_bytes(b"")
+    with pytest.raises(StageError, match="lies on the earth, but names no CRS"):
+        read_given(metashape(tmp_path, placed=PLACED), tmp_path / "photos")
+    turned = "<transform><rotation>0 1 0 -1 0 0 0 0 1</rotation></transform>"
+    assert place_of(metashape(tmp_path, placed=EARTH.split("<transform>")[0] + turned)) is None
+    for code, message in ((2263, "does not count in metres"), (27572, "degrees from Greenwich")):
+        wkt = escape(pyproj.CRS(code).to_wkt("WKT1_GDAL"))
+        with pytest.raises(StageError, match=message):
+            place_of(metashape(tmp_path, placed=f"<reference>{wkt}</reference>{PLACED}"))
+    with pytest.raises(StageError, match="the scale of its transform is 0"):
+        read_given(metashape(tmp_path, placed="<transform><scale>0</scale></transform>"), tmp_path / "photos")
 
 
 def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):

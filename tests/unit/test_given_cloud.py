@@ -167,9 +167,19 @@ def test_a_cloud_in_another_crs_than_its_project_s_lies_there_too(given):
     las = laspy.LasData(header)
     las.x, las.y, las.z = degrees.T
     las.write(given / "degrees.laz")
+    # Normals, which LAZ has not, as a PLY: east, north and up.
+    there_from_among = fit_sim3(among, there)
+    normals = there_from_among.rotate(read_cloud(given / "cloud.ply").normals).astype(np.float32)
+    write_cloud(given / "degrees.ply", Cloud(degrees, normals))
     cloud, report = imported(given, source=given / "degrees.laz")
     np.testing.assert_allclose(cloud.points, among, atol=5e-3 * MODEL_FROM_LOCAL.scale)
-    assert value(report, "crs") == "EPSG:4326"
+    assert value(report, "crs") == "EPSG:4326" and value(report, "object_from_file") is None
+    write_json(given / "sparse.json", replace(on_earth("geocentric"), crs=pyproj.CRS(4326)).report())
+    cloud, report = imported(given, source=given / "degrees.ply")
+    # North on the grid is half a degree off north.
+    assert np.abs((cloud.normals * read_cloud(given / "cloud.ply").normals).sum(1) - 1).max() < 1e-3
+    write_json(given / "sparse.json", on_earth("geocentric").report())
+    assert np.abs((cloud.normals * read_cloud(given / "cloud.ply").normals).sum(1) - 1).max() < 1e-3
     # What lies in no CRS, and what lies elsewhere in it.
     cloud, report = imported(given)
     np.testing.assert_allclose(cloud.points, among, atol=1e-9)
@@ -182,8 +192,27 @@ def test_a_cloud_in_another_crs_than_its_project_s_lies_there_too(given):
 def test_heights_above_a_geoid_that_is_not_installed_are_one_sentence(given):
     compound = replace(on_earth("geocentric"), crs=pyproj.CRS("EPSG:25832+5783"))
     write_json(given / "sparse.json", {"lens": quantity("held", "")} | compound.report())
-    with pytest.raises(StageError, match=r"need a geoid that is not installed; export .* in ETRS89 / UTM zone 32N"):
+    with pytest.raises(StageError, match=r"need a geoid, or a grid, that is not installed; export cameras and cloud"):
         georeferenced(given)
+    # Of the cloud's file likewise.
+    write_json(given / "sparse.json", {"lens": quantity("held", "")} | on_earth("geocentric").report())
+    there = on_earth("geocentric").in_crs(read_cloud(given / "cloud.ply").points)
+    write_laz(given / "cloud.laz", Cloud(there - there[0]), there[0], "EPSG:25832+5783")
+    with pytest.raises(StageError, match="need a geoid"):
+        imported(given, source=given / "cloud.laz")
+
+
+def test_a_project_far_from_its_photos_gps_is_refused(given):
+    place = on_earth("geocentric")
+    moved = replace(place.earth_from_model, translation=place.earth_from_model.translation + [0, 5000, 0])
+    for found in (place, replace(place, earth_from_model=moved)):
+        write_json(given / "sparse.json", {"lens": quantity("held", "")} | found.report())
+        if found is place:
+            georeferenced(given)
+            assert "from the photos' GPS" in value(read_json(given / "georeference.json"), "reason")
+        else:
+            with pytest.raises(StageError, match="lie .* km from where the photos' GPS saw them"):
+                georeferenced(given)
 
 
 @pytest.mark.parametrize(

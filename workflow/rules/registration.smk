@@ -53,7 +53,7 @@ rule align_models:
 rule crop_scene:
     """Cut the object's surroundings out of the scene by its masks' votes, or by clicks or fiducials (paper 3.3; C1 to C5)."""
     input:
-        crop_inputs,
+        as_inputs(crop_inputs),
         scene=in_scene("dense.ply"),
         sparse=in_photographed_scene("georeferenced"),
         georeference_json=in_scene("georeference.json"),

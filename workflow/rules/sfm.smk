@@ -73,7 +73,7 @@ rule extract_frames:
 rule extract_scene_features:
     """SIFT features (paper 3.1)."""
     input:
-        calibration_of("scene"),
+        as_inputs(calibration_of("scene")),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
     output:
@@ -104,7 +104,7 @@ rule extract_scene_features:
 
 use rule extract_scene_features as extract_object_features with:
     input:
-        calibration_of("object"),
+        as_inputs(calibration_of("object")),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
     output:
@@ -187,7 +187,7 @@ use rule match_scene_features as match_object_features with:
 rule map_scene_photos:
     """Cameras and sparse points by incremental mapping and bundle adjustment (paper 3.1)."""
     input:
-        cameras_of("scene"),
+        as_inputs(cameras_of("scene")),
         folder="results/scenes/{scene}/photos",
         photos="results/scenes/{scene}/photos.json",
         database="results/scenes/{scene}/database.db",
@@ -224,7 +224,7 @@ rule map_scene_photos:
 
 use rule map_scene_photos as map_object_photos with:
     input:
-        given_of,
+        as_inputs(given_of),
         folder="results/objects/{object}/frames",
         photos="results/objects/{object}/photos.json",
         database="results/objects/{object}/database.db",
@@ -256,7 +256,7 @@ use rule map_scene_photos as map_object_photos with:
 rule georegister:
     """Bring the model into metres, east, north and up, by control points or the photos' GPS, and adjust it to them."""
     input:
-        survey_of,
+        as_inputs(survey_of),
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/sparse",
         report="results/scenes/{scene}/sparse.json",

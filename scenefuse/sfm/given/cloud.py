@@ -17,6 +17,7 @@ from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, 
 from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.given.place import read_place
+from scenefuse.sfm.survey.crs import plane
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, fit_sim3
 from scenefuse.workspace import View, posed_images, read_model, read_views, view_of, with_mask
@@ -27,6 +28,8 @@ LEAST_PHOTOS = 3
 # met by a smaller share of the points that the photos' own matches give in its box. Of four right clouds 66 % were met
 # or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
 LEAST_SEEN, LEAST_MET = 0.1, 0.2
+# Of a right cloud as dense as the photos allow more is met.
+USUALLY_MET = 0.5
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 NEAR = 0.002
 # The cloud's box leaves out so much of it on each side; fewer points in it say that the cloud is elsewhere.
@@ -79,7 +82,8 @@ def import_posed_cloud(
         write_cloud(cloud, placed)
         content = import_report(source, own, spacing(placed.points), placed.diagonal, "object units")
         content |= {"points": quantity(len(placed), "1"), "outside_masks": quantity(len(whole) - len(placed), "1")}
-        content |= {"object_from_file": quantity(way.nearest.matrix, "object units")}
+        similar = None if way.turned_alone else way.nearest.matrix
+        content |= {"object_from_file": quantity(similar, "object units")}
     else:
         moved = Sim3.from_matrix(np.array(value(read_json(georeference_json), "scene_from_sparse")))
 
@@ -88,6 +92,12 @@ def import_posed_cloud(
 
         content = write_placed(cloud, source, parts, own, move, length_unit(georeference_json))
         content |= {"backend": quantity(IMPORTED, "")}
+    if value(fit, "met_share") < USUALLY_MET:
+        note = (
+            f"only {100 * value(fit, 'met_share'):.0f} % of the points where the photos' matches meet lie on the cloud"
+        )
+        content["notes"]["value"].append(f"{note}: it is sparse, or a little shifted, turned or scaled")
+        print(content["notes"]["value"][-1], flush=True)
     write_json(report, content | fit | {"crs": quantity(way.crs, "")})
 
 
@@ -99,11 +109,13 @@ class Way:
         exact: (N, 3) to (N, 3).
         nearest: the similarity that comes nearest to it over the cloud; normals turn by it.
         crs: of the file; None where it lies in the coordinates of the cameras.
+        turned_alone: whether only the turn of `nearest` is one: the file is in degrees.
     """
 
     exact: Callable[[Array], Array]
     nearest: Sim3
     crs: str | None
+    turned_alone: bool = False
 
     def apply(self, cloud: Cloud) -> Cloud:
         """The cloud among the cameras."""
@@ -136,7 +148,17 @@ def _way_to_cameras(source: Path, sample: Array, sparse: Path, content: dict[str
     fit = fit_to_cameras(exact(sample), sparse)
     check_fit(source, fit, f" nor, taken as {crs.name}, where these lie on the earth")
     print(f"{source.name} lies in {crs.name}, its cameras where their project placed them there", flush=True)
-    return Way(exact, fit_sim3(sample, exact(sample)), crs.to_string()), fit
+    in_degrees, name = plane(crs).is_geographic, crs.to_string()
+    nearest = _turn_there(exact, np.median(sample, axis=0)) if in_degrees else fit_sim3(sample, exact(sample))
+    return Way(exact, nearest, crs.name if len(name) > len(crs.name) + 20 else name, in_degrees), fit
+
+
+def _turn_there(exact: Callable[[Array], Array], place: Array) -> Sim3:
+    """How a change of coordinates turns directions at a place (3,), whatever it does to lengths."""
+    steps = np.diag([1e-6, 1e-6, 0.1])
+    along = exact(place + steps) - exact(np.stack([place] * 3))
+    left, _, right = np.linalg.svd((along / np.linalg.norm(along, axis=1, keepdims=True)).T)
+    return Sim3(1.0, left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right, np.zeros(3))
 
 
 def fit_to_cameras(points: Array, sparse: Path) -> dict[str, Any]:

@@ -9,7 +9,7 @@ import pyproj
 from scipy.optimize import least_squares
 
 from scenefuse.sfm.given.names import find_photo
-from scenefuse.sfm.given.place import Place
+from scenefuse.sfm.given.place import Place, check_crs
 from scenefuse.sfm.photo_files import photo_files
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.sfm.survey.crs import usable
@@ -22,27 +22,29 @@ PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "
 MOST_OFF_PX = 0.5
 # How the CRS of a chunk that does not lie on the earth begins.
 LOCAL = "LOCAL_CS"
+# The earth's radius, and how far a place near its surface may be from that: it is flattened by 21 km.
+EARTH_M, NEAR_M = 6.371e6, 40e3
 # Rays that it is fitted to, in each direction over the photo.
 GRID = 33
 
 
 def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
-    """The photos that were aligned; lenses of the kind frame.
+    """The photos that were aligned, in the active component, and are not disabled; lenses of the kind frame.
 
     Args:
         file: the XML.
         folder: of the photos; the XML names them without their ending.
 
     Raises:
-        StageError: the file is no such XML, or has a lens of another kind.
+        StageError: the file is no such XML, has a lens of another kind, or lies on the earth without a CRS.
     """
     try:
         chunk = ET.parse(file).getroot().find(".//chunk")
         if chunk is None:
             raise ValueError("it has no chunk")
         sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
-        files, lenses, found, moved = photo_files(folder), {}, [], _local_from_chunk(chunk)
-        for camera in chunk.iterfind("cameras//camera"):
+        files, lenses, found, moved = photo_files(folder), {}, [], _local_from_chunk(chunk, str(file))
+        for camera in _cameras_of(chunk):
             placed, number = camera.find("transform"), camera.attrib["sensor_id"]
             if placed is None or not placed.text:
                 continue
@@ -67,7 +69,7 @@ def metashape_place(file: Path) -> Place | None:
     chunk = ET.parse(file).getroot().find(".//chunk")
     reference = "" if chunk is None else (chunk.findtext("reference") or "").strip()
     earth_from_chunk = None if chunk is None else _outside_from_chunk(chunk)
-    if earth_from_chunk is None or not reference or reference.startswith(LOCAL):
+    if earth_from_chunk is None or not reference or reference.startswith(LOCAL) or not _on_earth(earth_from_chunk):
         return None
     try:
         crs = pyproj.CRS.from_wkt(reference)
@@ -76,27 +78,61 @@ def metashape_place(file: Path) -> Place | None:
             f"{file}: PROJ does not know its coordinate system ({reference[:60]}); choose another for the chunk, and"
             " export cameras and cloud again"
         ) from None
-    return Place(earth_from_chunk, True, usable(crs, str(file)))
+    crs = usable(crs, str(file))
+    check_crs(crs, str(file))
+    return Place(earth_from_chunk, True, crs)
 
 
-def _local_from_chunk(chunk: ET.Element) -> Sim3 | None:
+def _cameras_of(chunk: ET.Element) -> list[ET.Element]:
+    """Its cameras that are not disabled, of the active component: those of others lie somewhere else."""
+    active = _active(chunk)
+    return [
+        camera
+        for camera in chunk.iterfind("cameras//camera")
+        if camera.attrib.get("enabled", "true") not in ("false", "0")
+        and (active is None or camera.attrib.get("component_id", active) == active)
+    ]
+
+
+def _active(chunk: ET.Element) -> str | None:
+    """The id of its active component; None where it names none."""
+    components = chunk.find("components")
+    return None if components is None else components.attrib.get("active_id")
+
+
+def _on_earth(outside_from_chunk: Sim3) -> bool:
+    """Whether a chunk's origin lies near the earth's surface, in geocentric coordinates."""
+    return abs(float(np.linalg.norm(outside_from_chunk.translation)) - EARTH_M) < NEAR_M
+
+
+def _local_from_chunk(chunk: ET.Element, where: str) -> Sim3 | None:
     """Where a chunk lies in local coordinates, by scale bars or markers: those of its exported clouds.
 
     None where it was never placed, or on the earth: its clouds are exported in a CRS then, and its cameras stay put.
     """
     reference = (chunk.findtext("reference") or "").strip()
-    return _outside_from_chunk(chunk) if not reference or reference.startswith(LOCAL) else None
+    placed = _outside_from_chunk(chunk)
+    if reference and not reference.startswith(LOCAL):
+        return None
+    if placed is not None and _on_earth(placed):
+        raise StageError(f"{where} lies on the earth, but names no CRS; choose one for the chunk, and export it again")
+    return placed
 
 
 def _outside_from_chunk(chunk: ET.Element) -> Sim3 | None:
     """A chunk's transform, into local or geocentric coordinates; None where it was never placed."""
-    placed = [*chunk.iterfind("components/component/transform"), *chunk.iterfind("transform")]
+    active, components = _active(chunk), list(chunk.iterfind("components/component"))
+    chosen = [one for one in components if active is None or one.attrib.get("id") == active]
+    placed = [transform for one in [*chosen[:1], chunk] for transform in one.iterfind("transform")]
     if not placed:
         return None
     rotation, translation, scale = (placed[0].findtext(name) for name in ("rotation", "translation", "scale"))
     turn = np.eye(3) if rotation is None else np.array(rotation.split(), dtype=float).reshape(3, 3)
     shift = np.zeros(3) if translation is None else np.array(translation.split(), dtype=float).reshape(3)
-    return Sim3(1.0 if scale is None else float(scale), turn, shift)
+    size = 1.0 if scale is None else float(scale)
+    if not size > 0:
+        raise ValueError(f"the scale of its transform is {size:g}")
+    return Sim3(size, turn, shift)
 
 
 def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:

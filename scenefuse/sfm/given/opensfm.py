@@ -9,9 +9,9 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from scenefuse.io.tables import read_lines
-from scenefuse.sfm.given.place import Place
+from scenefuse.sfm.given.place import Place, check_crs
 from scenefuse.sfm.posed_photos import PosedPhoto
-from scenefuse.sfm.survey.crs import read_crs
+from scenefuse.sfm.survey.crs import plane, read_crs
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 
@@ -68,13 +68,18 @@ def opensfm_place(file: Path) -> Place | None:
         return None
     lines = [line for _, line in read_lines(coords)]
     try:
-        offset = np.array([*map(float, lines[1].split()[:2]), 0.0])
-        moved = Sim3(1.0, np.eye(3), offset)
+        east, north = map(float, lines[1].split())
     except (IndexError, ValueError):
-        raise StageError(
-            f"{coords} is damaged: its second line gives no offset; copy it again out of the project"
-        ) from None
-    return Place(moved, False, read_crs(lines[0], str(coords)))
+        east = north = np.nan
+    if not np.isfinite([east, north]).all():
+        raise StageError(f"{coords} is damaged: its second line is no offset; copy it again out of the project")
+    crs = read_crs(lines[0], str(coords))
+    check_crs(crs, str(coords))
+    place = Place(Sim3(1.0, np.eye(3), np.array([east, north, 0.0])), False, crs)
+    if plane(crs).is_geographic:
+        raise StageError(f"{coords}: the CRS {crs.name} is in degrees, and its offset cannot be; copy it again")
+    place.wgs84(np.zeros((1, 3)), str(coords))
+    return place
 
 
 def _camera(entry: dict[str, Any], where: str) -> pycolmap.Camera:

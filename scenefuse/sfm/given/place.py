@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from pyproj.transformer import TransformerGroup
 
-from scenefuse.sfm.survey.crs import plane, to_wgs84
+from scenefuse.sfm.survey.crs import plane, to_wgs84, unit_m
 from scenefuse.stage import StageError, quantity
 from scenefuse.transforms import Array, Sim3
 
@@ -38,7 +38,7 @@ class Place:
     def model_from(self, points: Array, crs: pyproj.CRS) -> Array:
         """The inverse, (N, 3) to (N, 3), of points in any CRS."""
         if crs != self.crs:
-            points = _through(pyproj.Transformer.from_crs(crs, self.crs, always_xy=True), points)
+            points = _through(_best(crs, self.crs, f"{crs.name} and {self.crs.name}"), points)
         earth = self._earth_from_crs(points) if self.geocentric else points
         return self.earth_from_model.inverse().apply(earth)
 
@@ -78,16 +78,23 @@ class Place:
         """From longitude, latitude and height on the CRS's datum to the CRS."""
         datum = plane(self.crs).geodetic_crs
         assert datum is not None
-        target = self.crs if self.crs.is_compound else plane(self.crs).to_3d()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # pyproj warns of the grids of which the error below tells.
-            group = TransformerGroup(datum.to_3d(), target, always_xy=True, allow_ballpark=False)
-        if not (group.transformers and group.best_available):
-            raise StageError(
-                f"heights of {self.crs.name} need a geoid that is not installed; export cameras and cloud again in"
-                f" {plane(self.crs).name}, with heights above its ellipsoid, or install PROJ's grids (projsync)"
-            )
-        return group.transformers[0]
+        return _best(datum.to_3d(), self.crs, self.crs.name)
+
+
+def check_crs(crs: pyproj.CRS, where: str) -> None:
+    """StageError where a CRS counts other than metres, or degrees from Greenwich.
+
+    Args:
+        crs: of a project.
+        where: the file that names it, for the message.
+    """
+    datum = plane(crs).geodetic_crs
+    odd = unit_m(crs) != 1 or datum is None or {axis.unit_name for axis in datum.axis_info[:2]} != {"degree"}
+    if odd or (datum is not None and datum.prime_meridian is not None and datum.prime_meridian.longitude != 0):
+        raise StageError(
+            f"{where}: the CRS {crs.name} does not count in metres, or not in degrees from Greenwich; choose another"
+            " for the project, a UTM zone for instance, and export cameras and cloud again"
+        )
 
 
 def read_place(content: Mapping[str, Any]) -> Place | None:
@@ -96,6 +103,20 @@ def read_place(content: Mapping[str, Any]) -> Place | None:
         return None
     matrix, geocentric, wkt = (content[name]["value"] for name in NAMES)
     return Place(Sim3.from_matrix(np.array(matrix)), geocentric, pyproj.CRS.from_wkt(wkt))
+
+
+def _best(one: pyproj.CRS, two: pyproj.CRS, names: str) -> pyproj.Transformer:
+    """The way from one CRS to another, heights too."""
+    one, two = (crs if crs.is_compound else crs.to_3d() for crs in (one, two))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # pyproj warns of the grids of which the error below tells.
+        group = TransformerGroup(one, two, always_xy=True, allow_ballpark=False)
+    if not (group.transformers and group.best_available):
+        raise StageError(
+            f"heights of {names} need a geoid, or a grid, that is not installed; export cameras and cloud again with"
+            " heights above the ellipsoid, in a UTM zone for instance, or install PROJ's grids (projsync)"
+        )
+    return group.transformers[0]
 
 
 def _through(transformer: pyproj.Transformer, points: Array, direction: str = "FORWARD") -> Array:

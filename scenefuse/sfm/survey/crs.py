@@ -9,7 +9,7 @@ from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 
 # OpenDroneMap's way to name a UTM zone.
-UTM = re.compile(r"WGS84 UTM (\d{1,2})([NS])", re.IGNORECASE)
+UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
 # A CRS is used so far beyond its area at most, in degrees: one UTM zone.
 BEYOND_DEG = 6.0
 
