@@ -11,6 +11,7 @@ import tyro
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
+from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
     Registration,
@@ -29,6 +30,8 @@ from scenefuse.version import VERSION
 
 REGISTERED, UNREGISTERED = 0, 3
 NOTHING = Known()
+# An object may be so many times as large as the part of the scene that shows it.
+LARGEST = 10.0
 OUTPUTS = (
     *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
     *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
@@ -90,6 +93,8 @@ def register(
     scales = known.scales()
     _clear(out, [object, scene, *(path for path in (known.fiducials, config) if path)])
     given = _read(object, scene, settings, known)
+    if scales is not None:
+        _check_size(scales, given)
     found = register_clouds(given.object, given.part, settings, seed, ups=given.ups, scales=scales)
     evidence = evidence_of(given.object, given.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": len(given.scene)}
@@ -163,6 +168,16 @@ def write_matrix(path: Path, pose: Sim3) -> None:
     """Write a similarity as four rows of four numbers, as CloudCompare and others read a matrix; no digit is lost."""
     with atomic_file(path) as temporary:
         np.savetxt(temporary, pose.matrix, fmt="%.17g")
+
+
+def _check_size(scales: ScaleRange, given: Given) -> None:
+    """StageError where the object would be much larger than the part of the scene that shows it."""
+    most, part = scales.centre * float(np.exp(scales.width)), given.part.diagonal
+    if most * given.object.diagonal > LARGEST * part:
+        raise StageError(
+            f"at a scale of {most:.4g} the object would be {most * given.object.diagonal:.4g} across, and the searched"
+            f" part of the scene is {part:.4g}; correct --scale or --scale-range: scene units per object unit"
+        )
 
 
 def _write_placed(path: Path, cloud: Cloud, crs: str | None) -> None:

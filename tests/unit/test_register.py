@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,6 +78,8 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
     assert abs(scale) < 1e-6 and angle < 2 and shift < 0.01
     assert "8 fiducials" in value(content, "searched") and "ground removed" in value(content, "searched")
     assert value(content, "tilt_deg") < 5
+    with pytest.raises(StageError, match="at a scale of 1000 the object would be .* across, and the searched part"):
+        register(**files, known=replace(known, scale=1000.0), out=tmp_path / "other")
     placed = read_cloud(out / "object_in_scene.ply").points
     pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
     assert np.abs(placed - pose.apply(read_cloud(tmp_path / "house.xyz").points)).max() < 1e-8
