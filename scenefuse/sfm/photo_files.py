@@ -19,15 +19,17 @@ CAMERA_PLACES = (".", "sparse", "sparse/0", "opensfm")
 CAMERA_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images", "frames", "rigs") for kind in ("bin", "txt"))
 CAMERA_FILES += ("transforms.json", "transforms_train.json", "reconstruction.json")
 BUNDLER = ".out"
+# Where in an OpenDroneMap project its place on the earth is.
+COORDS = "odm_georeferencing/coords.txt"
 
 
 def camera_files(given: Path) -> list[Path]:
     """The files that hold cameras of another program: in a folder, or a file itself with what belongs to it."""
     if given.is_file():
-        listed = bundler_list(given)
-        return [given, *([listed] if listed else [])]
+        listed, coords = bundler_list(given), given.parent.parent / COORDS
+        return [given, *([listed] if listed else []), *([coords] if coords.is_file() else [])]
     places = [given / place / name for place in CAMERA_PLACES for name in CAMERA_FILES]
-    return [file for file in places if file.is_file()] or [given]
+    return [file for file in [*places, given / COORDS] if file.is_file()] or [given]
 
 
 def bundler_list(file: Path) -> Path | None:

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.io.tables import read_lines
 from scenefuse.sfm.given.place import Place, check_crs
+from scenefuse.sfm.photo_files import COORDS
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.sfm.survey.crs import plane, read_crs
 from scenefuse.stage import StageError
@@ -18,8 +19,8 @@ from scenefuse.transforms import Sim3
 FILE = "reconstruction.json"
 # Where an OpenDroneMap project has it.
 PLACES = (FILE, f"opensfm/{FILE}")
-# What an OpenDroneMap project that lies on the earth has beside it, and beside its folder.
-TOPOCENTRIC, COORDS = "reconstruction.topocentric.json", "odm_georeferencing/coords.txt"
+# What an OpenDroneMap project that lies on the earth has beside it.
+TOPOCENTRIC = "reconstruction.topocentric.json"
 
 
 def find_opensfm(data: Path) -> Path | None:
