@@ -222,8 +222,10 @@ def test_a_project_far_from_its_photos_gps_is_refused(given):
         (lambda points: points[:, [0, 2, 1]], "only .* of its points .*; export cloud and cameras in the same"),
         (lambda points: MODEL_FROM_LOCAL.inverse().apply(points), "does not lie in the coordinates of the row's cam"),
         (lambda points: 3 * points, "does not lie in the coordinates of the row's cameras"),
+        (lambda points: points + [0, 0.26, 0], r"% if they are moved by [23].* % of the cameras' distance"),
+        (lambda points: points.mean(0) + 1.03 * (points - points.mean(0)), r"and scaled by \+[23].* % \(another datum"),
     ],
-    ids=["crs", "swapped axes", "metres", "another unit"],
+    ids=["crs", "swapped axes", "metres", "another unit", "another datum", "3 % larger"],
 )
 def test_a_cloud_in_other_coordinates_than_the_cameras_is_one_sentence(given, moved, sentence):
     write_cloud(given / "cloud.ply", Cloud(moved(read_cloud(given / "cloud.ply").points)))
