@@ -29,8 +29,8 @@ LEAST_PHOTOS = 3
 # met by a smaller share of the points that the photos' own matches give in its box. Of four right clouds 66 % were met
 # or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
 LEAST_SEEN, LEAST_MET = 0.1, 0.2
-# Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off; so it
-# is where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
+# Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off, and
+# where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
 USUALLY_MET, BETTER_MET, MOST_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 NEAR = 0.002
