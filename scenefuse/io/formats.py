@@ -102,10 +102,10 @@ def check_projected(path: Path) -> None:
     """StageError where a LAS or LAZ file is in degrees."""
     import pyproj
 
-    crs = las_crs(path)
-    if crs is not None and pyproj.CRS.from_wkt(crs).is_geographic:
-        name = pyproj.CRS.from_wkt(crs).name
-        raise StageError(f"{path} is in degrees ({name}); project it to metres first, to UTM for instance")
+    wkt = las_crs(path)
+    crs = None if wkt is None else pyproj.CRS.from_wkt(wkt)
+    if crs is not None and crs.is_geographic:
+        raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
 
 
 def _common_name(name: str) -> str:

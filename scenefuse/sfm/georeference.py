@@ -26,6 +26,7 @@ from scenefuse.sfm.survey.placement import (
     GpsCameras,
     Placement,
     beside_gps,
+    middle_of,
     place_by_control,
     place_by_gps,
     scaled,
@@ -156,7 +157,7 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
     frame = replace(local_frame(there), grid=grid_name(place.crs))
     fitted, reason = fit_sim3(corners, frame.apply(there)), f"where its cameras were given, in {place.crs.name}"
     if len(gps.names):
-        off = _middle(frame.apply(gps.positions) - fitted.apply(gps.centres))
+        off = middle_of(frame.apply(gps.positions) - fitted.apply(gps.centres))
         if np.linalg.norm(off[:2]) > ELSEWHERE_M:
             raise StageError(
                 f"the given cameras lie {np.linalg.norm(off[:2]) / 1000:.3g} km from where the photos' GPS saw them;"
@@ -165,12 +166,6 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
         reason += f" ({np.linalg.norm(off[:2]):.1f} m from the photos' GPS, {-off[2]:+.1f} m in height)"
     none = np.zeros(0, dtype=bool)
     return Georeference(Placement("georeferenced", reason, fitted, none, "measured", False), frame, gps)
-
-
-def _middle(off: Array) -> Array:
-    """(3,) medians of (N, 3) differences; 0 where none is known."""
-    known = [column[np.isfinite(column)] for column in off.T]
-    return np.array([np.median(column) if len(column) else 0.0 for column in known])
 
 
 def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, freedom: Freedom) -> dict[str, Any]:

@@ -20,7 +20,6 @@ import numpy as np
 import open3d as o3d
 import pandas as pd
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.fusion.changes import FROM_OBJECT, together
@@ -34,7 +33,7 @@ from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
 from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.stage import StageError, read_json, run, threads, value
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, step_to_planes
 from scenefuse.workspace import read_workspace
 
 # Points drawn on the true surface, as the workflow's evaluation draws them.
@@ -226,8 +225,9 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
 
     Errors are vectors to the true surface. For `deviation`, an error within the object's frame, the added points are
     aligned to the truth by their surface; `shift_pct` is how far this moves them from where the object's cameras put
-    them: the model's own bending, which belongs to the pose. A surface has no place along itself: an axis
-    counts where the surface faces it within 45 degrees.
+    them: the model's own bending, which belongs to the pose. `by_cameras` is without this alignment. `in_world` are
+    errors in the scene, aligned to the truth by its cameras, within `world_deviation`: the scene's bending is in
+    neither. A surface has no place along itself: an axis counts where the surface faces it within 45 degrees.
     """
     folder = case.results / "objects" / case.name
     evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
@@ -238,7 +238,9 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     placed = truth_from_scene.apply(added.points[measured])
     aligned = surface_alignment(placed, case.known)
     points, bounds = aligned.apply(placed), 2 * truth_from_scene.scale * added.fields["deviation"][measured]
-    errors = _to_surface(points, case.known)
+    errors, in_world = _to_surface(points, case.known), case.truth_from_scene
+    world = in_world.apply(added.points[measured])
+    world_bounds = 2 * in_world.scale * added.fields["world_deviation"][measured]
     whole = case.known.fit.truth_from_model.apply(case.object.points)
     total, nerf_only = (value(evidence, f"object_{name}") for name in ("points", "nerf_only"))
     yield {
@@ -248,6 +250,8 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
         "deviation_median_over_diagonal": float(np.median(bounds)) / 2 / case.known.diagonal,
         "shift_pct": 100 * float(np.linalg.norm(points.mean(0) - placed.mean(0))) / case.known.diagonal,
         **{f"{axis}_within_2_sd": share for axis, share in zip("xyz", _within(points, bounds, case.known))},
+        **{f"{axis}_by_cameras": share for axis, share in zip("xyz", _within(placed, bounds, case.known))},
+        **{f"{axis}_in_world": share for axis, share in zip("xyz", _within(world, world_bounds, case.known))},
         "distance_within_2_sd": float((np.linalg.norm(errors, axis=1) <= bounds).mean()),
         "added_within_1pct": float((np.linalg.norm(errors, axis=1) <= 0.01 * case.known.diagonal).mean()),
         "object_within_1pct": _share_near(whole, case.known),
@@ -303,13 +307,10 @@ def surface_alignment(points: Array, known: ObjectTruth) -> Sim3:
     points, found = points[:: max(1, len(points) // ALIGNED)], Sim3.identity()
     for _ in range(ALIGNMENTS):
         moved = found.apply(points)
-        normals, middle = _normals_there(moved, known), moved.mean(0)
-        off, lever = (_to_surface(moved, known) * normals).sum(1), moved - middle
+        normals = _normals_there(moved, known)
+        off = (_to_surface(moved, known) * normals).sum(1)
         weights = 1 / np.sqrt(np.maximum(1, np.abs(off) / (1.5 * np.median(np.abs(off)))))
-        along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
-        step = -np.linalg.lstsq(along * weights[:, None], off * weights, rcond=None)[0]
-        turn, scale = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(step[6]))
-        found = Sim3(scale, turn, middle + step[3:6] - scale * turn @ middle) @ found
+        found = step_to_planes(moved, normals, off, weights) @ found
     return found
 
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
 
 from scenefuse.stage import threads
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, step_to_planes
 
 # Points of the model that are laid on the cloud, and neighbours in it that say how its surface lies.
 MOST_POINTS, NEIGHBOURS = 20_000, 8
@@ -27,10 +26,5 @@ def cloud_from_own(points: Array, own: Array) -> Sim3:
         around = points[near[rows]]
         middle = around.mean(1)
         normals = np.linalg.eigh(np.einsum("nki,nkj->nij", *[around - middle[:, None]] * 2))[1][:, :, 0]
-        centre = moved[rows].mean(0)
-        lever, off = moved[rows] - centre, ((moved[rows] - middle) * normals).sum(1)
-        along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
-        step = -np.linalg.lstsq(along, off, rcond=None)[0]
-        turn, scale = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(np.clip(step[6], -0.1, 0.1)))
-        found = Sim3(scale, turn, centre + step[3:6] - scale * turn @ centre) @ found
+        found = step_to_planes(moved[rows], normals, ((moved[rows] - middle) * normals).sum(1)) @ found
     return found

@@ -165,7 +165,7 @@ def beside_gps(
     """
     fitted, points = placement.local_from_model, placement.used
     difference = target - fitted.apply(gps.centres)
-    shift = _middle(difference)
+    shift = middle_of(difference)
     if np.linalg.norm(shift[:2]) > ELSEWHERE_M:
         raise StageError(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
@@ -199,7 +199,7 @@ def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
     return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, BENT * extent))
 
 
-def _middle(difference: Array) -> Array:
+def middle_of(difference: Array) -> Array:
     """(3,) medians of (N, 3) differences; 0 where none is known."""
     known = np.isfinite(difference)
     return np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
