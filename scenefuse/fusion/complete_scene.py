@@ -9,11 +9,12 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenefuse.fusion.changes import Changes, added_by, merged, read_changes, with_source
-from scenefuse.io.clouds import Cloud, laz_in_parts, records_of, spacing
+from scenefuse.io.clouds import Cloud, records_of, spacing
+from scenefuse.io.tiles.copc import write_copc
 from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
 from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.job_records import JobRecords, why_unfinished
-from scenefuse.sfm.geodesy import GridFrame, LocalFrame, scene_frame
+from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.version import VERSION
 
@@ -31,10 +32,10 @@ class CompletionInputs:
     failed: tuple[str, ...] = ()
     """Names of the objects that failed before they were fused; whatever is in their folders is out of date."""
     georeference_json: Path | None = None
-    """JSON with `crs` and `crs_from_scene` for the LAZ file, or nothing."""
+    """JSON with `crs` and `crs_from_scene` for the COPC file, or nothing."""
 
 
-def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: Path, report: Path) -> None:
+def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc: Path, report: Path) -> None:
     """Put into the scene what every object adds, and leave out what any takes away (method F3).
 
     The scene is read and written part by part, so that memory does not grow with it. Where objects overlap, the points
@@ -45,7 +46,7 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
     Args:
         inputs: see CompletionInputs.
         completed: output PLY, the scene's frame, tile by tile; the points in the order of the scene's cloud.
-        completed_laz: output LAZ of the same, in the CRS where the scene is georeferenced.
+        completed_copc: output COPC (a LAZ with an octree) of the same, in the CRS where the scene is georeferenced.
         report: output JSON: what each `source` is, the points that each object added, and the objects that are not in
             it, unregistered or failed, each with its reason.
     """
@@ -71,7 +72,11 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
         if len(cloud):
             print(f"{inputs.objects[cloud.fields['source'][0] - 1].name}: {len(cloud)} points", flush=True)
     frame = None if inputs.georeference_json is None else scene_frame(read_json(inputs.georeference_json))
-    counts = _write(scene, merged(changes), added, frame, completed, completed_laz)
+    counts = _write(scene, merged(changes), added, completed)
+    if frame is None:
+        write_copc(completed_copc, open_cloud(completed), lambda points: points, None)
+    else:
+        write_copc(completed_copc, open_cloud(completed), frame.in_crs, frame.crs)
     content = _report(counts, len(scene), [folder.name for folder in inputs.objects], unregistered, failed) | {
         "crs": quantity(None if frame is None else frame.crs, ""),
         "version": quantity(VERSION, ""),
@@ -80,9 +85,7 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_laz: 
     write_json(report, content)
 
 
-def _write(
-    scene: TiledCloud, changes: Changes, added: list[Cloud], frame: LocalFrame | GridFrame | None, ply: Path, laz: Path
-) -> dict[int, int]:
+def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) -> dict[int, int]:
     """Write the completed scene part by part: the scene's tiles in their order, then a tile for what each object adds.
 
     Returns the number of points of each `source`.
@@ -97,19 +100,12 @@ def _write(
         table[name] = values
     like = changes.left_of(np.zeros(0, np.int64), scene.like)
     like = replace(like, fields=dict(sorted(like.fields.items())))
-    row = records_of(like, ply).dtype
-    origin = np.zeros(3) if frame is None else frame.in_crs(np.zeros((1, 3)))[0]
-    box = boxes[:, :3].min(0), boxes[:, 3:].max(0)
-    with (
-        reserved(ply, row, int(table["count"].sum()), len(table)) as (file, _),
-        laz_in_parts(laz, like, box, origin, None if frame is None else frame.crs) as append,
-    ):
+    row = records_of(like, path).dtype
+    with reserved(path, row, int(table["count"].sum()), len(table)) as (file, _):
         for cloud in chain((changes.left_of(*part) for part in scene.parts()), added):
-            part = _with_columns_of(like, cloud)
-            records = records_of(part, ply)
+            records = records_of(_with_columns_of(like, cloud), path)
             assert records.dtype == row
             file.write(records.tobytes())
-            append(replace(part, points=part.points if frame is None else frame.in_crs(part.points) - origin))
         file.write(table.tobytes())
     return {0: int(left.sum())} | {int(cloud.fields["source"][0]): len(cloud) for cloud in added}
 

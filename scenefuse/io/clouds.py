@@ -246,6 +246,58 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
         append(cloud)
 
 
+@dataclass(frozen=True)
+class LasLayout:
+    """How points are written as LAS 1.4: steps, offsets, CRS and further columns.
+
+    Attributes:
+        header: with the columns, the steps and the CRS; counts and boxes are not filled in.
+        names: what the clouds' fields are called in it.
+        origin: (3,) coordinates of the clouds' local origin.
+    """
+
+    header: Any
+    names: dict[str, str]
+    origin: NDArray[np.float64]
+
+    @classmethod
+    def of(
+        cls, path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]],
+        origin: NDArray[np.float64], crs: str | None,
+    ) -> "LasLayout":  # fmt: skip
+        """For clouds of `like`'s columns; see `laz_in_parts`."""
+        import laspy
+        import pyproj
+
+        header = laspy.LasHeader(point_format=7, version="1.4")
+        low, high = box
+        if crs is not None:
+            step, offset = 0.001, np.floor(origin)
+        else:  # LAS counts steps from the offset in 32 bits, and the points may lie anywhere
+            step, offset = (float(np.linalg.norm(high - low)) or 1.0) * 1e-8, origin + (low + high) / 2
+        header.scales, header.offsets = np.full(3, step), offset
+        if crs is not None:
+            header.add_crs(pyproj.CRS.from_user_input(crs))
+        names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
+        for name, values in like.fields.items():
+            kind = f"{values.dtype.kind}{values.dtype.itemsize}"
+            header.add_extra_dim(laspy.ExtraBytesParams(names[name], kind, LAS_DESCRIPTIONS.get(name, "")))
+        return cls(header, names, origin)
+
+    def records(self, part: Cloud) -> Any:
+        """A `laspy.ScaleAwarePointRecord` of some points."""
+        import laspy
+
+        points = laspy.ScaleAwarePointRecord.zeros(len(part), header=self.header)
+        points.x, points.y, points.z = (part.points + self.origin).T
+        points.return_number = points.number_of_returns = np.ones(len(part), np.uint8)
+        if part.colors is not None:
+            points.red, points.green, points.blue = part.colors.astype(np.uint16).T * 257
+        for name, values in part.fields.items():
+            points[self.names[name]] = values
+        return points
+
+
 @contextmanager
 def laz_in_parts(
     path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
@@ -265,33 +317,15 @@ def laz_in_parts(
     """
     import laspy
     import lazrs
-    import pyproj
 
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    low, high = box
-    step = 0.001 if crs is not None else max(float(np.linalg.norm(high - low)), 1e-300) * 1e-8
-    # LAS counts steps from the offset in 32 bits; without a CRS the points may lie anywhere.
-    middle = (low + high) / 2 if crs is None else 0.0
-    header.scales, header.offsets = np.full(3, step), np.floor(origin + middle)
-    if crs is not None:
-        header.add_crs(pyproj.CRS.from_user_input(crs))
-    names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
-    for name, values in like.fields.items():
-        kind = f"{values.dtype.kind}{values.dtype.itemsize}"
-        header.add_extra_dim(laspy.ExtraBytesParams(names[name], kind, LAS_DESCRIPTIONS.get(name, "")))
+    layout = LasLayout.of(path, like, box, origin, crs)
 
     def append(part: Cloud) -> None:
-        points = laspy.ScaleAwarePointRecord.zeros(len(part), header=header)
-        points.x, points.y, points.z = (part.points + origin).T
-        if part.colors is not None:
-            points.red, points.green, points.blue = part.colors.astype(np.uint16).T * 257
-        for name, values in part.fields.items():
-            points[names[name]] = values
-        writer.write_points(points)
+        writer.write_points(layout.records(part))
 
     with atomic_file(path) as temporary:
         try:
-            with laspy.open(temporary, mode="w", header=header) as writer:
+            with laspy.open(temporary, mode="w", header=layout.header) as writer:
                 yield append
         except lazrs.LazrsError as error:  # it does not say why, and only writing can fail
             left = shutil.disk_usage(temporary.parent).free / 1e9

@@ -144,7 +144,7 @@ def _completed_lines(fields: Fields) -> list[str]:
     added = find(fields, "completed.added_points")
     if added is None:
         return _line("completed", "not written with all decisions; look at the log of complete_scene")
-    parts = ["completed.ply, completed.laz", _pairs([("points", find(fields, "completed.points"), "")])]
+    parts = ["completed.ply, completed.copc.laz", _pairs([("points", find(fields, "completed.points"), "")])]
     parts += [f"{name} adds {count}" for name, count in added.items()]
     parts += [f"without {name}" for name in find(fields, "completed.unregistered") or {}]
     parts += [f"without {name}, which failed" for name in find(fields, "completed.failed") or {}]

@@ -121,8 +121,8 @@ def _scene_section(folder: Path, scenes: list[dict[str, str]], view: View | None
     parts = [f'<h2 id="scene-{escape(folder.name)}">Scene {escape(folder.name)}</h2>']
     if row.get("completed_points", "-") not in ("-", ""):
         parts.append(
-            f"<p><code>{escape(str(folder))}/completed.ply</code> and <code>completed.laz</code>: the scene with all "
-            f"registered objects in it ({escape(row['completed_by'])}), {escape(row['completed_points'])} points; "
+            f"<p><code>{escape(str(folder))}/completed.ply</code> and <code>completed.copc.laz</code>: the scene with "
+            f"all registered objects in it ({escape(row['completed_by'])}), {escape(row['completed_points'])} points; "
             "<code>source</code> says where each is from, <code>completed.json</code> what its numbers mean.</p>"
         )
     if view is not None:

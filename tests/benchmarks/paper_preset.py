@@ -139,8 +139,7 @@ def join(folder: Path, of: Path, scene: Path, fiducials: Path, settings: dict[st
         if arm != "full":
             compute_metrics(fine_json=made / "fine.json", report=made / "metrics.json", **measured)
     made = folder / "registration/full"
-    ways = {"fused": "fused.ply", "fused_scene": "fused_scene.ply", "fused_laz": "fused_scene.laz"}
-    ways |= {"checked": "checked.ply", "evidence": "evidence.json", "report": "fusion.json"}
+    ways = {"fused": "fused.ply", "checked": "checked.ply", "evidence": "evidence.json", "report": "fusion.json"}
     fuse_object(
         inputs=FusionInputs(folder / "object.ply", scene / "dense.ply", made / "crop.ply", made / "crop.json",
                             made / "fine.json", georeference_json=scene / "georeference.json"),

@@ -214,7 +214,7 @@ def stages(folder: Path, completed: bool) -> dict[str, Cost]:
     if completed:
         records = JobRecords(folder / "logs", folder / "benchmarks")
         inputs = CompletionInputs(scene=scene, objects=[house], jobs=records, georeference_json=georeference)
-        files = {"completed": folder / "completed.ply", "completed_laz": folder / "completed.laz"}
+        files = {"completed": folder / "completed.ply", "completed_copc": folder / "completed.copc.laz"}
         found["completed"] = timed(complete_scene, inputs=inputs, **files, report=folder / "completed.json")
     return found
 

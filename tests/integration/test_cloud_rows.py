@@ -59,7 +59,7 @@ def test_the_house_is_found_and_fills_the_scene_in_its_own_coordinates(project, 
     fusion = read_json(folder / "fusion.json")
     assert value(fusion, "mode") == "fill" and value(fusion, "added_points") > 500
     assert "neither side has photos" in " ".join(value(fusion, "notes"))
-    before, after = (laspy.read(project.path / name) for name in ("yard.laz", "results/scenes/yard/completed.laz"))
+    before, after = (laspy.read(project.path / name) for name in ("yard.laz", "results/scenes/yard/completed.copc.laz"))
     assert after.header.parse_crs().to_epsg() == 32632
     source = np.asarray(after["source"])
     assert np.array_equal(np.sort(after.xyz[source == 0], axis=0), np.sort(before.xyz, axis=0))

@@ -98,7 +98,7 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     report = json.loads((scene / "completed.json").read_text())
     assert list(report["added_points"]["value"]) == ["shed"] and "2.jpg" in report["failed"]["value"]["barn"]
     assert set(read_cloud(scene / "completed.ply").fields["source"]) == {0, 1}
-    assert (scene / "completed.laz").stat().st_size > 0
+    assert (scene / "completed.copc.laz").stat().st_size > 0
     measured = json.loads((scene / "metrics.json").read_text())["completion"]
     assert measured["objects"]["value"] == 1 and measured["surface_variation"]["value"] < 1e-6
     table = pd.read_csv(summary / "registration.tsv", sep="\t").set_index("object")

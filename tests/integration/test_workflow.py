@@ -86,7 +86,7 @@ def test_the_completed_scene_holds_what_the_object_adds(finished):
     assert np.array_equal(completed.points, np.concatenate([kept, added.points]))
     assert np.array_equal(completed.fields["source"], np.repeat([0, 1], [len(kept), len(added)]))
     assert json.loads((scene / "completed.json").read_text())["sources"]["value"] == {"0": "scene", "1": "house"}
-    assert (scene / "completed.laz").stat().st_size > 0
+    assert (scene / "completed.copc.laz").stat().st_size > 0
     of_scene, of_house = (json.loads((folder / "metrics.json").read_text())["completion"] for folder in (scene, house))
     for name in ("surface_variation", "surface_variation_null", "nue", "primitive_fitting_score_after"):
         assert of_scene[name]["value"] == pytest.approx(of_house[name]["value"], rel=0.05)
@@ -142,7 +142,7 @@ def test_maps_go_when_no_job_needs_them_only_where_that_is_wanted(finished, snak
 
 
 def test_the_scene_with_one_object_is_a_target(finished, snakemake):
-    result = snakemake(finished, "results/objects/house/fused_scene.laz", "--dry-run")
+    result = snakemake(finished, "results/objects/house/fused_scene.copc.laz", "--dry-run")
     assert planned(result.stdout) == {"complete_scene_with_object"}
 
 

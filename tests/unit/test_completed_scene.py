@@ -66,7 +66,7 @@ def run(folder, scene, objects, mode="fill", refused=(), failed=()):
             jobs=JobRecords(folder / "logs", folder / "benchmarks"),
         ),
         completed=folder / "completed.ply",
-        completed_laz=folder / "completed.laz",
+        completed_copc=folder / "completed.copc.laz",
         report=folder / "completed.json",
     )
     return read_cloud(folder / "completed.ply"), read_json(folder / "completed.json")
@@ -129,10 +129,12 @@ def test_an_unregistered_object_is_named_and_changes_nothing(tmp_path):
     assert np.array_equal(alone.points, scene.points)
 
 
-def test_the_laz_file_holds_the_same_points_with_their_sources(tmp_path):
+def test_the_copc_file_holds_the_same_points_with_their_sources(tmp_path):
     whole, _ = run(tmp_path, strip(0, 20), {"left": strip(0.03, 3, 1.54)})
-    las = laspy.read(tmp_path / "completed.laz")
-    assert np.array_equal(np.asarray(las["source"]), whole.fields["source"]) and whole.fields["source"].max() == 1
+    las = laspy.read(tmp_path / "completed.copc.laz")
+    order, other = (np.lexsort(np.round(points, 6).T) for points in (las.xyz, whole.points))
+    assert np.allclose(las.xyz[order], whole.points[other], atol=1e-6)
+    assert np.array_equal(las["source"][order], whole.fields["source"][other]) and whole.fields["source"].max() == 1
 
 
 def test_a_failed_object_is_named_with_its_reason_and_the_others_keep_their_numbers(tmp_path):

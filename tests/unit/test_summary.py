@@ -220,7 +220,7 @@ def test_the_text_says_that_ground_was_left_in(results):
 def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
     text = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
     assert "PSNR 27.5 dB on training photos" in text and "held-out" not in text
-    assert "completed.ply, completed.laz, points 5030, house adds 30, without balloon" in text
+    assert "completed.ply, completed.copc.laz, points 5030, house adds 30, without balloon" in text
     assert "completed.ply" not in (summarise(results) / "summary.txt").read_text()
 
 
@@ -363,7 +363,7 @@ def test_a_completed_scene_without_a_failed_object_is_shown_and_one_from_before_
     completed = {"points": quantity(5030, "points"), "added_points": quantity({"house": 30}, "points")}
     write_json(results / "scenes/demo/completed.json", completed | {"failed": quantity({"sculpture": "no mask"}, "")})
     text = " ".join((summarise(results) / "summary.txt").read_text().split())
-    assert "completed.ply, completed.laz, points 5030, house adds 30, without sculpture, which failed" in text
+    assert "completed.ply, completed.copc.laz, points 5030, house adds 30, without sculpture, which failed" in text
     assert "completed.ply" not in (summarise(results, ["house"]) / "summary.txt").read_text()
 
 

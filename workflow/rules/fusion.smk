@@ -4,8 +4,8 @@
 #           config: fusion
 # OUTPUTS   results/objects/{object}/fused.ply, checked.ply, evidence.json, fusion.json
 #           results/objects/{object}/missing.ply, missing.json, next_photos.csv, next_photos.geojson
-#           results/scenes/{scene}/completed.ply, completed.laz, completed.json
-#           results/objects/{object}/fused_scene.ply, fused_scene.laz, fused_scene.json      where they are asked for
+#           results/scenes/{scene}/completed.ply, completed.copc.laz, completed.json
+#           results/objects/{object}/fused_scene.ply, fused_scene.copc.laz, fused_scene.json      where they are asked for
 
 
 rule fuse_object:
@@ -100,7 +100,7 @@ rule complete_scene:
         fusions=of_objects("fusion.json"),
     output:
         cloud="results/scenes/{scene}/completed.ply",
-        laz="results/scenes/{scene}/completed.laz",
+        copc="results/scenes/{scene}/completed.copc.laz",
         report="results/scenes/{scene}/completed.json",
     log:
         "results/logs/complete_scene/{scene}.log",
@@ -119,7 +119,7 @@ rule complete_scene:
         "Scene {wildcards.scene}: all objects in it"
     shell:
         "exec python {params.script} --scene {input.scene} --objects {params.objects} --georeference-json {input.georeference}"
-        " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-laz {output.laz}"
+        " --logs results/logs --benchmarks results/benchmarks --completed {output.cloud} --completed-copc {output.copc}"
         " --report {output.report} &> {log}"
 
 
@@ -133,7 +133,7 @@ use rule complete_scene as complete_scene_with_object with:
         fusions="results/objects/{object}/fusion.json",
     output:
         cloud="results/objects/{object}/fused_scene.ply",
-        laz="results/objects/{object}/fused_scene.laz",
+        copc="results/objects/{object}/fused_scene.copc.laz",
         report="results/objects/{object}/fused_scene.json",
     log:
         "results/logs/complete_scene_with_object/{object}.log",

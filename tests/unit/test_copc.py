@@ -1,0 +1,132 @@
+"""Clouds written as COPC: every reader of LAZ has all points, and a reader of COPC what is near or coarse."""
+
+import sys
+
+import laspy
+import numpy as np
+import pytest
+from laspy.copc import load_octree_for_query
+from scipy.spatial import cKDTree
+
+from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.tiles import copc, tiled_cloud, write_tiles
+from scenefuse.io.tiles.copc import write_copc
+from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.io.tiles.write_tiles import write_tiled
+
+UTM = np.array([462_000.0, 5_260_000.0, 400.0])
+
+
+@pytest.fixture
+def small_nodes(monkeypatch):
+    """Tiles of 500 points, cubes of 3000 in memory, nodes of 200 points and 8 cells along an axis."""
+    for module in (tiled_cloud, write_tiles):
+        monkeypatch.setattr(module, "WHOLE", 2000)
+        monkeypatch.setattr(module, "TILE", 500)
+    monkeypatch.setattr(write_tiles, "POINTS_A_CELL", 20)
+    for name, number in {"AT_ONCE": 3000, "NODE_POINTS": 200, "GRID_BITS": 3, "TILES_HELD": 2}.items():
+        monkeypatch.setattr(copc, name, number)
+
+
+def ground(count=20_000, seed=0):
+    """Rolling ground of 100 m x 100 m, half of its points on a plot of 10 m x 10 m."""
+    rng = np.random.default_rng(seed)
+    x, y = np.concatenate([rng.uniform(0, 100, (count // 2, 2)), rng.uniform(40, 50, (count // 2, 2))]).T
+    points = np.stack([x, y, 2 * np.sin(x / 9)], axis=1)
+    fields = {"source": np.arange(count, dtype=np.uint16), "deviation": rng.random(count).astype(np.float32)}
+    return Cloud(points, colors=rng.integers(0, 256, (count, 3)).astype(np.uint8), fields=fields)
+
+
+def turned(points):
+    """A CRS whose axes are turned against the cloud's."""
+    return np.stack([-points[:, 1], points[:, 0], points[:, 2]], axis=1) + UTM
+
+
+def written(folder, cloud, in_crs=turned, crs="EPSG:32632"):
+    """The cloud as tiles, and those as COPC."""
+    write_tiled(folder / "a.ply", lambda: [cloud], len(cloud), cloud.points)
+    write_copc(folder / "a.copc.laz", open_cloud(folder / "a.ply"), in_crs, crs)
+    return folder / "a.copc.laz"
+
+
+def places(found):
+    return np.stack([found.x, found.y, found.z], axis=1)
+
+
+def test_every_point_is_there_once_with_all_it_had(tmp_path, small_nodes):
+    cloud = ground()
+    las = laspy.read(written(tmp_path, cloud))
+    order = np.argsort(las["source"])
+    assert np.array_equal(las["source"][order], cloud.fields["source"])
+    assert np.abs(las.xyz[order] - turned(cloud.points)).max() < 6e-4
+    assert np.array_equal(las["deviation"][order], cloud.fields["deviation"])
+    colors = np.stack([las.red, las.green, las.blue], axis=1)[order]
+    assert np.array_equal(colors // 257, cloud.colors)
+    assert las.header.parse_crs().to_epsg() == 32632
+    assert np.allclose([las.header.mins, las.header.maxs], [las.xyz.min(0), las.xyz.max(0)], atol=1e-6)
+    assert las.header.number_of_points_by_return[0] == len(cloud)
+
+
+def test_a_box_is_read_whole_without_the_rest(tmp_path, small_nodes):
+    cloud = ground()
+    low, high = UTM + [-30, 20, -3], UTM + [-20, 30, 3]
+    inside = ((turned(cloud.points) >= low) & (turned(cloud.points) <= high)).all(1)
+    path = written(tmp_path, cloud)
+    with laspy.CopcReader.open(path) as file:
+        found = file.query(laspy.Bounds(mins=low, maxs=high))
+        nodes = load_octree_for_query(
+            file.source, file.copc_info, file.root_page, query_bounds=laspy.Bounds(mins=low, maxs=high)
+        )
+    assert inside.sum() > 50 and set(found["source"]) == set(cloud.fields["source"][inside])
+    assert sum(node.point_count for node in nodes) < len(cloud) / 5
+
+
+def test_every_node_lies_in_its_cube_and_has_points(tmp_path, small_nodes):
+    path = written(tmp_path, ground())
+    with laspy.CopcReader.open(path) as file:
+        nodes = load_octree_for_query(file.source, file.copc_info, file.root_page)
+        assert len(nodes) > 50 and max(node.key.level for node in nodes) >= 5
+        seen = 0
+        for node in nodes:
+            found = file.query(node.bounds, level=node.key.level)
+            assert node.point_count > 0 and len(found) >= node.point_count
+            seen += node.point_count
+    assert seen == 20_000
+
+
+def test_a_coarse_level_is_even_where_the_cloud_is_not(tmp_path, small_nodes):
+    cloud = ground()
+    with laspy.CopcReader.open(written(tmp_path, cloud)) as file:
+        coarse = places(file.query(level=range(3)))
+        cell = file.copc_info.spacing / 4
+    in_plot = (np.abs(coarse[:, :2] - turned(np.array([[45.0, 45, 0]]))[0, :2]) < 5).all(1)
+    assert in_plot.mean() < 0.03  # a hundredth of the area, with half of the points
+    # Every place of the ground has a point of it within two cells.
+    assert cKDTree(coarse).query(turned(cloud.points))[0].max() < 2 * np.sqrt(3) * cell
+
+
+def test_without_a_crs_and_for_few_or_equal_points(tmp_path):
+    for points in (np.zeros((1, 3)), np.full((300, 3), 7.25), 5.3 + np.array([[0, 0, 0], [1e-3, 0, 0]])):
+        path = written(tmp_path, Cloud(points), lambda x: x, None)
+        with laspy.CopcReader.open(path) as file:
+            assert np.allclose(np.sort(places(file.query()), axis=0), np.sort(points, axis=0), atol=1e-9)
+
+
+def test_the_same_cloud_gives_the_same_file(tmp_path, small_nodes):
+    one, other = (written(tmp_path, ground()).read_bytes() for _ in range(2))
+    assert one == other
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+def test_a_file_that_does_not_fit_leaves_nothing(tmp_path):
+    import resource
+
+    write_cloud(tmp_path / "a.ply", Cloud(np.random.default_rng(0).random((200_000, 3))))
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):  # a full disk is put in words for all stages, in stage.py
+            write_copc(tmp_path / "a.copc.laz", open_cloud(tmp_path / "a.ply"), lambda x: x, None)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
