@@ -272,7 +272,7 @@ class LasLayout:
         header = laspy.LasHeader(point_format=7, version="1.4")
         low, high = box
         if crs is not None:
-            step, offset = 0.001, np.floor(origin)
+            step, offset = _step_of(path, np.maximum(np.abs(low), np.abs(high))), np.floor(origin)
         else:  # LAS counts steps from the offset in 32 bits, and the points may lie anywhere
             step, offset = (float(np.linalg.norm(high - low)) or 1.0) * 1e-8, origin + (low + high) / 2
         header.scales, header.offsets = np.full(3, step), offset
@@ -296,6 +296,18 @@ class LasLayout:
         for name, values in part.fields.items():
             points[self.names[name]] = values
         return points
+
+
+def _step_of(path: Path, farthest: NDArray[np.float64]) -> float:
+    """A millimetre, or what 32 bits can count as far as strays lie, however axes are turned and in feet as well."""
+    step = 0.001
+    while 4 * np.linalg.norm(farthest) / step >= 1 << 31:
+        step *= 10
+    if step > 0.001:
+        print(
+            f"note: points lie up to {farthest.max():.3g} from the origin; {path.name} counts in {step:g}", flush=True
+        )
+    return step
 
 
 @contextmanager

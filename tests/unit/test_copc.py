@@ -112,6 +112,16 @@ def test_without_a_crs_and_for_few_or_equal_points(tmp_path):
             assert np.allclose(np.sort(places(file.query()), axis=0), np.sort(points, axis=0), atol=1e-9)
 
 
+def test_a_stray_far_away_costs_digits_and_is_named(tmp_path, capsys):
+    points = np.random.default_rng(0).random((1000, 3))
+    points[0] = [5e6, 0, 0]
+    write_cloud(tmp_path / "a.ply", Cloud(points))
+    write_copc(tmp_path / "a.copc.laz", open_cloud(tmp_path / "a.ply"), turned, "EPSG:32632")
+    assert "points lie up to 5e+06 from the origin; a.copc.laz counts in 0.01" in capsys.readouterr().out
+    found = laspy.read(tmp_path / "a.copc.laz").xyz
+    assert len(found) == 1000 and abs(np.sort(found[:, 1])[-1] - UTM[1] - 5e6) < 0.006
+
+
 def test_the_same_cloud_gives_the_same_file(tmp_path, small_nodes):
     one, other = (written(tmp_path, ground()).read_bytes() for _ in range(2))
     assert one == other
