@@ -144,7 +144,6 @@ class _Octree:
         end = 0
         for child, records in children:
             start, end = end, end + len(records)
-            chosen[start] &= not chosen[start:end].all()  # a child with nothing in it would hide its own children
             self.nodes.add(child, records[~chosen[start:end]])
         return every[chosen]
 
@@ -176,9 +175,11 @@ class _Nodes:
         file.write(bytes(8))
 
     def add(self, key: Key, records: Records) -> None:
-        """Write a node."""
+        """Write a node, if it has points."""
         import lazrs
 
+        if not len(records):
+            return
         stream = io.BytesIO()
         compressor = lazrs.LasZipCompressor(stream, self.laszip)
         compressor.compress_many(records.tobytes())
@@ -196,7 +197,11 @@ class _Nodes:
         lazrs.write_chunk_table(table, [(count, size) for _, _, size, count in self.chunks], self.laszip)
         self.file.write(table.getvalue())
         end = self.file.tell()
-        entries = b"".join(ENTRY.pack(*key, *rest) for key, *rest in self.chunks)
+        nodes = {key: rest for key, *rest in self.chunks}
+        for level, x, y, z in list(nodes):
+            for up in range(1, level + 1):  # without points of their own, but readers come to their children by them
+                nodes.setdefault((level - up, x >> up, y >> up, z >> up), [0, 0, 0])
+        entries = b"".join(ENTRY.pack(*key, *rest) for key, rest in nodes.items())
         self.file.write(EXTENDED.pack(0, b"copc", 1000, len(entries), b"") + entries)
         self.header.point_count = sum(count for *_, count in self.chunks)
         self.header.number_of_points_by_return = np.array([self.header.point_count, *[0] * 14], np.uint64)
