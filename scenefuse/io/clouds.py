@@ -299,7 +299,12 @@ class LasLayout:
 
 
 def _step_of(path: Path, farthest: NDArray[np.float64]) -> float:
-    """A millimetre, or what 32 bits can count as far as strays lie, however axes are turned and in feet as well."""
+    """A thousandth of the CRS's unit, or more where 32 bits do not count as far as strays lie.
+
+    Args:
+        path: for the note.
+        farthest: (3,) largest distance from the origin along each axis; the factor of 4 is for turned axes and feet.
+    """
     step = 0.001
     while 4 * np.linalg.norm(farthest) / step >= 1 << 31:
         step *= 10

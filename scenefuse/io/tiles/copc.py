@@ -72,12 +72,14 @@ class _Source:
         high: (T, 3) opposite corner.
         counts: (T,) points of each tile.
         read: gives the records of a tile.
+        none: no records.
     """
 
     low: Steps
     high: Steps
     counts: Steps
     read: Callable[[int], Records]
+    none: Records
 
     @classmethod
     def of(cls, cloud: TiledCloud, in_crs: Callable[[Array], Array], layout: LasLayout) -> "_Source":
@@ -92,7 +94,7 @@ class _Source:
 
         places = (_places(read(tile)) for tile in range(len(cloud.low)))
         low, high = zip(*((steps.min(0), steps.max(0)) for steps in places))
-        return cls(np.stack(low), np.stack(high), np.diff(cloud.starts), read)
+        return cls(np.stack(low), np.stack(high), np.diff(cloud.starts), read, read(0)[:0])
 
     def shares(self, tiles: Steps, low: Steps, high: Steps) -> Array:
         """(T,) the share of each tile's box that lies in the cube from `low` (3,) up to, without, `high` (3,)."""
@@ -115,17 +117,18 @@ class _Octree:
         side = 1 << (self.bits - key[0])
         low = self.low + np.array(key[1:]) * side
         shares = self.source.shares(tiles, low, low + side)
+        few = shares @ self.source.counts[tiles] <= AT_ONCE
         tiles = tiles[shares > 0]
-        if shares.sum() == 0 or shares[shares > 0] @ self.source.counts[tiles] <= AT_ONCE or key[0] == self.bits:
+        if few or key[0] == self.bits:
             return self._of_records(key, self._inside(tiles, low, low + side))
         return self._coarser(key, [(child, self.of_tiles(child, tiles)) for child in _children(key)])
 
     def _inside(self, tiles: Steps, low: Steps, high: Steps) -> Records:
-        found = []
+        found = [self.source.none]
         for records in (self.source.read(int(tile)) for tile in tiles):
             places = _places(records)
             found.append(records[((places >= low) & (places < high)).all(1)])
-        return np.concatenate(found) if found else self.source.read(0)[:0]
+        return np.concatenate(found)
 
     def _of_records(self, key: Key, records: Records) -> Records:
         """The same from the points in the cube."""
@@ -138,8 +141,7 @@ class _Octree:
 
     def _coarser(self, key: Key, children: list[tuple[Key, Records]]) -> Records:
         """What a cube takes of its children's points, one for each cell of its grid; writes what each keeps."""
-        children = [(child, records) for child, records in children if len(records)]
-        every = np.concatenate([records for _, records in children]) if children else self.source.read(0)[:0]
+        every = np.concatenate([self.source.none, *(records for _, records in children)])
         chosen = _one_a_cell(_places(every) - self.low, max(self.bits - key[0] - GRID_BITS, 0))
         end = 0
         for child, records in children:
@@ -160,7 +162,10 @@ def _one_a_cell(places: Steps, shift: int) -> NDArray[np.bool_]:
 
 
 class _Nodes:
-    """The file: header, nodes as chunks of LAZ one after the other, table of chunks, hierarchy."""
+    """The file: header, nodes as chunks of LAZ one after the other, table of chunks, hierarchy.
+
+    `low` (3,) and `bits` are in steps, as in the octree; `middle` (3,) and `half` of its cube in coordinates.
+    """
 
     def __init__(self, file: BinaryIO, header: Any, low: Steps, bits: int) -> None:
         import lazrs
