@@ -15,7 +15,7 @@ from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cl
 from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.stage import quantity, read_json, threads, value, write_json
+from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.version import VERSION
 
 
@@ -49,6 +49,9 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
         completed_copc: output COPC (a LAZ with an octree) of the same, in the CRS where the scene is georeferenced.
         report: output JSON: what each `source` is, the points that each object added, and the objects that are not in
             it, unregistered or failed, each with its reason.
+
+    Raises:
+        StageError: no point is left.
     """
     start = time.perf_counter()
     scene = open_cloud(inputs.scene)
@@ -92,6 +95,8 @@ def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) 
     """
     left = np.diff(scene.starts) - changes.removed_in(scene.starts)
     added = [cloud for cloud in added if len(cloud)]
+    if not added and not left.any():
+        raise StageError(f"of {scene.path} no point is left, and no object adds any: there is no scene to write")
     boxes = np.concatenate([scene.low, scene.high], axis=1)[left > 0]
     boxes = np.concatenate([boxes, *([[*cloud.points.min(0), *cloud.points.max(0)]] for cloud in added)])
     table = np.zeros(len(boxes), ROW_OF_TILE)

@@ -276,6 +276,7 @@ class LasLayout:
         else:  # LAS counts steps from the offset in 32 bits, and the points may lie anywhere
             step, offset = (float(np.linalg.norm(high - low)) or 1.0) * 1e-8, origin + (low + high) / 2
         header.scales, header.offsets = np.full(3, step), offset
+        header.global_encoding.wkt = True  # LAS 1.4 asks it of these columns, with or without a CRS
         if crs is not None:
             header.add_crs(pyproj.CRS.from_user_input(crs))
         names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
@@ -310,7 +311,9 @@ def _step_of(path: Path, farthest: NDArray[np.float64]) -> float:
         step *= 10
     if step > 0.001:
         print(
-            f"note: points lie up to {farthest.max():.3g} from the origin; {path.name} counts in {step:g}", flush=True
+            f"note: points lie up to {farthest.max():.3g} from the origin, so {path.name} counts in {step:g} of its"
+            " CRS's unit: take these strays out of the scene's cloud, and it counts in 0.001",
+            flush=True,
         )
     return step
 

@@ -4,13 +4,14 @@ from dataclasses import replace
 
 import laspy
 import numpy as np
+import pytest
 
 from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene, without_overlaps
 from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.job_records import JobRecords
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
 SETTINGS = FusionSettings(mode="fill")
@@ -135,6 +136,12 @@ def test_the_copc_file_holds_the_same_points_with_their_sources(tmp_path):
     order, other = (np.lexsort(np.round(points, 6).T) for points in (las.xyz, whole.points))
     assert np.allclose(las.xyz[order], whole.points[other], atol=1e-6)
     assert np.array_equal(las["source"][order], whole.fields["source"][other]) and whole.fields["source"].max() == 1
+
+
+def test_a_scene_of_which_nothing_is_left_is_an_error_without_outputs(tmp_path):
+    with pytest.raises(StageError, match=r"of .*scene\.ply no point is left, and no object adds any"):
+        run(tmp_path, strip(0, 0), {})
+    assert not list(tmp_path.glob("completed*"))
 
 
 def test_a_failed_object_is_named_with_its_reason_and_the_others_keep_their_numbers(tmp_path):

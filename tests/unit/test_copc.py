@@ -11,8 +11,10 @@ from scipy.spatial import cKDTree
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.io.tiles import copc, tiled_cloud, write_tiles
 from scenefuse.io.tiles.copc import write_copc
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled
+from scenefuse.sfm.geodesy import LocalFrame
+from scenefuse.stage import StageError
 
 UTM = np.array([462_000.0, 5_260_000.0, 400.0])
 
@@ -110,6 +112,7 @@ def test_without_a_crs_and_for_few_or_equal_points(tmp_path):
     for points in (np.zeros((1, 3)), np.full((300, 3), 7.25), 5.3 + np.array([[0, 0, 0], [1e-3, 0, 0]])):
         path = written(tmp_path, Cloud(points), lambda x: x, None)
         with laspy.CopcReader.open(path) as file:
+            assert file.header.global_encoding.wkt
             assert np.allclose(np.sort(places(file.query()), axis=0), np.sort(points, axis=0), atol=1e-9)
 
 
@@ -118,9 +121,38 @@ def test_a_stray_far_away_costs_digits_and_is_named(tmp_path, capsys):
     points[0] = [5e6, 0, 0]
     write_cloud(tmp_path / "a.ply", Cloud(points))
     write_copc(tmp_path / "a.copc.laz", open_cloud(tmp_path / "a.ply"), turned, "EPSG:32632")
-    assert "points lie up to 5e+06 from the origin; a.copc.laz counts in 0.01" in capsys.readouterr().out
+    assert "points lie up to 5e+06 from the origin, so a.copc.laz counts in 0.01 of its" in capsys.readouterr().out
     found = laspy.read(tmp_path / "a.copc.laz").xyz
     assert len(found) == 1000 and abs(np.sort(found[:, 1])[-1] - UTM[1] - 5e6) < 0.006
+
+
+def test_a_stray_without_a_place_in_the_crs_is_named_and_leaves_no_file(tmp_path):
+    points = np.random.default_rng(0).random((1000, 3))
+    points[7] = [5e7, 0, 0]
+    write_cloud(tmp_path / "a.ply", Cloud(points))
+    frame = LocalFrame(47.5, 8.5, 400.0)
+    with pytest.raises(StageError, match=r"a\.ply: points such as \(5e\+07, 0, 0\) .*no coordinates there: remove"):
+        write_copc(tmp_path / "a.copc.laz", open_cloud(tmp_path / "a.ply"), frame.in_crs, frame.crs)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_memory_is_bounded_where_a_tile_is_a_heap_with_strays(tmp_path, small_nodes, monkeypatch):
+    """Boxes that strays stretch over all of the scene say nothing of where the points are."""
+    points = np.random.default_rng(0).random((20_000, 3)) * [5, 5, 1]
+    points[::50] *= 200
+    cloud = Cloud(points)
+    starts = np.arange(0, 20_001, 500)
+    parts = [points[start : start + 500] for start in starts[:-1]]
+    low, high = (np.array([end(part, 0) for part in parts]) for end in (np.min, np.max))
+    heap = TiledCloud(tmp_path / "a.ply", None, 0, starts, low, high)
+    monkeypatch.setattr(TiledCloud, "like", property(lambda _: cloud[:0]))
+    monkeypatch.setattr(TiledCloud, "read", lambda _, tiles: (None, Cloud(np.concatenate([parts[k] for k in tiles]))))
+    held = []
+    of_records = copc._Octree._of_records
+    monkeypatch.setattr(copc._Octree, "_of_records", lambda *args: held.append(len(args[2])) or of_records(*args))
+    write_copc(tmp_path / "a.copc.laz", heap, lambda x: x, None)
+    assert max(held) <= 2 * copc.AT_ONCE
+    assert np.allclose(np.sort(laspy.read(tmp_path / "a.copc.laz").xyz, axis=0), np.sort(points, axis=0), atol=1e-4)
 
 
 @pytest.mark.parametrize("case", ["stray", "clusters", "equal", "line"])

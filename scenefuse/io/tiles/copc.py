@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from scenefuse.io.clouds import LasLayout
 from scenefuse.io.tiles.tiled_cloud import AT_ONCE, TiledCloud
-from scenefuse.stage import atomic_file
+from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Array
 
 GRID_BITS = 7
@@ -49,6 +49,9 @@ def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], 
         cloud: the points, with at least one.
         in_crs: gives the coordinates (N, 3) in the CRS of points (N, 3).
         crs: anything pyproj understands; None when the coordinates are in no CRS.
+
+    Raises:
+        StageError: points lie where the CRS has no coordinates, or the disk is full.
     """
     box = cloud.low.min(0), cloud.high.max(0)
     layout = LasLayout.of(path, cloud.like, box, in_crs(np.zeros((1, 3)))[0], crs)
@@ -89,6 +92,13 @@ class _Source:
         def read(tile: int) -> Records:
             part = cloud.read(np.array([tile]))[1]
             points = in_crs(part.points) - layout.origin
+            nowhere = ~np.isfinite(points).all(1)
+            if nowhere.any():
+                one = ", ".join(f"{x:.6g}" for x in part.points[nowhere][0])
+                raise StageError(
+                    f"{cloud.path}: points such as ({one}) lie so far from the origin that the scene's CRS has no"
+                    " coordinates there: remove them from the scene's cloud"
+                )
             records: Records = layout.records(replace(part, points=points)).array
             return records
 
@@ -119,15 +129,21 @@ class _Octree:
         shares = self.source.shares(tiles, low, low + side)
         few = shares @ self.source.counts[tiles] <= AT_ONCE
         tiles = tiles[shares > 0]
-        if few or key[0] == self.bits:
-            return self._of_records(key, self._inside(tiles, low, low + side))
+        most = np.inf if key[0] == self.bits else 2 * AT_ONCE
+        inside = self._inside(tiles, low, low + side, most) if few or key[0] == self.bits else None
+        if inside is not None:
+            return self._of_records(key, inside)
         return self._coarser(key, [(child, self.of_tiles(child, tiles)) for child in _children(key)])
 
-    def _inside(self, tiles: Steps, low: Steps, high: Steps) -> Records:
-        found = [self.source.none]
+    def _inside(self, tiles: Steps, low: Steps, high: Steps, most: float) -> Records | None:
+        """The points in a cube; None if there are more than so many, as where a tile's points lie in heaps."""
+        found, count = [self.source.none], 0
         for records in (self.source.read(int(tile)) for tile in tiles):
             places = _places(records)
             found.append(records[((places >= low) & (places < high)).all(1)])
+            count += len(found[-1])
+            if count > most:
+                return None
         return np.concatenate(found)
 
     def _of_records(self, key: Key, records: Records) -> Records:
