@@ -1,6 +1,7 @@
 """Clouds written as COPC: every reader of LAZ has all points, and a reader of COPC what is near or coarse."""
 
 import sys
+import tracemalloc
 
 import laspy
 import numpy as np
@@ -136,23 +137,26 @@ def test_a_stray_without_a_place_in_the_crs_is_named_and_leaves_no_file(tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["a.ply"]
 
 
-def test_memory_is_bounded_where_a_tile_is_a_heap_with_strays(tmp_path, small_nodes, monkeypatch):
+def test_memory_is_bounded_where_tiles_are_heaps_with_strays(tmp_path, small_nodes, monkeypatch):
     """Boxes that strays stretch over all of the scene say nothing of where the points are."""
-    points = np.random.default_rng(0).random((20_000, 3)) * [5, 5, 1]
+    points = np.random.default_rng(0).random((30_000, 3)) * [5, 5, 1]
     points[::50] *= 200
     cloud = Cloud(points)
-    starts = np.arange(0, 20_001, 500)
-    parts = [points[start : start + 500] for start in starts[:-1]]
+    parts = np.split(points, 60)
     low, high = (np.array([end(part, 0) for part in parts]) for end in (np.min, np.max))
-    heap = TiledCloud(tmp_path / "a.ply", None, 0, starts, low, high)
+    heap = TiledCloud(tmp_path / "a.ply", None, 0, np.arange(0, 30_001, 500), low, high)
     monkeypatch.setattr(TiledCloud, "like", property(lambda _: cloud[:0]))
     monkeypatch.setattr(TiledCloud, "read", lambda _, tiles: (None, Cloud(np.concatenate([parts[k] for k in tiles]))))
-    held = []
-    of_records = copc._Octree._of_records
-    monkeypatch.setattr(copc._Octree, "_of_records", lambda *args: held.append(len(args[2])) or of_records(*args))
-    write_copc(tmp_path / "a.copc.laz", heap, lambda x: x, None)
-    assert max(held) <= 2 * copc.AT_ONCE
-    assert np.allclose(np.sort(laspy.read(tmp_path / "a.copc.laz").xyz, axis=0), np.sort(points, axis=0), atol=1e-4)
+    peaks = []
+    for at_once in (3000, len(cloud)):
+        monkeypatch.setattr(copc, "AT_ONCE", at_once)
+        tracemalloc.start()
+        write_copc(tmp_path / "a.copc.laz", heap, lambda x: x, None)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+        found = laspy.read(tmp_path / "a.copc.laz").xyz
+        assert np.allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=1e-4)
+    assert peaks[0] < peaks[1] / 2
 
 
 @pytest.mark.parametrize("case", ["stray", "clusters", "equal", "line"])
