@@ -40,6 +40,7 @@ from scenefuse.fusion.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.io.tiles.tiled_cloud import Rows, open_cloud
 from scenefuse.io.units import length_unit
+from scenefuse.registration.frame_ledger import frame_ledger
 from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.stage import quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, box_around
@@ -68,7 +69,9 @@ class FusionInputs:
     scene_workspace: Path | None = None
     """The scene's, in the frame of its cloud; without it the scene is judged by the object's photos."""
     georeference_json: Path | None = None
-    """JSON of the scene, for the unit of its lengths, or nothing."""
+    """JSON of the scene, for the unit of its lengths and its place in the world, or nothing."""
+    object_json: Path | None = None
+    """JSON of the object cloud, for its other frames, or nothing."""
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,8 @@ class FusionOutputs:
     """JSON: what photos say of both sides' points."""
     report: Path
     """JSON: counts, distances, gain, status."""
+    frames: Path | None = None
+    """JSON, the frame ledger: every transform between the object's frames."""
 
 
 @dataclass(frozen=True)
@@ -176,6 +181,9 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
     write_json(outputs.report, content)
+    if outputs.frames is not None:
+        ledger = frame_ledger(pose, inputs.object_json, inputs.georeference_json)
+        write_json(outputs.frames, ledger | {"status": content["registration"]})
 
 
 def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: float) -> tuple[Array, Array]:

@@ -17,7 +17,7 @@ _OBJECT_FILES = (
 _SCENE_FILES = ("photos.json", "features.db", "matches.json", "sparse.json", "georeference.json", "undistorted.json")
 # The same of an object whose cloud was given with its photos; masks are made only where they mark it.
 _POSED_FILES = tuple(name for name in _OBJECT_FILES if not name.startswith(("masks", "stage")))
-_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json", "metrics.json")
+_JOIN_FILES = ("crop.json", "scale.json", "coarse.json", "fine.json")
 Given = Literal["photos", "cloud", "both"]
 """What of a scene or an object the user gave; `both`: photos, cameras, and a cloud in their coordinates."""
 ALONE = "by itself"
@@ -119,11 +119,15 @@ def collect(
 
 
 def _collect_variants(folder: Path, variants: list[str]) -> tuple[dict[str, Fields], dict[str, str]]:
-    """The quantities of each variant's registration, and the first file that each incomplete one lacks."""
+    """The quantities of each variant's registration, and the first file that each incomplete one lacks.
+
+    The first variant is fused, and its metrics are the object's.
+    """
     found: dict[str, Fields] = {}
     gaps: dict[str, str] = {}
     for variant in variants:
-        there, lacking = unbroken(folder / "registration" / variant, _JOIN_FILES)
+        names = _JOIN_FILES if variant == variants[0] else (*_JOIN_FILES, "metrics.json")
+        there, lacking = unbroken(folder / "registration" / variant, names)
         found[variant] = read_fields(folder / "registration" / variant, there)
         if lacking:
             gaps[variant] = f"registration/{variant}/{lacking}"

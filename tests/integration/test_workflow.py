@@ -114,7 +114,7 @@ SUMMARY = {"draw_object", "write_summary", "write_report", "all"}
             {"fusion": {"density": 2.0}},
             {
                 *("fuse_object", "find_missing", "complete_scene", "view_scene"),
-                *("compute_metrics", "compute_scene_metrics", "evaluate_object", "write_frame_ledger"),
+                *("compute_metrics", "compute_scene_metrics", "evaluate_object"),
             },
         ),
     ],

@@ -12,9 +12,10 @@ from scenefuse.fusion.modes import FusionSettings
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.import_cloud import import_object_cloud, import_scene_cloud, near_origin
 from scenefuse.registration.crop.crop_scene import points_in
-from scenefuse.registration.frame_ledger import write_frame_ledger
+from scenefuse.registration.frame_ledger import frame_ledger
 from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.stage import StageError, read_json, value
+from scenefuse.transforms import Sim3
 
 
 @pytest.fixture
@@ -167,18 +168,9 @@ def test_points_of_an_objects_own_file_reach_the_world_by_the_ledger(tmp_path, c
     write_cloud(tmp_path / "b.ply", moved)
     import_object_cloud(source=tmp_path / "b.ply", cloud=tmp_path / "object.ply", report=tmp_path / "object.json")
     obj, scene = read_cloud(tmp_path / "object.ply").points, read_cloud(tmp_path / "dense.ply").points
-    pose = np.eye(4)
-    pose[:3, :3] *= 3
-    pose[:3, 3] = scene[0] - 3 * obj[0]
-    fusion = {"scene_from_object": quantity(pose, ""), "registration": quantity("registered", "")}
-    write_json(tmp_path / "fusion.json", fusion)
-    write_frame_ledger(
-        object_json=tmp_path / "object.json",
-        fusion_json=tmp_path / "fusion.json",
-        georeference_json=tmp_path / "georeference.json",
-        report=tmp_path / "frames.json",
-    )
-    matrix = np.array(value(read_json(tmp_path / "frames.json"), "world_from_file"))
+    pose = Sim3(3.0, np.eye(3), scene[0] - 3 * obj[0])
+    ledger = frame_ledger(pose, tmp_path / "object.json", tmp_path / "georeference.json")
+    matrix = np.array(value(ledger, "world_from_file"))
     assert np.allclose(moved.points @ matrix[:3, :3].T + matrix[:3, 3], cloud.points, atol=1e-3)
 
 

@@ -14,7 +14,7 @@ from scenefuse.registration.candidates import match, ransac_similarities, uprigh
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
 from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import register_finely, scale_ledger
-from scenefuse.registration.frame_ledger import round_trip, write_frame_ledger
+from scenefuse.registration.frame_ledger import frame_ledger, round_trip
 from scenefuse.registration.free_space import read_free_space
 from scenefuse.registration.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.registration.paper import register_as_paper
@@ -270,20 +270,13 @@ def test_a_line_and_a_point_are_one_sentence(tmp_path, house, size, where):
 def test_frame_ledger_inverts_every_transform(tmp_path):
     pose = Sim3(2.5, Rotation.random(random_state=1).as_matrix(), np.array([4e5, 5e6, 100.0]))
     write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([0.5, 0.5, 0.5, 1.0]), "")})
-    write_json(
-        tmp_path / "f.json",
-        {"scene_from_object": quantity(pose.matrix, ""), "registration": quantity("registered", "")},
-    )
-    write_frame_ledger(
-        object_json=tmp_path / "o.json", fusion_json=tmp_path / "f.json", report=tmp_path / "frames.json"
-    )
-    ledger = read_json(tmp_path / "frames.json")
+    ledger = frame_ledger(pose, tmp_path / "o.json", None)
     assert np.allclose(value(ledger, "scene_from_nerf"), (pose @ Sim3(2.0, np.eye(3), np.zeros(3))).matrix)
     assert value(ledger, "world_from_scene") is None
     assert round_trip(pose) < 1e-8
-    write_json(tmp_path / "f.json", {"scene_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
-    with pytest.raises(StageError, match="not a similarity"):
-        write_frame_ledger(object_json=tmp_path / "o.json", fusion_json=tmp_path / "f.json", report=tmp_path / "x.json")
+    write_json(tmp_path / "o.json", {"nerf_from_object": quantity(np.diag([1.0, 2, 3, 1]), "")})
+    with pytest.raises(StageError, match=r"nerf_from_object in .*o\.json is not a similarity.*rerun its stage"):
+        frame_ledger(pose, tmp_path / "o.json", None)
 
 
 def test_a_scale_at_the_edge_of_its_prior_is_refused(house):

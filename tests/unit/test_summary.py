@@ -45,13 +45,16 @@ def results(tmp_path):
                 write_json(folder / f"registration/{variant}/{stage}.json", {})
             scale = {"scale": quantity(2.0 + k, "scene units per object unit")}
             write_json(folder / f"registration/{variant}/fine.json", fine | scale)
-            scores = {"fitness": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
-            write_json(folder / f"registration/{variant}/metrics.json", {"registration": scores})
+        scores = {
+            v: {"fitness": quantity(0.9 - 0.3 * k, "1"), "tau": quantity(0.05, "m")}
+            for k, v in enumerate(("full", "paper"))
+        }
+        write_json(folder / "registration/paper/metrics.json", {"registration": scores["paper"]})
         completion = {"nue": quantity(1.25, "1"), "nue_null": quantity(2.5, "1")}
         completion |= {
             f"surface_variation{e}": quantity(v, "1") for e, v in (("", 0.1), ("_before", 0.3), ("_after", 0.2))
         }
-        write_json(folder / "metrics.json", {"completion": completion})
+        write_json(folder / "metrics.json", {"registration": scores["full"], "completion": completion})
         removed = {"photos see a surface behind it": 4, "no photo can see it": 0, "the object measured it better": 12}
         notes = {"notes": quantity(["judged by the scene's photos"], "")}
         write_json(folder / "evidence.json", {"scene_removed": quantity(removed, "points")} | notes)
@@ -150,7 +153,7 @@ def test_one_name_has_one_source(results):
     fine = results / "objects/house/registration/full/fine.json"
     content = json.loads(fine.read_text()) | {"f_score": quantity(0.5, "1"), "fitness": quantity(0.7, "1")}
     write_json(fine, content)
-    metrics = results / "objects/house/registration/full/metrics.json"
+    metrics = results / "objects/house/metrics.json"
     write_json(metrics, {"registration": {"f_score": quantity(0.6, "1")}})
     row = read(summarise(results), "registration").set_index(["object", "variant"]).loc[("house", "full")]
     assert row["f_score"] == 0.5 and np.isnan(row["fitness"]) and np.isnan(row["fitness_f_score"])

@@ -2,7 +2,7 @@
 #
 # INPUTS    results/objects/{object}/object.ply, undistorted/, registration/full/; results/scenes/{scene}/dense.ply, undistorted/;
 #           config: fusion
-# OUTPUTS   results/objects/{object}/fused.ply, checked.ply, evidence.json, fusion.json
+# OUTPUTS   results/objects/{object}/fused.ply, checked.ply, evidence.json, fusion.json, frames.json
 #           results/objects/{object}/missing.ply, missing.json, next_photos.csv, next_photos.geojson
 #           results/scenes/{scene}/completed.ply, completed.copc.laz, completed.json
 #           results/objects/{object}/fused_scene.ply, fused_scene.copc.laz, fused_scene.json      where they are asked for
@@ -25,6 +25,7 @@ rule fuse_object:
         checked="results/objects/{object}/checked.ply",
         evidence="results/objects/{object}/evidence.json",
         report="results/objects/{object}/fusion.json",
+        frames="results/objects/{object}/frames.json",
     log:
         "results/logs/fuse_object/{object}.log",
     benchmark:
@@ -43,10 +44,10 @@ rule fuse_object:
     message:
         "{wildcards.object}: fusion"
     shell:
-        "exec python {params.script} --object {input.cloud} --scene {input.scene} --crop {input.crop} --crop-json {input.crop_json}"
-        " --fine-json {input.fine} {params.photos}"
+        "exec python {params.script} --object {input.cloud} --object-json {input.cloud_json} --scene {input.scene} --crop {input.crop}"
+        " --crop-json {input.crop_json} --fine-json {input.fine} {params.photos}"
         " --georeference-json {input.georeference} --fused {output.fused} --checked {output.checked} --evidence {output.evidence}"
-        " --report {output.report} {params.options} &> {log}"
+        " --report {output.report} --frames {output.frames} {params.options} &> {log}"
 
 
 rule find_missing:

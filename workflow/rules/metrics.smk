@@ -43,7 +43,7 @@ rule compute_metrics:
 
 
 use rule compute_metrics as compute_variant_metrics with:
-    # Registration metrics of one variant, at the full variant's thresholds and on its crop.
+    # Registration metrics of a variant that is not fused, at the full variant's thresholds and on its crop.
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",

@@ -3,7 +3,6 @@
 # INPUTS    config/objects.tsv: fiducials, where there are any; the scene's cloud and model; the object's cloud; config: registration
 # OUTPUTS   results/objects/{object}/alignment.json                          the pose that shared features of the photos give
 #           results/objects/{object}/registration/{variant}/crop.ply, crop.json, scale.json, coarse.json, fine.json, fine.png
-#           results/objects/{object}/frames.json
 #
 # `full` is the variant that is fused; the others run beside it by the same scripts, with other options, and are measured at the same
 # thresholds. `paper` has a crop by fiducials, and the paper's recipe is a stage of its own.
@@ -239,30 +238,3 @@ rule register_as_paper:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
         " {params.gravity} --scale-report {output.scale} --coarse-report {output.coarse} --report {output.fine}"
         " --picture {output.picture} --seed {params.seed} {params.options} &> {log}"
-
-
-rule write_frame_ledger:
-    """Every transform between the object's frames, in one file."""
-    input:
-        cloud="results/objects/{object}/object.json",
-        fusion="results/objects/{object}/fusion.json",
-        georeference=in_scene("georeference.json"),
-    output:
-        "results/objects/{object}/frames.json",
-    log:
-        "results/logs/write_frame_ledger/{object}.log",
-    benchmark:
-        "results/benchmarks/write_frame_ledger/{object}.tsv"
-    conda:
-        "../../envs/registration.yaml"
-    resources:
-        mem_mb=lambda wildcards, attempt: 500 * attempt,
-        runtime=lambda wildcards, attempt: 10 * attempt,
-    params:
-        script=script("registration/write_frame_ledger.py"),
-        code=code("registration/write_frame_ledger.py"),
-    message:
-        "{wildcards.object}: frame ledger"
-    shell:
-        "exec python {params.script} --object-json {input.cloud} --fusion-json {input.fusion} --georeference-json {input.georeference}"
-        " --report {output} &> {log}"
