@@ -8,7 +8,7 @@ def results_of(wildcards):
         "fusion.json",
         "missing.json",
         "frames.json",
-        *(f"registration/{variant}/metrics.json" for variant in VARIANTS[1:]),
+        *(f"registration/{variant}/metrics.json" for variant in list(VARIANTS)[1:]),
     ]
     scene_ends = ["dense.json", "completed.json", "metrics.json"]
     files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
