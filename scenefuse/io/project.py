@@ -165,7 +165,7 @@ def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
 
 
 def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Settings of the variants that run; with recipe `paper` the paper's registration is the one that is fused."""
+    """Settings of the variants that run, first `full`, which is fused: with recipe `paper` the paper's registration."""
     defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
     registration = settings["registration"]
     if settings["object"]["recipe"] == "paper":
@@ -179,4 +179,4 @@ def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
         )
     if "full" not in chosen:
         raise StageError("config, registration.variants: 'full' is missing; it is the one that is fused")
-    return {name: defined[name] for name in chosen}
+    return {name: defined[name] for name in sorted(chosen, key=lambda name: name != "full")}

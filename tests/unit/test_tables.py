@@ -180,6 +180,11 @@ def test_settings_of_a_row_that_are_not_there_are_named_with_the_row(own_project
         read_project({"scenes": "scenes.tsv", "objects": "objects.tsv"})
 
 
+def test_the_variant_that_is_fused_comes_first_in_whatever_order_they_are_written(project):
+    found = project(registration={"variants": ["paper", "no_crop", "full"]})
+    assert list(found.variants) == ["full", "paper", "no_crop"]
+
+
 @pytest.mark.parametrize(
     "changes, sentence",
     [
