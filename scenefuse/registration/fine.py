@@ -144,10 +144,10 @@ def rests_on(best: Hypothesis, evidence: Evidence) -> list[str]:
 
 
 def _stated(outcome: Outcome, bending: tuple[Array | None, Array | None], length: str) -> dict[str, Any]:
-    """The standard deviations of the pose: against the world, with what either model may be bent (covariances of object
-    and scene); and on the scene as it is, which the gate counts."""
-    on_scene, pose = outcome.uncertainty, outcome.ranked[0].pose
-    total = None if on_scene is None else with_bending(on_scene, pose, *bending)
+    """The standard deviations of the pose: against the world, with what the clouds may have wrong alike, and how far
+    either model may be bent (covariances of object and scene); and on the scene as it is, which the gate counts."""
+    on_scene, stated = outcome.uncertainty, outcome.stated
+    total = None if stated is None else with_bending(stated, outcome.ranked[0].pose, *bending)
     known = [name for name, of in zip(("object", "scene"), bending) if of is not None]
     return {
         **uncertainty_quantities(total, length),

@@ -13,7 +13,7 @@ from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
 from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
 from scenefuse.registration.surface import Surface, with_grid, with_queries
-from scenefuse.registration.uncertainty import Uncertainty, half_sampling, with_bending
+from scenefuse.registration.uncertainty import Uncertainty, alike, half_sampling, with_bending
 from scenefuse.transforms import Array, Sim3
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
@@ -41,11 +41,27 @@ RESAMPLINGS = 8
 
 @dataclass(frozen=True)
 class Outcome:
-    """The refined hypotheses, best first, the decision on the first, and its uncertainty."""
+    """The refined hypotheses, best first, the decision on the first, and its uncertainty.
+
+    Attributes:
+        ranked: the hypotheses.
+        decision: on the first.
+        uncertainty: of the first, on the clouds as they are; the gate counts it.
+        alike: (7, 7) what the clouds have wrong alike, where the pose is theirs (see `alike`); None where it is the
+            alignment's.
+    """
 
     ranked: list[Hypothesis]
     decision: Decision
     uncertainty: Uncertainty | None
+    alike: Array | None = None
+
+    @property
+    def stated(self) -> Uncertainty | None:
+        """The uncertainty with what the clouds have wrong alike."""
+        if self.uncertainty is None or self.alike is None:
+            return self.uncertainty
+        return self.uncertainty.plus(self.alike)
 
     def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
         """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
@@ -76,7 +92,11 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings)
-    return Outcome(ranked, decision, uncertainty)
+    pose, alignment = ranked[0].pose, problem.evidence.alignment
+    by_photos = alignment is not None and pose is alignment.pose
+    return Outcome(
+        ranked, decision, uncertainty, None if by_photos else alike(*work.scored, pose, problem.scales, work.narrow)
+    )
 
 
 def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":

@@ -230,7 +230,7 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
             "scale_prior": quantity([found.scales.clamp(0.0), found.scales.clamp(np.inf)], unit),
             "margin": quantity(decision.margin, "1"),
             "free_axis": quantity(decision.free_axis, ""),
-            **uncertainty_quantities(outcome.uncertainty, "scene units"),
+            **uncertainty_quantities(outcome.stated, "scene units"),
             "tilt_deg": quantity(tilt_deg(best.pose, ups), "deg"),
             "gravity_used": quantity(ups is not None, ""),
             "agreement": found.agreement,

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.icp import COLOR_WEIGHT, ScaleRange, refine_planes
 from scenefuse.registration.surface import Surface
-from scenefuse.stage import quantity
+from scenefuse.stage import quantity, threads
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
 # Halves begin this much too large or too small, so that a scale that stays where it is put shows itself.
@@ -18,6 +18,8 @@ ROUNDS = 30
 # Pieces to the scene's diagonal: what errs together stays together.
 PIECES_ACROSS = 6
 MIN_PIECES = 8
+# What a surface has wrong alike all over, as a share of how far two surfaces scatter about each other.
+ALIKE = 0.2
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,10 @@ class Uncertainty:
         """(3,) standard deviations of log scale, of the rotation (degrees) and of the shift (scene units)."""
         return np.array([self.scale_sd_log, self.rotation_sd_deg, self.translation_sd])
 
+    def plus(self, covariance: Array) -> "Uncertainty":
+        """With another error about the same centre, by its covariance (7, 7)."""
+        return Uncertainty.of(self.covariance + covariance)
+
     def with_difference(self, pose: Sim3, other: Sim3, at: Array) -> "Uncertainty":
         """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
         return Uncertainty.even(*np.hypot(self.deviations, _apart(pose, other, at)))
@@ -103,6 +109,32 @@ def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_sce
     if of_scene is not None:
         total += of_scene
     return Uncertainty.of(total)
+
+
+def alike(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: float) -> Array:
+    """What a pose by clouds has wrong because their surfaces err alike, about the object's centre (method R12).
+
+    Stereo fattens, smooths and displaces whole surfaces; neither their scatter nor halves of them show it. It is taken
+    as a fifth of the scatter: of the RMS distance, along the object's normals, of the scene's points that lie on it.
+
+    Args:
+        obj: the object.
+        scene: the scene.
+        pose: scene_from_object.
+        scales: bounds of the scale; one that is held has no error.
+        reach: distance within which a point of the scene lies on the object, scene units.
+
+    Returns:
+        (7, 7) covariance of rotation vector (radians), translation (scene units) and log scale.
+    """
+    points = pose.inverse().apply(scene.points)
+    distance, nearest = obj.tree.query(points, distance_upper_bound=reach / pose.scale, workers=threads())
+    on_it = np.isfinite(distance)
+    off = ((points[on_it] - obj.points[nearest[on_it]]) * obj.normals[nearest[on_it]]).sum(1)
+    shift = ALIKE * pose.scale * float(np.sqrt((off**2).mean())) if on_it.any() else 0.0
+    radius = pose.scale * float(np.sqrt(((obj.points - obj.points.mean(0)) ** 2).sum(1).mean()))
+    of_scale = shift / radius if scales.width > 0 else 0.0
+    return np.diag(np.square([shift / radius] * 3 + [shift] * 3 + [of_scale]))
 
 
 def uncertainty_quantities(uncertainty: Uncertainty | None, length: str) -> dict[str, Any]:

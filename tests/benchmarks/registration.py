@@ -58,7 +58,7 @@ def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
     if not found:
         return Found(None, False, "no hypothesis")
     outcome = refine_hypotheses(problem, [(h.pose, h.source) for h in found], FineSettings())
-    return Found(outcome.ranked[0].pose, outcome.decision.registered, outcome.decision.reason, outcome.uncertainty)
+    return Found(outcome.ranked[0].pose, outcome.decision.registered, outcome.decision.reason, outcome.stated)
 
 
 def paper(trial: Trial, scene: Cloud) -> Found:

@@ -23,7 +23,7 @@ from scenefuse.registration.refinement import refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimate_scale, estimates, prior
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
-from scenefuse.registration.uncertainty import Uncertainty, half_sampling
+from scenefuse.registration.uncertainty import ALIKE, Uncertainty, alike, half_sampling
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
 
@@ -339,6 +339,25 @@ def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_t
     outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, unsure, 40, None)))
     assert outcome.ranked[0].pose is not beside
     np.testing.assert_allclose(outcome.uncertainty.deviations, alone.uncertainty.deviations)
+
+
+def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_poses_by_clouds(house):
+    truth, sigma = house.scene_from_object, 0.003 * house.scene.diagonal
+    obj, scene = surfaces(house, 0.02)
+    rng = np.random.default_rng(0)
+    off = truth.apply(obj.points) + truth.rotate(obj.normals) * rng.normal(0, sigma, (len(obj), 1))
+    scene = replace(scene, points=off)
+    covariance = alike(obj, scene, truth, ScaleRange(truth.scale, 0.3), 5 * sigma)
+    shift = np.sqrt(np.diag(covariance)[3:6])
+    np.testing.assert_allclose(shift, ALIKE * sigma, rtol=0.1)
+    radius = truth.scale * np.linalg.norm(obj.points - obj.points.mean(0), axis=1)
+    np.testing.assert_allclose(np.sqrt(covariance[6, 6]) * np.sqrt((radius**2).mean()), shift[0])
+    assert alike(obj, scene, truth, ScaleRange(truth.scale, 0.0), 5 * sigma)[6, 6] == 0
+    by_clouds = refined(house, truth)
+    assert (by_clouds.stated.deviations > by_clouds.uncertainty.deviations).all()
+    sure = Alignment(truth, Uncertainty.even(1e-5, 1e-3, 1e-4), 40, None)
+    by_photos = refined(house, truth, evidence=Evidence(alignment=sure))
+    assert by_photos.ranked[0].pose is truth and by_photos.stated is by_photos.uncertainty
 
 
 def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncertain(house):
