@@ -51,7 +51,7 @@ def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], 
         crs: anything pyproj understands; None when the coordinates are in no CRS.
 
     Raises:
-        StageError: points lie where the CRS has no coordinates, or the disk is full.
+        StageError: points lie where the CRS has no coordinates.
     """
     box = cloud.low.min(0), cloud.high.max(0)
     layout = LasLayout.of(path, cloud.like, box, in_crs(np.zeros((1, 3)))[0], crs)
@@ -129,10 +129,11 @@ class _Octree:
         shares = self.source.shares(tiles, low, low + side)
         few = shares @ self.source.counts[tiles] <= AT_ONCE
         tiles = tiles[shares > 0]
-        most = np.inf if key[0] == self.bits else 2 * AT_ONCE
-        inside = self._inside(tiles, low, low + side, most) if few or key[0] == self.bits else None
-        if inside is not None:
-            return self._of_records(key, inside)
+        finest = key[0] == self.bits
+        if few or finest:
+            inside = self._inside(tiles, low, low + side, np.inf if finest else 2 * AT_ONCE)
+            if inside is not None:
+                return self._of_records(key, inside)
         return self._coarser(key, [(child, self.of_tiles(child, tiles)) for child in _children(key)])
 
     def _inside(self, tiles: Steps, low: Steps, high: Steps, most: float) -> Records | None:
