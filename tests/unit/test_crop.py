@@ -43,6 +43,16 @@ def test_a_tree_inside_the_box_is_left_out():
     assert not keep[-60:].any()
 
 
+def test_the_papers_crop_is_all_that_lies_in_the_least_box_of_the_fiducials():
+    trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
+    points, marks = trial.scene.points, trial.fiducials
+    settings = replace(SETTINGS, margin=0.3, shape="oriented", minimal=True)
+    cut = crop_cloud(trial.scene, marks, Z, settings)
+    inside = ((points >= marks.min(0)) & (points <= marks.max(0))).all(1)
+    assert inside.any() and (cut.keep == inside).all() and not cut.on_ground.any() and cut.ground is None
+    assert (crop_cloud(trial.scene, marks, Z, replace(settings, minimal=False)).keep != inside).any()
+
+
 def test_without_ground_nothing_is_removed_and_that_is_said():
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     cut = crop_cloud(trial.scene, trial.fiducials, Z, SETTINGS)

@@ -43,6 +43,8 @@ class CropSettings:
     """Share of the object's photos showing a scene point that must have it inside their mask."""
     whole_scene: bool = False
     """Keep the whole scene, whatever the mode: the ablation without cropping, and what is left without any mark."""
+    minimal: bool = False
+    """Keep all that lies in the least upright box around the marks, whatever the rest says: the paper's crop."""
 
 
 @dataclass(frozen=True)
@@ -86,10 +88,14 @@ def crop_cloud(
 ) -> Crop:
     """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
     level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
-    if settings.shape == "oriented":
+    if settings.shape == "oriented" and not settings.minimal:
         level = least_footprint(fiducials @ level.T) @ level
     points, marks = scene.points @ level.T, fiducials @ level.T
     extent = np.ptp(marks, axis=0)
+    if settings.minimal:
+        low, high = marks.min(0), marks.max(0)
+        inside = ((points >= low) & (points <= high)).all(1)
+        return Crop(inside, inside, np.zeros_like(inside), "box", level, low, high, None, [])
     diagonal = float(np.linalg.norm(extent))
     margin = settings.margin * extent + MARGIN_FRACTION * diagonal
     low, high = marks.min(0) - margin, marks.max(0) + margin
