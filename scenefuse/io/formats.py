@@ -28,6 +28,11 @@ OTHER_NAMES = {
     **dict(zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), COLOR * 3)),
 }
 
+# Points of a LAS file that are looked at for what they say beside positions and colours.
+LOOKED_AT = 1_000_000
+# Narrower than this share of its height, a cloud at coordinates like longitude and latitude is in degrees.
+DEGREES_BELOW = 1e-3
+
 
 def read_columns(path: Path) -> Columns:
     """The columns of a cloud file, as the file holds them.
@@ -106,6 +111,34 @@ def check_projected(path: Path) -> None:
     crs = None if wkt is None else pyproj.CRS.from_wkt(wkt)
     if crs is not None and crs.is_geographic:
         raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
+
+
+def check_not_degrees(path: Path, points: NDArray[np.float64]) -> None:
+    """StageError where points (N, 3) of a file can only be longitude, latitude and a height in metres."""
+    low, high = np.percentile(points, [1, 99], axis=0)
+    wide, tall = float((high - low)[:2].max()), float(high[2] - low[2])
+    if (np.maximum(abs(low), abs(high))[:2] <= (360, 90)).all() and 0 < wide < DEGREES_BELOW * tall:
+        raise StageError(
+            f"{path} seems to be in degrees: x and y vary by {wide:.3g} where z varies by {tall:.3g}; project it to"
+            " metres first, to UTM for instance"
+        )
+
+
+def las_dimensions(path: Path) -> list[str]:
+    """What a LAS or LAZ file says of its points beside position, colour and extra dimensions, as far as it differs
+    among the first million or is a class: names of the format; empty for any other file."""
+    if path.suffix.lower() not in (".las", ".laz"):
+        return []
+    import laspy
+
+    with readable(path), laspy.open(path) as file:
+        points = next(iter(file.chunk_iterator(LOOKED_AT)), None)
+    if points is None:
+        return []
+    form = points.point_format
+    names = [name for name in form.standard_dimension_names if name.lower() not in (*POSITION, *COLOR)]
+    values = {name: np.asarray(points[name]) for name in names}
+    return [name for name in names if np.ptp(values[name]) > 0 or (name == "classification" and values[name].any())]
 
 
 def _common_name(name: str) -> str:
@@ -333,43 +366,79 @@ def _text(path: Path) -> Columns:
 
     A line above the rows that names the columns (`//X Y Z R G B`) is believed. Without one, the first three columns are
     x, y, z and each three that follow are normals if they have unit length, else colours; PTS may have an intensity
-    between. A first column that counts the rows is left out.
+    between. A first column that names or numbers the points is left out, and so is what follows the last three, and
+    both are printed.
     """
     with open(path, encoding="utf-8-sig") as file:
         head = list(islice(file, 50))
     if not "".join(head).strip():
         return {name: np.empty(0) for name in POSITION}
-    above = next((k for k, line in enumerate(head) if len(_numbers(line)) >= 3), None)
-    if above is None:
-        raise ValueError("none of its first lines holds three numbers")
+    above, named = _first_row(path, head)
     separator = _separator(head[above])
-    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig")
+    cells = len(head[above].split(separator))
+    wanted = range(1, cells) if named else range(cells)
+    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", usecols=wanted)
     names = [cell.strip() for cell in head[above - 1].strip(" \t\r\n/#").split(separator)] if above else []
+    names = names[cells - len(wanted) :]
     if len(names) == rows.shape[1] and set(POSITION) <= {_common_name(name) for name in names}:
         return dict(zip(names, rows.T))
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
-    if rows.shape[1] > 3 and len(rows) > 3 and (rows[:, 0] == rows[0, 0] + np.arange(len(rows))).all():
-        rows = rows[:, 1:]
+    if not named and _numbers_points(rows):
+        rows, named = rows[:, 1:], True
     columns, start = dict(zip(POSITION, rows.T)), 3
     if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
         columns["intensity"], start = rows[:, 3], 4
-    for first in range(start, rows.shape[1] - 2, 3):
-        three = rows[:, first : first + 3]
+    for start in range(start, rows.shape[1] - 2, 3):
+        three = rows[:, start : start + 3]
         unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
         columns |= dict(zip(NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR, three.T))
+    if named:
+        print(f"{path.name}: its first column names or numbers the points and is left out", flush=True)
+    if further := rows.shape[1] - len(columns):
+        print(f"{path.name}: its last {further} columns have no names and are left out", flush=True)
     return columns
+
+
+def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
+    """Where the rows of numbers begin among the first lines, and whether a name stands before the numbers.
+
+    Raises:
+        ValueError: there are none.
+        StageError: decimals have commas.
+    """
+    lines = [line for line in head if line.strip()]
+    if any(len(re.findall(r"(?<![\d.])-?\d+,\d+(?![\d.,])", line)) >= 3 for line in lines[-1:]):
+        raise StageError(f"{path} has commas as decimal points: '{lines[-1].strip()[:60]}'; export it with points")
+    for named in (False, True):
+        row = next((k for k, line in enumerate(head) if len(_numbers(line, named)) >= 3), None)
+        if row is not None and (not named or all(len(_numbers(line, named)) >= 3 for line in lines[-len(lines) // 2 :])):
+            return row, named
+    raise ValueError("none of its first lines holds three numbers")
+
+
+def _numbers_points(rows: NDArray[np.float64]) -> bool:
+    """Whether the first of (N, C) columns numbers the points: one after the other, or whole numbers, each once, beside
+    coordinates that are not whole."""
+    first = rows[:, 0]
+    if rows.shape[1] <= 3 or len(rows) <= 3:
+        return False
+    if (first == first[0] + np.arange(len(first))).all():
+        return True
+    whole = (rows[:, :3] == np.rint(rows[:, :3])).all(0)
+    return bool(whole[0] and not whole[1:].any() and len(np.unique(first)) == len(first))
 
 
 def _separator(line: str) -> str | None:
     return next((mark for mark in ";," if mark in line), None)
 
 
-def _numbers(line: str) -> list[float]:
-    """The numbers of a line of numbers, none of any other."""
+def _numbers(line: str, named: bool = False) -> list[float]:
+    """The numbers of a line of numbers, with a name before them or not; none of any other."""
+    cells = line.split(_separator(line))
     try:
-        return [float(cell) for cell in line.split(_separator(line))]
+        return [float(cell) for cell in cells[int(named) :]]
     except ValueError:
         return []
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.io.clouds import Cloud, cloud_of, concatenate, finite_rows, spacing, write_cloud
-from scenefuse.io.formats import COLOR, las_crs
+from scenefuse.io.formats import COLOR, check_not_degrees, las_crs, las_dimensions
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
 from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled
@@ -25,6 +25,8 @@ STRAY_PERCENT = 1.0
 SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
+# Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
+NEAR_ZERO = 10_000.0
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -44,10 +46,12 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
     """
     parts = columns_in_parts(source)
     own = survey(source, parts)
+    check_not_degrees(source, own.sample)
     crs = las_crs(source)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
+        _check_place(crs, own, source)
     origin = near_origin(own.sample)
     shift = Sim3(1.0, np.eye(3), origin)
     content = write_placed(cloud, source, parts, own, lambda part: part.transformed(shift.inverse()), unit)
@@ -74,6 +78,7 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     """
     parts = columns_in_parts(source)
     own = survey(source, parts)
+    check_not_degrees(source, own.sample)
     whole = concatenate(list(clouds_in_parts(parts, own)))
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
@@ -138,6 +143,7 @@ def survey(source: Path, parts: ColumnParts) -> Survey:
     if count == 0:
         what = "point with a finite position" if left_out else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
+    unused |= set(las_dimensions(source))
     different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
     if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
         raise StageError(
@@ -187,10 +193,10 @@ def import_report(source: Path, own: Survey, step: float, diagonal: float, unit:
     notes = [f"{own.left_out} rows without a finite position were left out"] if own.left_out else []
     if own.unit_normals is False:
         notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
+    if own.unused:
+        notes.append(f"not taken over, and so not in the results: {', '.join(own.unused)}")
     for note in notes:
         print(note, flush=True)
-    if own.unused:
-        print(f"not used: the columns {', '.join(own.unused)}", flush=True)
     return {
         "points": quantity(own.count, "1"),
         "spacing": quantity(step, unit),
@@ -201,6 +207,19 @@ def import_report(source: Path, own: Survey, step: float, diagonal: float, unit:
         "has_normals": quantity(bool(own.unit_normals), ""),
         "notes": quantity(notes, ""),
     }
+
+
+def _check_place(crs: str, own: Survey, source: Path) -> None:
+    """StageError where the middle of a file's points lies far from where its CRS is used, or at a zero beyond that."""
+    import pyproj
+
+    from scenefuse.io.crs import BEYOND_DEG, check_in_area, plane
+
+    known = pyproj.CRS.from_user_input(crs)
+    if plane(known).is_projected:
+        middle = np.median(own.sample, axis=0)
+        beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
+        check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)
 
 
 def unit_and_name(crs: str) -> tuple[str, str]:

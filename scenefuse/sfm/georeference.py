@@ -16,7 +16,7 @@ from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.sfm.survey.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.sfm.survey.control import Control, read_sighted
-from scenefuse.sfm.survey.crs import grid_name
+from scenefuse.io.crs import grid_name
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.sfm.survey.placement import (
     ELSEWHERE_M,

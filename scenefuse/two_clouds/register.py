@@ -10,7 +10,7 @@ import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.io.formats import las_crs
+from scenefuse.io.formats import check_not_degrees, las_crs
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
@@ -144,6 +144,8 @@ def _clear(out: Path, inputs: list[Path]) -> None:
 def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Known) -> Given:
     up_object, up_scene = known.ups()
     cloud, whole = read_cloud(object), read_cloud(scene)
+    for path, points in ((object, cloud.points), (scene, whole.points)):
+        check_not_degrees(path, points)
     box = None if known.crop_box is None else np.array(known.crop_box)
     part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)

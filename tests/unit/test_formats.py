@@ -215,6 +215,28 @@ def test_a_column_that_counts_the_rows_is_no_coordinate(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "grid.xyz").points[:, 0], np.arange(20) % 10)
 
 
+def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_path, capsys):
+    points = np.random.default_rng(0).uniform(-5, 5, (20, 3)).round(3)
+    numbers = np.random.default_rng(1).permutation(100)[:20]
+    np.savetxt(tmp_path / "thinned.txt", np.column_stack([numbers, points]), fmt="%.3f")
+    rows = [f"P{n} {x} {y} {z} 0.5" for n, (x, y, z) in zip(numbers, points)]
+    (tmp_path / "named.txt").write_text("Survey of 1 2 2026\n" + "\n".join(rows))
+    for name in ("thinned.txt", "named.txt"):
+        np.testing.assert_allclose(read_cloud(tmp_path / name).points, points)
+        assert f"{name}: its first column names or numbers the points" in capsys.readouterr().out
+    np.savetxt(tmp_path / "more.xyz", np.column_stack([points, numbers]), fmt="%.3f")
+    np.testing.assert_allclose(read_cloud(tmp_path / "more.xyz").points, points)
+    assert "its last 1 columns have no names" in capsys.readouterr().out
+
+
+def test_decimal_commas_are_named(tmp_path):
+    (tmp_path / "a.txt").write_text("1,25;2,5;3,75\n2,25;3,5;4,75\n")
+    with pytest.raises(StageError, match=r"commas as decimal points: '2,25;3,5;4,75'"):
+        read_cloud(tmp_path / "a.txt")
+    (tmp_path / "b.csv").write_text("125,25,375\n225,35,475\n")
+    assert read_cloud(tmp_path / "b.csv").points.tolist() == [[125, 25, 375], [225, 35, 475]]
+
+
 def test_a_table_in_degrees_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("Longitude,Latitude,Height\n8.1,47.2,400\n8.2,47.1,401\n8.3,47.3,402\n")
     with pytest.raises(StageError, match=r"is in degrees \(column Longitude\)"):

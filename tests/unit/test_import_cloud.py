@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import laspy
 import numpy as np
 import pytest
 from support.cloud_files import UTM, write_e57
@@ -120,7 +121,7 @@ def test_without_a_crs_nothing_is_called_metres(tmp_path, cloud):
 
 
 def test_feet_are_called_by_their_name(tmp_path, cloud):
-    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), UTM, "EPSG:2263")
+    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), np.array([985_000.0, 195_000.0, 0.0]), "EPSG:2263")
     assert value(imported_scene(tmp_path, tmp_path / "a.laz")[2], "length_unit") == "US survey foot"
 
 
@@ -135,13 +136,36 @@ def test_rows_without_a_position_and_unused_columns_are_recorded(tmp_path, cloud
     write_cloud(tmp_path / "a.ply", Cloud(points, None, None, {"intensity": np.zeros(500, np.float32)}))
     found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
     assert len(found) == 497 and found.fields == {} and value(report, "columns_not_used") == ["intensity"]
-    assert value(report, "notes") == ["3 rows without a finite position were left out"]
+    left_out, unused = value(report, "notes")
+    assert left_out == "3 rows without a finite position were left out" and unused.endswith("results: intensity")
 
 
 def test_normals_that_are_none_are_left_out_and_that_is_said(tmp_path, cloud):
     write_cloud(tmp_path / "a.ply", Cloud(cloud.points, np.zeros((500, 3), np.float32)))
     found, report, _ = imported_scene(tmp_path, tmp_path / "a.ply")
     assert found.normals is None and "not all of unit length" in value(report, "notes")[0]
+
+
+def test_classes_of_a_laz_are_not_taken_over_and_that_is_said(tmp_path, cloud):
+    las = laspy.read(write_as(tmp_path / "a.laz", cloud))
+    las.classification[:100] = 6
+    las.write(tmp_path / "classed.laz")
+    _, report, _ = imported_scene(tmp_path, tmp_path / "classed.laz")
+    assert value(report, "columns_not_used") == ["classification"]
+    assert value(report, "notes") == ["not taken over, and so not in the results: classification"]
+
+
+def test_a_cloud_that_is_not_where_its_crs_says_is_one_sentence(tmp_path, cloud):
+    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), np.zeros(3), "EPSG:32632")
+    with pytest.raises(StageError, match=r"a\.laz, the middle of its points: .* does not lie in WGS 84 / UTM zone 32N"):
+        imported_scene(tmp_path, tmp_path / "a.laz")
+
+
+def test_longitude_and_latitude_without_a_word_are_refused(tmp_path, cloud):
+    points = (cloud.points - UTM) * [1e-5, 1e-5, 1] + [8.1, 47.2, 400]
+    np.savetxt(tmp_path / "a.xyz", points)
+    with pytest.raises(StageError, match="seems to be in degrees: x and y vary by"):
+        imported_scene(tmp_path, tmp_path / "a.xyz")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.given.offset import cloud_from_own
 from scenefuse.sfm.given.place import read_place
-from scenefuse.sfm.survey.crs import plane
+from scenefuse.io.crs import plane
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.workspace import View, posed_images, read_model, read_views, view_of, with_mask

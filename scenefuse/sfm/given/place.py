@@ -9,7 +9,7 @@ import numpy as np
 import pyproj
 from pyproj.transformer import TransformerGroup
 
-from scenefuse.sfm.survey.crs import plane, to_wgs84, unit_m
+from scenefuse.io.crs import plane, to_wgs84, unit_m
 from scenefuse.stage import StageError, quantity
 from scenefuse.transforms import Array, Sim3
 

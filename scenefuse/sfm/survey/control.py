@@ -12,7 +12,7 @@ from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import intersect, model_pixel
 from scenefuse.sfm.photos import Photo
 from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
-from scenefuse.sfm.survey.crs import grid_name
+from scenefuse.io.crs import grid_name
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
 

@@ -8,7 +8,7 @@ import numpy as np
 import pyproj
 
 from scenefuse.io.tables import comma_advice, read_lines
-from scenefuse.sfm.survey.crs import read_crs, to_wgs84
+from scenefuse.io.crs import read_crs, to_wgs84
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 

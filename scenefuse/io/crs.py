@@ -77,17 +77,24 @@ def to_wgs84(crs: pyproj.CRS, points: Array, where: str) -> Array:
     Raises:
         StageError: points that lie nowhere near the area of the CRS, with a guess where the axes are swapped.
     """
+    found = check_in_area(crs, points, where)
+    return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
+
+
+def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = BEYOND_DEG) -> Array:
+    """(N, 2) longitude, latitude of points (N, 3) in a CRS, so far beyond its area at most; StageError as of
+    `to_wgs84`."""
     found = _in_degrees(crs, points[:, :2])
-    strange = ~_in_area(crs, found)
+    strange = ~_in_area(crs, found, beyond_deg)
     if strange.any():
         row = int(np.flatnonzero(strange)[0])
-        swapped = _in_area(crs, _in_degrees(crs, points[:, 1::-1])).all()
+        swapped = _in_area(crs, _in_degrees(crs, points[:, 1::-1]), beyond_deg).all()
         advice = "x and y are swapped: x is easting or longitude" if swapped else "correct the CRS or the coordinates"
         raise StageError(
             f"{where}: {points[row, 0]:.12g} {points[row, 1]:.12g} does not lie in {crs.name}"
             f" ({strange.sum()} of {len(points)} points); {advice}"
         )
-    return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
+    return found
 
 
 def _in_degrees(crs: pyproj.CRS, points: Array) -> Array:
@@ -96,12 +103,12 @@ def _in_degrees(crs: pyproj.CRS, points: Array) -> Array:
     return np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
 
 
-def _in_area(crs: pyproj.CRS, degrees: Array) -> np.ndarray:
+def _in_area(crs: pyproj.CRS, degrees: Array, beyond_deg: float) -> np.ndarray:
     """(N,) whether longitude, latitude exist and lie in the area of the CRS or near it."""
     longitude, latitude = degrees.T
     good = np.isfinite(degrees).all(1) & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
     area = plane(crs).area_of_use
     if area is None or area.west > area.east:
         return good
-    good &= (latitude >= area.south - BEYOND_DEG) & (latitude <= area.north + BEYOND_DEG)
-    return np.asarray(good & (longitude >= area.west - BEYOND_DEG) & (longitude <= area.east + BEYOND_DEG))
+    good &= (latitude >= area.south - beyond_deg) & (latitude <= area.north + beyond_deg)
+    return np.asarray(good & (longitude >= area.west - beyond_deg) & (longitude <= area.east + beyond_deg))
