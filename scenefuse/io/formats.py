@@ -413,7 +413,9 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
         raise StageError(f"{path} has commas as decimal points: '{lines[-1].strip()[:60]}'; export it with points")
     for named in (False, True):
         row = next((k for k, line in enumerate(head) if len(_numbers(line, named)) >= 3), None)
-        if row is not None and (not named or all(len(_numbers(line, named)) >= 3 for line in lines[-len(lines) // 2 :])):
+        if row is not None and (
+            not named or all(len(_numbers(line, named)) >= 3 for line in lines[-len(lines) // 2 :])
+        ):
             return row, named
     raise ValueError("none of its first lines holds three numbers")
 

@@ -66,6 +66,17 @@ def _one_side(fields: Fields) -> Iterator[str]:
         )
 
 
+def _clicks(fields: Fields) -> Iterator[str]:
+    """Clicks that disagree with the others."""
+    left_out = find(fields, "masks.clicks_left_out") or []
+    if left_out:
+        shown = "; ".join(left_out[:QUOTED]) + (f" and {len(left_out) - QUOTED} more" if len(left_out) > QUOTED else "")
+        yield (
+            f"clicks that disagree with the others and are left out ({len(left_out)}): {shown}; correct them in the"
+            " page to click in (docs/clicking.md), or delete them"
+        )
+
+
 def _masks(fields: Fields) -> Iterator[str]:
     """Masks that disagree with each other."""
     left_out, photos = find(fields, "masks.photos_left_out") or [], find(fields, "masks.photos") or 0
@@ -107,4 +118,12 @@ def _unlinked(fields: Fields) -> Iterator[str]:
         )
 
 
-CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (_split, _misplaced, _one_side, _masks, _exposed, _unlinked)
+CAUSES: tuple[Callable[[Fields], Iterator[str]], ...] = (
+    _split,
+    _misplaced,
+    _one_side,
+    _clicks,
+    _masks,
+    _exposed,
+    _unlinked,
+)
