@@ -1,4 +1,5 @@
-"""profiles/slurm on a Slurm that the test starts: jobs are submitted, one fails, one runs out of time and goes on."""
+"""profiles/slurm on a Slurm that the test starts: jobs are submitted, steps of seconds together, one with a card; one
+fails, one runs out of time and goes on."""
 
 import os
 import re
@@ -25,14 +26,25 @@ rule slow:
         "if [ -f checkpoint ]; then echo resumed at $(cat checkpoint) > {output}; "
         "else echo 7 > checkpoint; echo $SLURM_JOB_ID > started; sleep 600; fi"
 """
+CARD = """
+rule card:
+    output:
+        "card.txt",
+    resources:
+        gpu=1,
+    shell:
+        "echo $SLURM_JOB_PARTITION $CUDA_VISIBLE_DEVICES > {output}"
+"""
 # Slurm looks at time limits every half minute; this job's is brought forward, so that it is over at once.
 RUN = """
 {snakemake} {targets} --snakefile {root}/Snakefile --directory clouds --configfile clouds/mine.yaml &> clouds.txt &
 {snakemake} --snakefile slow/Snakefile --directory slow &> slow.txt &
+{snakemake} --snakefile card/Snakefile --directory card --set-resources card:slurm_partition=cards &> card.txt &
 for _ in $(seq 1200); do [ -s slow/started ] && break; sleep 0.1; done
 scontrol update JobId=$(cat slow/started) EndTime=now
 wait %1 && echo 0 > clouds.status || echo $? > clouds.status
 wait %2 && echo 0 > slow.status || echo $? > slow.status
+wait %3 && echo 0 > card.status || echo $? > card.status
 scontrol show jobs --oneliner > jobs.txt
 """
 
@@ -52,18 +64,20 @@ pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not())
 
 @pytest.fixture(scope="module")
 def ran(tmp_path_factory):
-    """The folder in which both workflows have run: clouds/, one of which has a single point, and slow/."""
+    """The folder in which three workflows have run: clouds/, one of which has a single point, slow/ and card/."""
     folder = tmp_path_factory.mktemp("slurm")
-    yard, slow = folder / "clouds", folder / "slow"
-    slow.mkdir()
-    (slow / "Snakefile").write_text(SLOW)
+    yard = folder / "clouds"
+    for name, content in (("slow", SLOW), ("card", CARD)):
+        (folder / name).mkdir()
+        (folder / name / "Snakefile").write_text(content)
     rng = np.random.default_rng(0)
     for name, count in (("yard", 2000), ("house", 500), ("shed", 1)):
         write_cloud(yard / f"{name}.ply", Cloud(rng.uniform(0, 9, (count, 3))))
     (yard / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.ply\n")
     (yard / "objects.tsv").write_text("object\tscene\tcloud\nhouse\tyard\thouse.ply\nshed\tyard\tshed.ply\n")
     (yard / "mine.yaml").write_text(yaml.safe_dump({"scenes": "scenes.tsv", "objects": "objects.tsv"}))
-    targets = "results/scenes/yard/dense.ply results/objects/house/object.ply results/objects/shed/object.ply"
+    targets = "results/scenes/yard/dense.ply results/objects/shed/object.ply"
+    targets += " results/objects/house/registration/full/fine.json"
     command = f"{sys.executable} -m snakemake"
     command += f" --profile {ROOT}/profiles/slurm --workflow-profile {ROOT}/profiles/default"
     command += " --slurm-init-seconds-before-status-checks 2 --seconds-between-status-checks 2"
@@ -95,6 +109,19 @@ def test_jobs_of_the_workflow_are_submitted_with_what_they_need(ran, jobs):
     assert len(done) == 2 and {job["Partition"] for job in done} == {"main"}
     # The object's cloud, which is read whole, asks for a little more.
     assert sorted(job["MinMemoryNode"] for job in done) == ["4000M", "4001M"]
+
+
+def test_steps_of_seconds_are_one_job_with_the_time_of_all(ran, jobs):
+    of_house = ran / "clouds/results/objects/house/registration/full"
+    assert all((of_house / f"{step}.json").exists() for step in ("crop", "scale", "coarse", "fine"))
+    assert len([job for job in jobs if job["JobState"] == "COMPLETED" and job["Partition"] == "main"]) == 4
+    assert "03:00:00" in [job["TimeLimit"] for job in jobs]
+
+
+def test_a_job_that_asks_for_a_card_gets_one_in_its_partition(ran, jobs):
+    assert (ran / "card.status").read_text().strip() == "0", text_of(ran / "card.txt")
+    assert (ran / "card/card.txt").read_text() == "cards 0\n"
+    assert len([job for job in jobs if job["Partition"] == "cards" and "gpu" in job["TresPerJob"]]) == 1
 
 
 def test_a_job_that_fails_is_tried_again_with_more_and_then_named_and_the_others_go_on(ran, jobs):

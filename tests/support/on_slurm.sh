@@ -6,6 +6,9 @@ folder=$(realpath "$1"); shift
 host=$(hostname -s)
 port=$((20000 + RANDOM % 20000))
 mkdir -p "$folder"/{conf,state,spool}
+# A card is any character device to Slurm: here a second /dev/null.
+mknod "$folder/card" c 1 3
+echo "Name=gpu File=$folder/card" >"$folder/conf/gres.conf"
 # More cores and memory than there are: the test looks at what jobs ask for, and they do next to nothing.
 cat >"$folder/conf/slurm.conf" <<END
 ClusterName=test
@@ -36,8 +39,10 @@ SchedulerParameters=batch_sched_delay=0,sched_interval=1,sched_min_interval=0
 SelectType=select/cons_tres
 SelectTypeParameters=CR_Core_Memory
 SlurmdParameters=config_overrides
-NodeName=$host NodeAddr=127.0.0.1 CPUs=16 RealMemory=64000 State=UNKNOWN
+GresTypes=gpu
+NodeName=$host NodeAddr=127.0.0.1 CPUs=16 RealMemory=64000 Gres=gpu:1 State=UNKNOWN
 PartitionName=main Nodes=ALL Default=YES MaxTime=INFINITE State=UP
+PartitionName=cards Nodes=ALL MaxTime=INFINITE State=UP
 END
 # Where programs look for it that are started without SLURM_CONF, as job steps are.
 mount --bind "$folder/conf" /etc/slurm
