@@ -390,8 +390,8 @@ def _text(path: Path) -> Columns:
     columns, start = dict(zip(POSITION, rows.T)), 3
     if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
         columns["intensity"], start = rows[:, 3], 4
-    for start in range(start, rows.shape[1] - 2, 3):
-        three = rows[:, start : start + 3]
+    for first in range(start, rows.shape[1] - 2, 3):
+        three = rows[:, first : first + 3]
         unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
         columns |= dict(zip(NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR, three.T))
     if named:

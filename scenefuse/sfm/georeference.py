@@ -8,6 +8,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from scenefuse.io.crs import grid_name
 from scenefuse.sfm.bundle.adjustment import Freedom, drop_outliers
 from scenefuse.sfm.bundle.lens import LENSES
 from scenefuse.sfm.geodesy import local_frame
@@ -16,7 +17,6 @@ from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.sfm.survey.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.sfm.survey.control import Control, read_sighted
-from scenefuse.io.crs import grid_name
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.sfm.survey.placement import (
     ELSEWHERE_M,

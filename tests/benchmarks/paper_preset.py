@@ -40,8 +40,8 @@ from scenefuse.registration.problem import Inputs
 from scenefuse.stage import StageError, read_json, run, value
 from scenefuse.transforms import Sim3
 
-# Tables 2 to 4 of the paper, on its own captures: house, balloon, sculpture. It gives RMSE in metres, and no diagonal to
-# divide it by.
+# Tables 2 to 4 of the paper, on its own captures: house, balloon, sculpture. It gives RMSE in metres, and no diagonal
+# to divide it by.
 PUBLISHED = {
     "fitness": (0.9302, 0.9916, 0.9207),
     "inlier_rmse": (0.0852, 0.0096, 0.0348),

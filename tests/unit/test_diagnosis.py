@@ -46,7 +46,10 @@ def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
         ({"sparse__doubtful_photos": {"b.jpg": 0.6, "a.jpg": 0.7}}, ["in wrong places (2): a.jpg, b.jpg"]),
         ({"undistorted__largest_gap_deg": 190.0}, ["within 190 degrees, between a.jpg and b.jpg"]),
         ({"masks__photos_left_out": [f"{k}.jpg" for k in range(9)]}, ["9 of 40 masks", "and 4 more"]),
-        ({"masks__clicks_left_out": ["the click at (3, 4) of a.jpg is 9 px off"]}, ["left out (1): the click at (3, 4)"]),
+        (
+            {"masks__clicks_left_out": ["the click at (3, 4) of a.jpg is 9 px off"]},
+            ["left out (1): the click at (3, 4)"],
+        ),
         ({"masks__median_agreement": 0.6}, ["agree by 0.60 only"]),
         ({"stage2__blurred_photos": {"b.jpg": 0.4}}, ["blurred photos (1): b.jpg"]),
         ({"stage2__photo_gains": {"a.jpg": [1, 1.1, 1], "b.jpg": [0.5, 0.5, 0.5]}}, ["others (1): b.jpg"]),

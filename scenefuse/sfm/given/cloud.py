@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, spacing, write_cloud
+from scenefuse.io.crs import plane
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, survey, write_placed
 from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.given.offset import cloud_from_own
 from scenefuse.sfm.given.place import read_place
-from scenefuse.io.crs import plane
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.workspace import View, posed_images, read_model, read_views, view_of, with_mask

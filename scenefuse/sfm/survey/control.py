@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scenefuse.io.crs import grid_name
 from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import intersect, model_pixel
 from scenefuse.sfm.photos import Photo
 from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
-from scenefuse.io.crs import grid_name
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
 

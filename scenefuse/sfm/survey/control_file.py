@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pyproj
 
-from scenefuse.io.tables import comma_advice, read_lines
 from scenefuse.io.crs import read_crs, to_wgs84
+from scenefuse.io.tables import comma_advice, read_lines
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.io.tables import read_lines
 from scenefuse.io.crs import read_crs, to_wgs84
+from scenefuse.io.tables import read_lines
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 
