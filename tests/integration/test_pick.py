@@ -1,30 +1,19 @@
 """The page to click in, as a person uses it: a real server and a real browser, with mouse and keyboard."""
 
-import os
 import re
-import subprocess
-import sys
 import time
-from contextlib import contextmanager, suppress
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 from support.browser import chromium
+from support.clicking_page import LOCAL, MASK, Page, served
 from support.user_project import CLICKS, Project
 
-from scenefuse.pick.pictures import Picture
-from scenefuse.sfm.fiducials import read_points
 from scenefuse.sfm.survey.lengths import read_ends
 
-ROOT = Path(__file__).resolve().parents[2]
-# The page comes from this machine, and from nowhere else.
-LOCAL = "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"
-PATIENCE_S = 60
 NAME, SIZE = "Füße und Kopf.jpg", (600, 400)
 DISC = ((250, 120), (200, 220), (300, 220))
-MASK = "img.leaflet-image-layer"
 
 
 @pytest.fixture(scope="module")
@@ -50,124 +39,10 @@ def yard(tmp_path):
     return project
 
 
-@contextmanager
-def served(project):
-    """The address of a page of the shed."""
-    # NiceGUI would take the server for one of its own tests.
-    env = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST")}
-    command = [
-        sys.executable,
-        ROOT / "scripts/pick.py",
-        "--object",
-        "shed",
-        "--configfile",
-        "mine.yaml",
-        "--no-browser",
-    ]
-    server = subprocess.Popen(
-        command, cwd=project.path, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env
-    )
-    try:
-        printed = ""
-        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", printed)):
-            line = server.stdout.readline()
-            assert line, printed
-            printed += line
-        yield found[0]
-    finally:
-        server.terminate()
-        server.communicate(timeout=PATIENCE_S)
-
-
 @pytest.fixture
 def page(browser, yard):
-    with served(yard) as address:
-        yield Page(browser, yard.path, address)
-
-
-class Page:
-    """What a person does with the page, and sees."""
-
-    def __init__(self, browser, folder, address):
-        self.browser, self.path, self.address = browser, folder / "prompts.tsv", address
-        self.open()
-
-    def open(self):
-        self.browser.complaints()
-        self.browser.window.get(self.address)
-        self.until("return !!document.querySelector('.leaflet-tile-loaded');")
-
-    def until(self, script, *given):
-        end = time.monotonic() + PATIENCE_S
-        while not self.browser.value(script, *given):
-            assert time.monotonic() < end, f"never: {script}; the page says: {self.text()}"
-            time.sleep(0.05)
-
-    def text(self):
-        return self.browser.value("return document.body.innerText;")
-
-    def until_text(self, text):
-        self.until("return document.body.innerText.includes(given[0]);", text)
-
-    def point(self, x, y, width=SIZE[0], height=SIZE[1]):
-        """Where a pixel of the photo is in the window."""
-        return self.browser.value(
-            "const e = document.querySelector('.photo'), box = e.getBoundingClientRect();"
-            "const p = getElement(+e.id.slice(1)).map.latLngToContainerPoint(given);"
-            "return [Math.round(box.x + p.x), Math.round(box.y + p.y)];",
-            *Picture("", Path(), width, height).place(x, y),
-        )
-
-    def mouse(self, button=0):
-        from selenium.webdriver.common.action_chains import ActionBuilder
-        from selenium.webdriver.common.actions.pointer_input import PointerInput
-
-        return ActionBuilder(self.browser.window, mouse=PointerInput("mouse", "pointer"), duration=40)
-
-    def click(self, x, y, button=0):
-        action = self.mouse()
-        action.pointer_action.move_to_location(*self.point(x, y)).pointer_down(button=button).pointer_up(button=button)
-        action.perform()
-
-    def drag(self, start, end):
-        action, middle = self.mouse(), ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
-        action.pointer_action.move_to_location(*self.point(*start)).pointer_down()
-        action.pointer_action.move_to_location(*self.point(*middle)).move_to_location(*self.point(*end)).pointer_up()
-        action.perform()
-
-    def key(self, keys):
-        from selenium.webdriver import ActionChains
-
-        ActionChains(self.browser.window).send_keys(keys).perform()
-
-    def button(self, text):
-        """Press the button of this text, once it can be pressed: a dialogue takes a moment to appear."""
-        from selenium.common.exceptions import (
-            ElementClickInterceptedException,
-            ElementNotInteractableException,
-            StaleElementReferenceException,
-        )
-
-        not_yet = ElementClickInterceptedException, ElementNotInteractableException, StaleElementReferenceException
-        end = time.monotonic() + PATIENCE_S
-        while time.monotonic() < end:
-            for button in self.browser.window.find_elements("css selector", "button"):
-                with suppress(*not_yet):
-                    if text in button.text:
-                        button.click()
-                        return
-            time.sleep(0.05)
-        raise AssertionError(f"no button {text}: {self.text()}")
-
-    def marks(self, count):
-        """Wait until the badge of the shown photo counts so many clicks."""
-        shown = "document.querySelector('.thumb.here .clicks')"
-        self.until(f"const b = {shown}; return (b.offsetParent ? +b.innerText : 0) === given[0];", count)
-
-    def save(self):
-        self.key("s")
-        self.until_text("rows saved in")
-        return read_points(self.path)
+    with served(yard.path) as (address, _):
+        yield Page(browser, yard.path / "prompts.tsv", address, SIZE)
 
 
 def test_clicks_give_a_mask_and_are_saved_where_they_were_made(page):
@@ -278,8 +153,8 @@ def test_clicks_survive_a_reload_and_a_restart(page, browser, yard):
     page.open()
     page.marks(1)
     page.save()
-    with served(yard) as address:
-        again = Page(browser, yard.path, address)
+    with served(yard.path) as (address, _):
+        again = Page(browser, yard.path / "prompts.tsv", address, SIZE)
         again.marks(1)
 
 

@@ -1,0 +1,133 @@
+"""The page to click in, served as for a person, and what a person does with it in a real browser."""
+
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from scenefuse.pick.pictures import Picture
+from scenefuse.sfm.fiducials import read_points
+
+ROOT = Path(__file__).resolve().parents[2]
+# The page comes from this machine, and from nowhere else.
+LOCAL = "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"
+PATIENCE_S = 60
+MASK = "img.leaflet-image-layer"
+
+
+@contextmanager
+def served(folder, name="shed", config="mine.yaml"):
+    """The address of a page of an object of the project in a folder, and the server's process."""
+    # NiceGUI would take the server for one of its own tests.
+    env = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST")}
+    command = [
+        sys.executable,
+        ROOT / "scripts/pick.py",
+        "--object",
+        name,
+        "--configfile",
+        config,
+        "--no-browser",
+    ]
+    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env)
+    try:
+        printed = ""
+        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", printed)):
+            line = server.stdout.readline()
+            assert line, printed
+            printed += line
+        yield found[0], server
+    finally:
+        server.terminate()
+        server.communicate(timeout=PATIENCE_S)
+
+
+class Page:
+    """What a person does with the page, and sees."""
+
+    def __init__(self, browser, path, address, size):
+        """Open the page whose table is at `path`; photos are of one size, (width, height)."""
+        self.browser, self.path, self.address, self.size = browser, path, address, size
+        self.patience_s = PATIENCE_S
+        self.open()
+
+    def open(self):
+        self.browser.complaints()
+        self.browser.window.get(self.address)
+        self.until("return !!document.querySelector('.leaflet-tile-loaded');")
+
+    def until(self, script, *given):
+        end = time.monotonic() + self.patience_s
+        while not self.browser.value(script, *given):
+            assert time.monotonic() < end, f"never: {script}; the page says: {self.text()}"
+            time.sleep(0.05)
+
+    def text(self):
+        return self.browser.value("return document.body.innerText;")
+
+    def until_text(self, text):
+        self.until("return document.body.innerText.includes(given[0]);", text)
+
+    def point(self, x, y, width=None, height=None):
+        """Where a pixel of the photo is in the window."""
+        width, height = width or self.size[0], height or self.size[1]
+        return self.browser.value(
+            "const e = document.querySelector('.photo'), box = e.getBoundingClientRect();"
+            "const p = getElement(+e.id.slice(1)).map.latLngToContainerPoint(given);"
+            "return [Math.round(box.x + p.x), Math.round(box.y + p.y)];",
+            *Picture("", Path(), width, height).place(x, y),
+        )
+
+    def mouse(self, button=0):
+        from selenium.webdriver.common.action_chains import ActionBuilder
+        from selenium.webdriver.common.actions.pointer_input import PointerInput
+
+        return ActionBuilder(self.browser.window, mouse=PointerInput("mouse", "pointer"), duration=40)
+
+    def click(self, x, y, button=0):
+        action = self.mouse()
+        action.pointer_action.move_to_location(*self.point(x, y)).pointer_down(button=button).pointer_up(button=button)
+        action.perform()
+
+    def drag(self, start, end):
+        action, middle = self.mouse(), ((start[0] + end[0]) / 2, (start[1] + end[1]) / 2)
+        action.pointer_action.move_to_location(*self.point(*start)).pointer_down()
+        action.pointer_action.move_to_location(*self.point(*middle)).move_to_location(*self.point(*end)).pointer_up()
+        action.perform()
+
+    def key(self, keys):
+        from selenium.webdriver import ActionChains
+
+        ActionChains(self.browser.window).send_keys(keys).perform()
+
+    def button(self, text):
+        """Press the button of this text, once it can be pressed: a dialogue takes a moment to appear."""
+        from selenium.common.exceptions import (
+            ElementClickInterceptedException,
+            ElementNotInteractableException,
+            StaleElementReferenceException,
+        )
+
+        not_yet = ElementClickInterceptedException, ElementNotInteractableException, StaleElementReferenceException
+        end = time.monotonic() + PATIENCE_S
+        while time.monotonic() < end:
+            for button in self.browser.window.find_elements("css selector", "button"):
+                with suppress(*not_yet):
+                    if text in button.text:
+                        button.click()
+                        return
+            time.sleep(0.05)
+        raise AssertionError(f"no button {text}: {self.text()}")
+
+    def marks(self, count):
+        """Wait until the badge of the shown photo counts so many clicks."""
+        shown = "document.querySelector('.thumb.here .clicks')"
+        self.until(f"const b = {shown}; return (b.offsetParent ? +b.innerText : 0) === given[0];", count)
+
+    def save(self):
+        self.key("s")
+        self.until_text("rows saved in")
+        return read_points(self.path)
