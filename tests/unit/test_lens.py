@@ -9,7 +9,7 @@ import pytest
 from scenefuse.registration.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm.bundle import spread as bundle
 from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
-from scenefuse.sfm.bundle.lens import BROWN, CENTRED, HELD, choose_lens, enrich
+from scenefuse.sfm.bundle.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
 from scenefuse.sfm.bundle.spread import Spread, read_spread, spread_of, write_spread
 from scenefuse.sfm.features import read_calibration
 from scenefuse.stage import StageError
@@ -56,10 +56,18 @@ def test_brown_distortion_is_refined_and_found():
     assert np.linalg.norm(off - off.mean(0), axis=1).max() < 1  # a turned camera looks like a shifted photo
 
 
+def test_two_radial_terms_are_found_without_tangential_ones():
+    model = photographed([700, 700, 510, 388, -0.5, 30, 0, 0])
+    choice = choose_lens(model)
+    assert (choice.lens, choice.next) == (RADIAL, BROWN)
+    camera = next(iter(choice.lens.fit(model, ROUGH_TOLERANCE).cameras.values()))
+    assert camera.model_name == "RADIAL" and abs(camera.principal_point_x - 510) < 1
+
+
 def test_a_lens_in_the_middle_without_distortion_is_held():
     choice = choose_lens(photographed([700, 700, 500, 400, 0, 0, 0, 0]))
     assert (choice.lens, choice.next) == (HELD, CENTRED)
-    assert [trial["lens"] for trial in choice.trials] == ["held", "centred", "brown"]
+    assert [trial["lens"] for trial in choice.trials] == ["held", "centred", "radial", "brown"]
 
 
 def test_a_richer_model_is_the_same_lens():

@@ -62,9 +62,10 @@ class Lens:
 KNOWN = Lens("known", None, Freedom(lens=False), "calibration given, held")
 HELD = Lens("held", None, Freedom(), "principal point held in the middle")
 CENTRED = Lens("centred", None, Freedom(principal_point=True), "principal point refined")
+RADIAL = Lens("radial", "RADIAL", CENTRED.freedom, "principal point and two radial terms refined")
 BROWN = Lens("brown", "OPENCV", CENTRED.freedom, "principal point and Brown distortion refined")
 RATIONAL = Lens("rational", "FULL_OPENCV", CENTRED.freedom, "principal point and rational distortion refined")
-DISTORTED, STRAIGHT = (HELD, CENTRED, BROWN, RATIONAL), (HELD, CENTRED)
+DISTORTED, STRAIGHT = (HELD, CENTRED, RADIAL, BROWN, RATIONAL), (HELD, CENTRED)
 LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED)}
 
 
@@ -87,30 +88,32 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     """Go from the poorest lens to richer ones while held-out observations are predicted better (method M9).
 
     Cross-validation (Stone 1974): one observation of every point that four photos or more see is left out of the
-    adjustment; the logarithmic (Cauchy) errors of a richer lens there have to be smaller, pair by pair, by three
-    standard errors of their mean, and their median by half a per cent.
+    adjustment; the logarithmic (Cauchy) errors of a richer lens there have to be smaller than those of each poorer one,
+    taken or not, pair by pair, by three standard errors of their mean, and their median by half a per cent.
 
     Args:
         model: bundle-adjusted; it is not changed.
         lenses: from poor to rich.
     """
     kept, held = hold_out(model)
-    best, beyond, trials = lenses[0], None, list[dict[str, Any]]()
-    best_errors = _errors(best.fit(kept, ROUGH_TOLERANCE), held)
-    trials.append(_trial(best, best_errors, None, "the poorest"))
+    best, beyond = lenses[0], None
+    poorer = [_errors(best.fit(kept, ROUGH_TOLERANCE), held)]
+    trials = [_trial(best, poorer[0], None, "the poorest")]
     for lens in lenses[1:]:
         fitted = lens.fit(kept, ROUGH_TOLERANCE)
         errors = _errors(fitted, held)
-        gain = _gain(best_errors, errors)
-        better = len(errors) > 0 and np.median(errors) <= (1 - LEAST_GAIN) * np.median(best_errors)
+        gain = min(_gain(others, errors) for others in poorer)
+        least = (1 - LEAST_GAIN) * min(map(np.median, poorer)) if len(errors) else 0.0
+        better = len(errors) > 0 and np.median(errors) <= least
         problem = _problem(fitted, gain if better else 0.0)
         trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
+        poorer.append(errors)
         if problem is None:
-            best, best_errors, beyond = lens, errors, None
-        elif beyond is None:
+            best, beyond = lens, None
+        elif beyond in (None, RADIAL):
             beyond = lens
-        # Without distortion a free principal point may not help, and help with it: the third lens is always tried.
-        if lens is not lenses[1] and problem is not None:
+        # A free principal point may help with distortion only, and one of its terms with others: these are always tried.
+        if problem is not None and lens.richest not in (None, RADIAL.richest):
             break
     return Choice(best, beyond, trials)
 
@@ -133,7 +136,9 @@ def enrich(camera: pycolmap.Camera, name: str) -> None:
     ranks = {model: rank for rank, model in enumerate(POLYNOMIALS)}
     if ranks.get(camera.model_name, len(ranks)) >= ranks[name]:
         return
-    same = [camera.mean_focal_length()] * 2 if len(camera.focal_length_idxs()) == 1 else camera.params[:2]
+    same = [camera.mean_focal_length()] * (1 if name == "RADIAL" else 2)
+    if len(camera.focal_length_idxs()) == 2:
+        same = camera.params[:2]
     centre = [camera.principal_point_x, camera.principal_point_y]
     distortion = [camera.params[i] for i in camera.extra_params_idxs()]
     camera.model = getattr(pycolmap.CameraModelId, name)
