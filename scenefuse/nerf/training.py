@@ -91,6 +91,9 @@ class NerfRecipe:
     views confirm: where the absolute loss has them too, there is nothing left to rank (method N3)."""
     prior_share: float = PRIOR_SHARE
     """Where a prior expects the surface, at most this share of a ray's samples lies near it."""
+    turned_share: float = 0.25
+    """This share of the rays has its colours asked for from a random direction: they depend on the direction where the
+    photos show that they do, and elsewhere are what all photos agree on (method N8)."""
     appearance: bool = True
     """Whether gains and vignetting of the photos are found (method N15), and blurred photos count less."""
     pose_learning_rate: float = 0.0
@@ -308,9 +311,10 @@ def _loss_terms(
     rng = torch.Generator().manual_seed(training.seed * SEED_STRIDE + step)
     jitter = torch.rand(len(rays.origin), count, generator=rng).to(device)
     background = torch.rand(len(rays.origin), 3, generator=rng).to(device)
+    seen_from = _partly_turned(rays.direction, training.recipe.turned_share, rng)
     origin, direction = rays.origin.detach().contiguous(), rays.direction.detach().contiguous()
     drawn = march(origin, direction, nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior)
-    sigma, seen = _render(nerf.field, rays, drawn, batch, training.recipe.edge_boost)
+    sigma, seen = _render(nerf.field, rays, seen_from, drawn, batch, training.recipe.edge_boost)
     if edges.boost and step % EDGES_EVERY == 0:
         x = (origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]).view(-1, 3)
         opacity = (1 - torch.exp(-sigma.detach() * drawn.delta)).view(-1)
@@ -341,17 +345,26 @@ def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None, prior_shar
     return _Rays(origin, direction, prior, confidence, batch.order * length.detach(), ranked)
 
 
+def _partly_turned(direction: Tensor, share: float, rng: torch.Generator) -> Tensor:
+    """Unit directions (R, 3), a share of them replaced by random ones."""
+    if share == 0:
+        return direction
+    turned = torch.rand(len(direction), 1, generator=rng) < share
+    other = torch.nn.functional.normalize(torch.randn(len(direction), 3, generator=rng), dim=1)
+    return torch.where(turned.to(direction.device), other.to(direction.device), direction)
+
+
 def _render(
-    field: Field, rays: _Rays, drawn: RaySamples, batch: RayBatch, edge_boost: float
+    field: Field, rays: _Rays, seen_from: Tensor, drawn: RaySamples, batch: RayBatch, edge_boost: float
 ) -> tuple[Tensor, Composited]:
-    """Densities (H, S) of the samples, and what the H rays that have any look like."""
+    """Densities (H, S) of the samples, and what the H rays that have any look like from directions (R, 3)."""
     x = rays.origin[drawn.ray, None] + drawn.t[..., None] * rays.direction[drawn.ray, None]
     boost = None
     if edge_boost > 0:
         boost = (1 + edge_boost * batch.edge[drawn.ray])[:, None].expand(drawn.t.shape).reshape(-1)
     sigma, features = field.geometry(x.view(-1, 3), boost, fine_from=field.settings.levels // 2)
     sigma = sigma.view(drawn.t.shape)
-    return sigma, composite(sigma, field.color(features, rays.direction[drawn.ray]), drawn.t, drawn.delta)
+    return sigma, composite(sigma, field.color(features, seen_from[drawn.ray]), drawn.t, drawn.delta)
 
 
 def _photometric(

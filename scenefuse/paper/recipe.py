@@ -11,7 +11,8 @@ EPOCHS = 60
 BATCH_PHOTOS = 24
 WARMUP_EPOCHS = 2
 LEARNING_RATE = 1e-3
-# Stages 2 and 4. The paper has neither samples near the prior, nor gains of photos, nor levels that open one by one.
+# Stages 2 and 4. The paper has neither samples near the prior, nor gains of photos, nor turned rays, nor levels that open
+# one by one.
 NERF = NerfRecipe(
     images_per_batch=BATCH_PHOTOS,
     rays_per_image=170,
@@ -23,6 +24,7 @@ NERF = NerfRecipe(
     edge_rate=1.0,
     order_of_all=True,
     prior_share=0.0,
+    turned_share=0.0,
     appearance=False,
 )
 # It gives no weights: they are the shipped ones. The distortion is not among its losses.

@@ -12,7 +12,7 @@ from support.painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphe
 import scenefuse.nerf.training as training_module
 from scenefuse import checkpoints
 from scenefuse.cores import use_threads
-from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others
+from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others, surface_points
 from scenefuse.nerf.encoding import encode
 from scenefuse.nerf.field import EdgeRates, Field, FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -324,3 +324,21 @@ def test_the_order_of_depths_that_nothing_confirms_is_learned_only_where_it_is_a
     assert torch.equal(shipped[0].field.table, unranked[0].field.table) and shipped[1]["rank"] == 0
     ranked, barely = trained(0.5, inside_out)[1]["rank"], trained(1e-9, inside_out)[1]["rank"]
     assert ranked < 0.8 * barely
+
+
+def test_from_directions_that_no_photo_has_colours_are_those_that_photos_agree_on():
+    few = sphere_views(count=6, arc=np.pi / 3)
+    errors = {share: _error_from_anywhere(few, share) for share in (0.0, NerfRecipe().turned_share)}
+    assert max(errors.values()) == errors[0.0] > 1.5 * min(errors.values())
+
+
+def _error_from_anywhere(sphere, share):
+    """RMS error of the trained field's colours on the surface that a photo shows, asked for from random directions."""
+    nerf, photos, cube, _ = _train(sphere, steps=400, turned_share=share)
+    images, _, intrinsics, poses, depths = sphere
+    points, rows, columns = surface_points(depths[0], intrinsics[0], poses[0])
+    directions = torch.nn.functional.normalize(torch.randn(len(points), 3, generator=torch.manual_seed(1)), dim=1)
+    with torch.no_grad():
+        features = nerf.field.geometry(torch.from_numpy(cube.apply(points).astype(np.float32)))[1]
+        found = nerf.field.color(features, directions)[:, 0].numpy()
+    return float(np.sqrt(((found - images[0][rows, columns] / 255.0) ** 2).mean()))
