@@ -11,8 +11,8 @@ EPOCHS = 60
 BATCH_PHOTOS = 24
 WARMUP_EPOCHS = 2
 LEARNING_RATE = 1e-3
-# Stages 2 and 4. The paper has neither samples near the prior, nor gains of photos, nor turned rays, nor levels that open
-# one by one.
+# Stages 2 and 4. The paper has neither samples near the prior, nor turned rays, nor gains of photos, nor levels that
+# open one by one.
 NERF = NerfRecipe(
     images_per_batch=BATCH_PHOTOS,
     rays_per_image=170,

@@ -21,8 +21,10 @@ from scenefuse.stage import run
 PATIENCE_S = 900
 ACTION_S = 2.0
 """Of a person, for one action."""
-OTHER_ACTIONS = ("scenefuse init", "photos into a folder", "a row of scenes.tsv", "a row of objects.tsv")
-OTHER_ACTIONS += ("scenefuse pick", "choose the photo", "save", "snakemake")
+OTHER_ACTIONS = (
+    *("scenefuse init", "photos into a folder", "a row of scenes.tsv", "a row of objects.tsv"),
+    *("scenefuse pick", "choose the photo", "save", "snakemake"),
+)
 SHOWN = "return document.querySelector('.thumb.here .name')?.innerText === given[0];"
 CHANGED = f"const m = document.querySelector('{MASK}'); return !!m?.naturalWidth && m.src !== given[0];"
 

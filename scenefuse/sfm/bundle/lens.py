@@ -103,8 +103,8 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         fitted = lens.fit(kept, ROUGH_TOLERANCE)
         errors = _errors(fitted, held)
         gain = min(_gain(others, errors) for others in poorer)
-        least = (1 - LEAST_GAIN) * min(map(np.median, poorer)) if len(errors) else 0.0
-        better = len(errors) > 0 and np.median(errors) <= least
+        median = min(np.median(others) for others in poorer) if held else 0.0
+        better = len(errors) > 0 and np.median(errors) <= (1 - LEAST_GAIN) * median
         problem = _problem(fitted, gain if better else 0.0)
         trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
         poorer.append(errors)
@@ -112,7 +112,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
             best, beyond = lens, None
         elif beyond in (None, RADIAL):
             beyond = lens
-        # A free principal point may help with distortion only, and one of its terms with others: these are always tried.
+        # A free principal point may help with distortion only, and one term of it with the others: all are tried.
         if problem is not None and lens.richest not in (None, RADIAL.richest):
             break
     return Choice(best, beyond, trials)
@@ -136,9 +136,9 @@ def enrich(camera: pycolmap.Camera, name: str) -> None:
     ranks = {model: rank for rank, model in enumerate(POLYNOMIALS)}
     if ranks.get(camera.model_name, len(ranks)) >= ranks[name]:
         return
-    same = [camera.mean_focal_length()] * (1 if name == "RADIAL" else 2)
-    if len(camera.focal_length_idxs()) == 2:
-        same = camera.params[:2]
+    same = [camera.params[i] for i in camera.focal_length_idxs()]
+    if len(same) == 1 and name != "RADIAL":
+        same *= 2
     centre = [camera.principal_point_x, camera.principal_point_y]
     distortion = [camera.params[i] for i in camera.extra_params_idxs()]
     camera.model = getattr(pycolmap.CameraModelId, name)
