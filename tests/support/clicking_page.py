@@ -33,6 +33,7 @@ def served(folder, name="shed", config="mine.yaml"):
         "--no-browser",
     ]
     server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env)
+    assert server.stdout is not None
     try:
         printed = ""
         while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", printed)):

@@ -132,13 +132,13 @@ def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, H
 
 
 def enrich(camera: pycolmap.Camera, name: str) -> None:
-    """Turn a camera into a richer polynomial model, in place and the same lens; others and richer ones stay."""
+    """Turn a camera into a richer polynomial model, in place and the same lens, but for two focal lengths that become one
+    in RADIAL; others and richer ones stay."""
     ranks = {model: rank for rank, model in enumerate(POLYNOMIALS)}
     if ranks.get(camera.model_name, len(ranks)) >= ranks[name]:
         return
-    same = [camera.params[i] for i in camera.focal_length_idxs()]
-    if len(same) == 1 and name != "RADIAL":
-        same *= 2
+    focal = [camera.params[i] for i in camera.focal_length_idxs()]
+    same = [camera.mean_focal_length()] if name == "RADIAL" else focal * (3 - len(focal))
     centre = [camera.principal_point_x, camera.principal_point_y]
     distortion = [camera.params[i] for i in camera.extra_params_idxs()]
     camera.model = getattr(pycolmap.CameraModelId, name)
