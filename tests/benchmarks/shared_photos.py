@@ -77,7 +77,7 @@ def _compared(content: dict[str, Any], known: Truth, trial: PhotoTrial, spreads:
 def shared_photos(
     *,
     out: Path = Path("results/bench/shared_photos.tsv"),
-    seeds: Literal["development", "published"] = "published",
+    seeds: Literal["development", "published"] = "development",
     trials: int = 120,
     first: int = 0,
     bend: float = 1.0,

@@ -34,7 +34,7 @@ rule train_depth:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        mem_mb=by_photos(6000, 2000, 10, masked_photos),
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
@@ -74,7 +74,7 @@ rule refine_depth:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
+        mem_mb=by_photos(6000, 2000, 10, masked_photos),
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:

@@ -145,8 +145,8 @@ rule match_scene_features:
         "../../envs/reconstruction.yaml"
     threads: SCENE_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 6000 * attempt,
-        runtime=lambda wildcards, attempt: 240 * attempt,
+        mem_mb=by_size(6000, features=4),
+        runtime=by_size(240, features=2),
     params:
         options=settings("scene.matches"),
         seed=config["seed"],
@@ -173,8 +173,8 @@ use rule match_scene_features as match_object_features with:
     priority: 0
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
+        mem_mb=by_size(4000, features=4),
+        runtime=by_size(120, features=2),
     params:
         options=settings("object.matches"),
         seed=config["seed"],
@@ -203,8 +203,8 @@ rule map_scene_photos:
         "../../envs/reconstruction.yaml"
     threads: SCENE_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 8000 * attempt,
-        runtime=lambda wildcards, attempt: 480 * attempt,
+        mem_mb=by_size(8000, database=8),
+        runtime=by_size(480, database=1),
     params:
         options=settings("scene.sparse"),
         calibrated=calibrated("scene"),
@@ -238,8 +238,8 @@ use rule map_scene_photos as map_object_photos with:
     priority: 0
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
+        mem_mb=by_size(4000, database=8),
+        runtime=by_size(120, database=2),
     params:
         options=settings("object.sparse"),
         calibrated=calibrated("object"),
@@ -273,8 +273,8 @@ rule georegister:
         "../../envs/reconstruction.yaml"
     threads: SCENE_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 8000 * attempt,
-        runtime=lambda wildcards, attempt: 120 * attempt,
+        mem_mb=by_size(8000, model=8),
+        runtime=by_size(120, model=1),
     params:
         options=settings("scene.georegister"),
         survey=survey_flags,
@@ -306,8 +306,8 @@ rule estimate_scene_spread:
         "../../envs/reconstruction.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
-        runtime=lambda wildcards, attempt: 240 * attempt,
+        mem_mb=by_size(4000, model=8),
+        runtime=by_size(240, model=2),
     params:
         script=script("sfm/estimate_spread.py"),
         code=code("sfm/estimate_spread.py"),
