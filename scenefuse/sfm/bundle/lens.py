@@ -132,8 +132,8 @@ def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, H
 
 
 def enrich(camera: pycolmap.Camera, name: str) -> None:
-    """Turn a camera into a richer polynomial model, in place and the same lens, but for two focal lengths that become one
-    in RADIAL; others and richer ones stay."""
+    """Turn a camera into a richer polynomial model, in place and the same lens (RADIAL takes the mean of two focal
+    lengths); others and richer ones stay."""
     ranks = {model: rank for rank, model in enumerate(POLYNOMIALS)}
     if ranks.get(camera.model_name, len(ranks)) >= ranks[name]:
         return
