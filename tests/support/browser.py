@@ -74,7 +74,9 @@ class Browser:
             last, data = data, self.find(selector).screenshot_as_png
             if data == last:
                 break
-        return cv2.cvtColor(cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+        shown = cv2.imdecode(np.frombuffer(data, dtype=np.uint8), cv2.IMREAD_COLOR)
+        assert shown is not None
+        return cv2.cvtColor(shown, cv2.COLOR_BGR2RGB)
 
     def drag(self, element, right: float, down: float) -> None:
         self._actions().drag_and_drop_by_offset(element, right, down).perform()
