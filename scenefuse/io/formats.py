@@ -114,13 +114,16 @@ def check_projected(path: Path) -> None:
 
 
 def check_not_degrees(path: Path, points: NDArray[np.float64]) -> None:
-    """StageError where points (N, 3) of a file can only be longitude, latitude and a height in metres."""
-    low, high = np.percentile(points, [1, 99], axis=0)
+    """StageError where points (N, 3) of a file without a CRS can only be longitude, latitude and a height in metres:
+    far from zero, and narrow beside their height. Of a flat site that cannot be told."""
+    crs = las_crs(path)
+    low, high = np.percentile(points, [10, 90], axis=0)
+    far = np.minimum(abs(low), abs(high))[:2]
     wide, tall = float((high - low)[:2].max()), float(high[2] - low[2])
-    if (np.maximum(abs(low), abs(high))[:2] <= (360, 90)).all() and 0 < wide < DEGREES_BELOW * tall:
+    if crs is None and far.min() > 1 and far.max() <= 360 and far.min() <= 90 and 0 < wide < DEGREES_BELOW * tall:
         raise StageError(
             f"{path} seems to be in degrees: x and y vary by {wide:.3g} where z varies by {tall:.3g}; project it to"
-            " metres first, to UTM for instance"
+            " metres first, to UTM for instance (if it is in metres, subtract its x and y)"
         )
 
 
@@ -138,7 +141,8 @@ def las_dimensions(path: Path) -> list[str]:
     form = points.point_format
     names = [name for name in form.standard_dimension_names if name.lower() not in (*POSITION, *COLOR)]
     values = {name: np.asarray(points[name]) for name in names}
-    return [name for name in names if np.ptp(values[name]) > 0 or (name == "classification" and values[name].any())]
+    differing = {name for name in names if values[name].min() != values[name].max()}
+    return [name for name in names if name in differing or (name == "classification" and values[name].any())]
 
 
 def _common_name(name: str) -> str:
@@ -366,8 +370,7 @@ def _text(path: Path) -> Columns:
 
     A line above the rows that names the columns (`//X Y Z R G B`) is believed. Without one, the first three columns are
     x, y, z and each three that follow are normals if they have unit length, else colours; PTS may have an intensity
-    between. A first column that names or numbers the points is left out, and so is what follows the last three, and
-    both are printed.
+    between. A first column that names or numbers the points is left out, and so is what follows: that is printed.
     """
     with open(path, encoding="utf-8-sig") as file:
         head = list(islice(file, 50))
@@ -375,61 +378,69 @@ def _text(path: Path) -> Columns:
         return {name: np.empty(0) for name in POSITION}
     above, named = _first_row(path, head)
     separator = _separator(head[above])
-    cells = len(head[above].split(separator))
-    wanted = range(1, cells) if named else range(cells)
-    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", usecols=wanted)
-    names = [cell.strip() for cell in head[above - 1].strip(" \t\r\n/#").split(separator)] if above else []
-    names = names[cells - len(wanted) :]
+    # A name counts as a number, so that rows of another length are still an error.
+    first_cell: Any = {0: lambda name: 0.0} if named else None
+    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", converters=first_cell)
+    titles = head[above - 1].strip(" \t\r\n/#").split(separator) if above else []
+    names = [title.strip().strip("\"'") for title in titles]
     if len(names) == rows.shape[1] and set(POSITION) <= {_common_name(name) for name in names}:
         return dict(zip(names, rows.T))
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
-    if not named and _numbers_points(rows):
-        rows, named = rows[:, 1:], True
+    if named or _numbers_points(rows):
+        rows = rows[:, 1:]
+        print(f"{path.name}: its first column names or numbers the points and is left out", flush=True)
     columns, start = dict(zip(POSITION, rows.T)), 3
     if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
         columns["intensity"], start = rows[:, 3], 4
     for first in range(start, rows.shape[1] - 2, 3):
         three = rows[:, first : first + 3]
         unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
-        columns |= dict(zip(NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR, three.T))
-    if named:
-        print(f"{path.name}: its first column names or numbers the points and is left out", flush=True)
+        kind = NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR
+        if kind[0] in columns:
+            break
+        columns |= dict(zip(kind, three.T))
     if further := rows.shape[1] - len(columns):
         print(f"{path.name}: its last {further} columns have no names and are left out", flush=True)
     return columns
 
 
 def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
-    """Where the rows of numbers begin among the first lines, and whether a name stands before the numbers.
+    """Where the rows begin among the first lines, and whether a name stands before the numbers of all of them.
 
     Raises:
         ValueError: there are none.
         StageError: decimals have commas.
     """
-    lines = [line for line in head if line.strip()]
-    if any(len(re.findall(r"(?<![\d.])-?\d+,\d+(?![\d.,])", line)) >= 3 for line in lines[-1:]):
-        raise StageError(f"{path} has commas as decimal points: '{lines[-1].strip()[:60]}'; export it with points")
-    for named in (False, True):
-        row = next((k for k, line in enumerate(head) if len(_numbers(line, named)) >= 3), None)
-        if row is not None and (
-            not named or all(len(_numbers(line, named)) >= 3 for line in lines[-len(lines) // 2 :])
-        ):
-            return row, named
-    raise ValueError("none of its first lines holds three numbers")
+    last = next(line.strip() for line in reversed(head) if line.strip())
+    commas = len(re.findall(r"(?<![\d.,])-?\d+,\d+(?![\d.,])", last))
+    if commas >= 3 or (commas and (";" in last or "\t" in last)):
+        raise StageError(f"{path} has commas as decimal points: '{last[:60]}'; export it with points")
+    numbers = next((k for k, line in enumerate(head) if len(_numbers(line)) >= 3), None)
+    if numbers is not None:
+        return numbers, False
+    counts = [len(_numbers(line, True)) for line in head]
+    usual = max((count for count in counts if count >= 3), key=counts.count, default=None)
+    if usual is None:
+        raise ValueError("none of its first lines holds three numbers")
+    first = counts.index(usual)
+    if any(count != usual for count, line in zip(counts[first:], head[first:]) if line.strip()):
+        raise ValueError("its rows have different numbers of columns")
+    return first, True
 
 
 def _numbers_points(rows: NDArray[np.float64]) -> bool:
-    """Whether the first of (N, C) columns numbers the points: one after the other, or whole numbers, each once, beside
-    coordinates that are not whole."""
-    first = rows[:, 0]
-    if rows.shape[1] <= 3 or len(rows) <= 3:
+    """Whether the first of (N, C) columns numbers the points: one after the other, or whole numbers, each once, before
+    coordinates that are not whole where x, y, z and colours or normals would be a column fewer or more."""
+    first, columns = rows[:, 0], rows.shape[1]
+    if columns <= 3 or len(rows) <= 3:
         return False
     if (first == first[0] + np.arange(len(first))).all():
         return True
-    whole = (rows[:, :3] == np.rint(rows[:, :3])).all(0)
-    return bool(whole[0] and not whole[1:].any() and len(np.unique(first)) == len(first))
+    whole = (rows[:, :4] == np.rint(rows[:, :4])).all(0)
+    once = len(np.unique(first)) == len(first)
+    return bool(columns % 3 == 1 and whole[0] and not whole[1:].any() and once)
 
 
 def _separator(line: str) -> str | None:

@@ -42,7 +42,8 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
             `crs_from_scene`, the shift back into the file's coordinates.
 
     Raises:
-        StageError: the file is missing, damaged, in degrees, of an unknown ending, or has too few different points.
+        StageError: the file is missing, damaged, in degrees, of an unknown ending, not where its CRS is used, or has
+            too few different points.
     """
     parts = columns_in_parts(source)
     own = survey(source, parts)
@@ -152,7 +153,7 @@ def survey(source: Path, parts: ColumnParts) -> Survey:
         )
     if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
         most_color = None  # Formats with colours are used for points without, which are black then.
-    return Survey(count, left_out, sample, unit_normals, most_color, sorted(unused))
+    return Survey(count, left_out, sample, unit_normals, most_color, sorted(unused - {""}))
 
 
 def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
@@ -210,13 +211,17 @@ def import_report(source: Path, own: Survey, step: float, diagonal: float, unit:
 
 
 def _check_place(crs: str, own: Survey, source: Path) -> None:
-    """StageError where the middle of a file's points lies far from where its CRS is used, or at a zero beyond that."""
+    """StageError where the middle of a file's points lies far from where its CRS is used; near the CRS's zero, where it
+    lies outside at all."""
     import pyproj
 
     from scenefuse.io.crs import BEYOND_DEG, check_in_area, plane
 
     known = pyproj.CRS.from_user_input(crs)
-    if plane(known).is_projected:
+    known = plane(known.source_crs if known.is_bound and known.source_crs is not None else known)
+    code = known.to_epsg()  # Older WKT does not say where a CRS is used; the register does.
+    known = known if code is None else pyproj.CRS.from_epsg(code)
+    if known.is_projected:
         middle = np.median(own.sample, axis=0)
         beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
         check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)

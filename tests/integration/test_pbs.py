@@ -74,7 +74,7 @@ def test_jobs_are_submitted_with_what_they_need_and_the_others_go_on(pbs, tmp_pa
     done, asked = pbs(tmp_path, *files, "--snakefile", ROOT / "Snakefile", "--configfile", "mine.yaml")
     assert done.returncode == 1 and "shed.ply has only 1 different positions" in done.stdout, done.stdout
     assert len(read_cloud(tmp_path / files[0])) == 500 and not (tmp_path / files[1]).exists()
-    select = "select=1:ncpus=1:mem={}mb:ngpus=0"
+    select = "select=1:ncpus=1:mem={}mb"
     asked = [tuple(options) for options in asked]
     assert (select.format(4001), "walltime=1800") in asked and (select.format(8000), "walltime=3600") in asked
 

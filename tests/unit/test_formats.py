@@ -229,7 +229,31 @@ def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_pat
     assert "its last 1 columns have no names" in capsys.readouterr().out
 
 
+def test_whole_coordinates_are_no_numbers_of_points(tmp_path):
+    rng = np.random.default_rng(0)
+    x, yz, colors = 5 * np.arange(20.0), rng.uniform(-5, 5, (20, 2)).round(3) + 0.0005, rng.integers(0, 256, (20, 3))
+    for name, further in (("profile.xyz", colors), ("measured.xyz", colors[:, :1])):
+        np.savetxt(tmp_path / name, np.column_stack([x, yz, further]), fmt="%.4f")
+        np.testing.assert_allclose(read_cloud(tmp_path / name).points, np.column_stack([x, yz]))
+
+
+def test_rows_of_other_lengths_are_an_error_and_lines_above_are_no_points(tmp_path):
+    (tmp_path / "a.txt").write_text("1.5 2.5 3.5\n" + "1.5 2.5 3.5 9 9 9\n" * 9)
+    (tmp_path / "b.txt").write_text("P1 1.5 2.5 3.5\nP2 1.5 2.5 3.5\nP3 1.5 2.5 3.5 9\n")
+    for name in ("a.txt", "b.txt"):
+        with pytest.raises(StageError, match="not a readable TXT cloud"):
+            read_cloud(tmp_path / name)
+    rows = "".join(f"P{k} {k}.5 2.5 3.5 9 9 9\n" for k in range(9))
+    (tmp_path / "c.txt").write_text("Origin 500000 5000000 0\n" + rows)
+    assert len(read_cloud(tmp_path / "c.txt")) == 9
+    (tmp_path / "d.csv").write_text('"","y","x","z"\n' + "".join(f'"{k}",2,1,{k}.5\n' for k in range(1, 6)))
+    assert read_cloud(tmp_path / "d.csv").points[0].tolist() == [1, 2, 1.5]
+
+
 def test_decimal_commas_are_named(tmp_path):
+    (tmp_path / "one.txt").write_text("0,5;200;300\n1,5;210;310\n")
+    with pytest.raises(StageError, match="commas as decimal points"):
+        read_cloud(tmp_path / "one.txt")
     (tmp_path / "a.txt").write_text("1,25;2,5;3,75\n2,25;3,5;4,75\n")
     with pytest.raises(StageError, match=r"commas as decimal points: '2,25;3,5;4,75'"):
         read_cloud(tmp_path / "a.txt")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import laspy
 import numpy as np
+import pyproj
 import pytest
 from support.cloud_files import UTM, write_e57
 from support.copc_file import write_copc
@@ -155,10 +156,25 @@ def test_classes_of_a_laz_are_not_taken_over_and_that_is_said(tmp_path, cloud):
     assert value(report, "notes") == ["not taken over, and so not in the results: classification"]
 
 
-def test_a_cloud_that_is_not_where_its_crs_says_is_one_sentence(tmp_path, cloud):
-    write_laz(tmp_path / "a.laz", Cloud(cloud.points - UTM), np.zeros(3), "EPSG:32632")
+@pytest.mark.parametrize("version", ["WKT2_2019", "WKT1_GDAL"])
+def test_a_cloud_that_is_not_where_its_crs_says_is_one_sentence(tmp_path, cloud, version):
+    header = laspy.LasHeader(version="1.4", point_format=6)
+    header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(pyproj.CRS("EPSG:32632").to_wkt(version)))
+    las = laspy.LasData(header)
+    las.x, las.y, las.z = (cloud.points - UTM).T
+    las.write(tmp_path / "a.laz")
     with pytest.raises(StageError, match=r"a\.laz, the middle of its points: .* does not lie in WGS 84 / UTM zone 32N"):
         imported_scene(tmp_path, tmp_path / "a.laz")
+
+
+def test_what_is_narrow_and_tall_is_not_in_degrees(tmp_path):
+    rng = np.random.default_rng(0)
+    borehole = rng.uniform(-0.05, 0.05, (400, 3)) * [1, 1, 4000]
+    room = rng.uniform(2, 12, (400, 3))
+    room[:8, 2] = -32768
+    for name, points in (("borehole.xyz", borehole), ("room.xyz", room)):
+        np.savetxt(tmp_path / name, points)
+        assert len(imported_scene(tmp_path, tmp_path / name)[0]) == 400
 
 
 def test_longitude_and_latitude_without_a_word_are_refused(tmp_path, cloud):

@@ -70,6 +70,13 @@ def test_a_lens_in_the_middle_without_distortion_is_held():
     assert [trial["lens"] for trial in choice.trials] == ["held", "centred", "radial", "brown"]
 
 
+def test_two_focal_lengths_stay_two():
+    model = photographed([700, 700, 510, 388, 0, 0, 0, 0])
+    for camera in model.cameras.values():
+        camera.model, camera.params = pycolmap.CameraModelId.PINHOLE, [700, 700, 500, 400]
+    assert [trial["lens"] for trial in choose_lens(model).trials] == ["held", "centred", "brown"]
+
+
 def test_a_richer_model_is_the_same_lens():
     poor = pycolmap.Camera(model="RADIAL", width=100, height=80, params=[90, 51, 39, -0.1, 0.02])
     rich = pycolmap.Camera(poor.todict())

@@ -149,7 +149,7 @@ def crop_by_file(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) 
         near = scene.near(*around_marks(points, settings))[1]
         return near, crop_marked(near, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
     near = scene.near(*around_marks(points, settings, GROWN_EXTENTS))[1]
-    cut = crop_grown(near, points, UP, settings, clicks.other(near.points))
+    cut = crop_grown(near, points, UP, replace(settings, minimal=False), clicks.other(near.points))
     cut = replace(cut, notes=[*clicks.left_out, *cut.notes])
     _announce(cut, str(inputs.fiducials))
     return near, cut, Marks("clicks", points)

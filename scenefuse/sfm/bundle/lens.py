@@ -30,6 +30,9 @@ SEED = 0
 # Models by the number of their distortion parameters, the poorer ones as prefixes of the richer.
 POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
+# Of these, a second radial term makes a richer one.
+ONE_TERM = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
+
 Held = list[tuple[int, int, Array]]
 
 
@@ -89,7 +92,8 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
 
     Cross-validation (Stone 1974): one observation of every point that four photos or more see is left out of the
     adjustment; the logarithmic (Cauchy) errors of a richer lens there have to be smaller than those of each poorer one,
-    taken or not, pair by pair, by three standard errors of their mean, and their median by half a per cent.
+    taken or not (but for one whose principal point ran away), pair by pair, by three standard errors of their mean, and
+    their median by half a per cent.
 
     Args:
         model: bundle-adjusted; it is not changed.
@@ -100,6 +104,8 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
     poorer = [_errors(best.fit(kept, ROUGH_TOLERANCE), held)]
     trials = [_trial(best, poorer[0], None, "the poorest")]
     for lens in lenses[1:]:
+        if lens is RADIAL and any(camera.model_name not in ONE_TERM for camera in model.cameras.values()):
+            continue
         fitted = lens.fit(kept, ROUGH_TOLERANCE)
         errors = _errors(fitted, held)
         gain = min(_gain(others, errors) for others in poorer)
@@ -107,7 +113,8 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         better = len(errors) > 0 and np.median(errors) <= (1 - LEAST_GAIN) * median
         problem = _problem(fitted, gain if better else 0.0)
         trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
-        poorer.append(errors)
+        if _in_bounds(fitted):
+            poorer.append(errors)
         if problem is None:
             best, beyond = lens, None
         elif beyond in (None, RADIAL):
@@ -181,11 +188,16 @@ def _problem(model: pycolmap.Reconstruction, gain: float) -> str | None:
     """Why a richer lens is not taken, or None."""
     if gain < MIN_GAIN:
         return "held-out observations are predicted no better"
+    return None if _in_bounds(model) else "the principal point ran away from the middle"
+
+
+def _in_bounds(model: pycolmap.Reconstruction) -> bool:
+    """Whether all principal points are near enough to the middle to be a lens's."""
     for camera in model.cameras.values():
         off = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
         if np.abs(off).max() > MOST_OFF_CENTRE * max(camera.width, camera.height):
-            return "the principal point ran away from the middle"
-    return None
+            return False
+    return True
 
 
 def _trial(lens: Lens, errors: Array, gain: float | None, verdict: str) -> dict[str, Any]:
