@@ -84,6 +84,8 @@ def test_five_clicks_in_one_photo_cut_out_all_sides_of_the_object(crop):
     # Not by the clicks' own box alone: from the roof it grows down to the foot.
     roof = crop(inside((-2, -1.5, 3), (2, -1.5, 3), (2, 1.5, 3), (-2, 1.5, 3)))[0]
     assert roof[OWN].mean() > 0.9 and roof[~OWN].sum() < 0.02 * roof.sum()
+    # The paper's crop is a box of points; clicks in one photo have none, and are grown all the same.
+    assert (crop(inside(*CORNERS), minimal=True)[0] == kept).all()
 
 
 def test_clicks_have_the_depth_of_the_nearest_surface(crop):
