@@ -38,10 +38,7 @@ def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
     Raises:
         StageError: its heights have another unit than its plane, or it is neither projected nor geographic.
     """
-    if crs.is_bound and crs.source_crs is not None:
-        crs = crs.source_crs  # Older WKT names a way to WGS84 as well; PROJ knows better ones.
-    known = crs.to_epsg()
-    crs = crs if known is None else pyproj.CRS.from_epsg(known)
+    crs = registered(crs)
     units = {axis.unit_name for axis in crs.axis_info}
     if plane(crs).is_projected and len(units) > 1:
         raise StageError(
@@ -52,6 +49,14 @@ def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
             f"{where}: the CRS {crs.name} is neither projected nor geographic; give coordinates in such a one"
         )
     return crs
+
+
+def registered(crs: pyproj.CRS) -> pyproj.CRS:
+    """A CRS as its register has it, where it does: older WKT does not say where it is used."""
+    if crs.is_bound and crs.source_crs is not None:
+        crs = crs.source_crs  # Older WKT names a way to WGS84 as well; PROJ knows better ones.
+    known = crs.to_epsg()
+    return crs if known is None else pyproj.CRS.from_epsg(known)
 
 
 def plane(crs: pyproj.CRS) -> pyproj.CRS:

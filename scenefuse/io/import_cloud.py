@@ -215,12 +215,9 @@ def _check_place(crs: str, own: Survey, source: Path) -> None:
     lies outside at all."""
     import pyproj
 
-    from scenefuse.io.crs import BEYOND_DEG, check_in_area, plane
+    from scenefuse.io.crs import BEYOND_DEG, check_in_area, plane, registered
 
-    known = pyproj.CRS.from_user_input(crs)
-    known = plane(known.source_crs if known.is_bound and known.source_crs is not None else known)
-    code = known.to_epsg()  # Older WKT does not say where a CRS is used; the register does.
-    known = known if code is None else pyproj.CRS.from_epsg(code)
+    known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
     if known.is_projected:
         middle = np.median(own.sample, axis=0)
         beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG

@@ -21,10 +21,10 @@ def diagnose(item: Collected) -> list[str]:
     return [sentence for cause in CAUSES for sentence in cause(item.stages)]
 
 
-def named(photos: list[str]) -> str:
-    """Photos by their names, a few of many."""
-    more = len(photos) - QUOTED
-    return ", ".join(photos[:QUOTED]) + (f" and {more} more" if more > 0 else "")
+def named(items: list[str], mark: str = ", ") -> str:
+    """Photos by their names, or sentences, with a mark between them; a few of many."""
+    more = len(items) - QUOTED
+    return mark.join(items[:QUOTED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _split(fields: Fields) -> Iterator[str]:
@@ -70,10 +70,9 @@ def _clicks(fields: Fields) -> Iterator[str]:
     """Clicks that disagree with the others."""
     left_out = find(fields, "masks.clicks_left_out") or []
     if left_out:
-        shown = "; ".join(left_out[:QUOTED]) + (f" and {len(left_out) - QUOTED} more" if len(left_out) > QUOTED else "")
         yield (
-            f"clicks that disagree with the others and are left out ({len(left_out)}): {shown}; correct them in the"
-            " page to click in (docs/clicking.md), or delete them"
+            f"clicks that disagree with the others and are left out ({len(left_out)}): {named(left_out, '; ')}; correct"
+            " them in the page to click in (docs/clicking.md), or delete them"
         )
 
 

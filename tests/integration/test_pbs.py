@@ -6,11 +6,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import yaml
+from support.user_project import write_clouds
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import read_cloud
 
 pytest.importorskip("snakemake_executor_plugin_cluster_generic", reason="pip install -r tests/requirements.txt")
 
@@ -64,12 +63,7 @@ def pbs(tmp_path):
 
 
 def test_jobs_are_submitted_with_what_they_need_and_the_others_go_on(pbs, tmp_path):
-    rng = np.random.default_rng(0)
-    for name, count in (("yard", 2000), ("house", 500), ("shed", 1)):
-        write_cloud(tmp_path / f"{name}.ply", Cloud(rng.uniform(0, 9, (count, 3))))
-    (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.ply\n")
-    (tmp_path / "objects.tsv").write_text("object\tscene\tcloud\nhouse\tyard\thouse.ply\nshed\tyard\tshed.ply\n")
-    (tmp_path / "mine.yaml").write_text(yaml.safe_dump({"scenes": "scenes.tsv", "objects": "objects.tsv"}))
+    write_clouds(tmp_path)
     files = [f"results/objects/{name}/object.ply" for name in ("house", "shed")]
     done, asked = pbs(tmp_path, *files, "--snakefile", ROOT / "Snakefile", "--configfile", "mine.yaml")
     assert done.returncode == 1 and "shed.ply has only 1 different positions" in done.stdout, done.stdout

@@ -8,11 +8,10 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
-import yaml
+from support.user_project import write_clouds
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import read_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 ISOLATED = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")
@@ -70,12 +69,7 @@ def ran(tmp_path_factory):
     for name, content in (("slow", SLOW), ("card", CARD)):
         (folder / name).mkdir()
         (folder / name / "Snakefile").write_text(content)
-    rng = np.random.default_rng(0)
-    for name, count in (("yard", 2000), ("house", 500), ("shed", 1)):
-        write_cloud(yard / f"{name}.ply", Cloud(rng.uniform(0, 9, (count, 3))))
-    (yard / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.ply\n")
-    (yard / "objects.tsv").write_text("object\tscene\tcloud\nhouse\tyard\thouse.ply\nshed\tyard\tshed.ply\n")
-    (yard / "mine.yaml").write_text(yaml.safe_dump({"scenes": "scenes.tsv", "objects": "objects.tsv"}))
+    write_clouds(yard)
     targets = "results/scenes/yard/dense.ply results/objects/shed/object.ply"
     targets += " results/objects/house/registration/full/fine.json"
     command = f"{sys.executable} -m snakemake"

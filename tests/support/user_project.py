@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 import yaml
 
+from scenefuse.io.clouds import Cloud, write_cloud
+
 CLICKS = "label\tphoto\tx_px\ty_px\n" + "".join(f"inside\t0.jpg\t{x}\t20\n" for x in (20, 30, 40))
 """Clicks on an object, in a photo of `Project.photos`."""
 HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\ttruth\n"
@@ -15,6 +17,16 @@ HEADER = "object\tscene\tphotos\tfiducials\tprompts\tmasks\ttruth\n"
 def planned(output: str) -> set[str]:
     """Rules that a dry run lists."""
     return set(re.findall(r"^([a-z0-9_]+) +\d+$", output, re.MULTILINE)) - {"total"}
+
+
+def write_clouds(path: Path) -> None:
+    """A project of clouds alone: the yard, in it a house, and a shed of a single point, which fails."""
+    rng = np.random.default_rng(0)
+    for name, count in (("yard", 2000), ("house", 500), ("shed", 1)):
+        write_cloud(path / f"{name}.ply", Cloud(rng.uniform(0, 9, (count, 3))))
+    (path / "scenes.tsv").write_text("scene\tcloud\nyard\tyard.ply\n")
+    (path / "objects.tsv").write_text("object\tscene\tcloud\nhouse\tyard\thouse.ply\nshed\tyard\tshed.ply\n")
+    (path / "mine.yaml").write_text(yaml.safe_dump({"scenes": "scenes.tsv", "objects": "objects.tsv"}))
 
 
 class Project:
