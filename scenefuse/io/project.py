@@ -165,11 +165,11 @@ def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
 
 
 def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """Settings of the variants that run, first `full`, which is fused: with recipe `paper` the paper's registration."""
+    """Settings of the variants that run, first `full`, which is fused; with recipe `paper` all by its crop."""
     defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
     registration = settings["registration"]
     if settings["object"]["recipe"] == "paper":
-        defined["full"] = defined["paper"]
+        defined = {name: merge(defined["paper"], own) for name, own in defined.items()}
     chosen = registration["variants"]
     unknown = next((name for name in chosen if name not in defined), None)
     if unknown is not None:

@@ -182,7 +182,7 @@ class Thumbnails:
         """
         key = self._key(picture)
         if key not in self._known:
-            pixels = read_upright(picture.path, 4 * THUMB_PX)
+            pixels = read_upright(picture.path, 2 * THUMB_PX)
             sharp = sharpness(np.ascontiguousarray(pixels[..., ::-1]))
             path = self._folder / f"{key}_{sharp:.2f}.jpg"
             with self._lock:

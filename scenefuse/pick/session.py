@@ -132,8 +132,10 @@ class Session:
         return list(self.boards[board].source.pictures.values())[number]
 
     def _ahead(self) -> list[Picture]:
-        known = self.thumbnails.sharpest_first(self.boards[0].source.pictures.values())
-        return [*self.wanted, *known]
+        # Which photos are the sharpest changes until all are known, and features take both cores from looking for them.
+        if thumbnails_left(self, 0):
+            return self.wanted
+        return [*self.wanted, *self.thumbnails.sharpest_first(self.boards[0].source.pictures.values())]
 
     def _make_thumbnails(self) -> None:
         for board in self.boards:

@@ -1,7 +1,9 @@
 """The page to click in, as a person uses it: a real server and a real browser, with mouse and keyboard."""
 
+import json
 import re
 import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,7 +12,9 @@ from support.browser import chromium
 from support.clicking_page import LOCAL, MASK, Page, served
 from support.user_project import CLICKS, Project
 
+from scenefuse.pick.pictures import Picture
 from scenefuse.sfm.survey.lengths import read_ends
+from scenefuse.workspace import View, write_model
 
 NAME, SIZE = "Füße und Kopf.jpg", (600, 400)
 DISC = ((250, 120), (200, 220), (300, 220))
@@ -210,6 +214,82 @@ def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
     marked = page.save()
     assert marked.points == ["chimney"] * 2 and len(set(marked.photos)) == 2
     assert np.abs(marked.pixels - (30, 20)).max() < 0.5
+
+
+def masked(folder, names):
+    """Results of an object whose photos have the disc as their mask, but for one that was left out."""
+    views = [View(name, np.array([[500.0, 0, 300], [0, 500, 200], [0, 0, 1]]), np.eye(4), *SIZE) for name in names]
+    for part in ("sparse", "undistorted/sparse", "masks"):
+        (folder / part).mkdir(parents=True)
+    for part in ("sparse", "undistorted/sparse"):
+        write_model(folder / part, views)
+    for name in names:
+        mask = cv2.circle(np.zeros(SIZE[::-1], dtype=np.uint8), (250, 180), 90, 255, -1)
+        cv2.imwrite(str(folder / "masks" / f"{name.split('.')[0]}.png"), mask)
+    kept = {name: {"area": 0.1, "agreement": 0.9 + 0.01 * k} for k, name in enumerate(names)}
+    (folder / "masks.json").write_text(json.dumps({"dropped": {"3.jpg": "disagrees"}, "per_photo": kept}))
+
+
+def test_the_workflow_s_masks_are_stepped_through_and_accepted(page, yard):
+    masked(yard.path / "results/objects/shed", ["1.jpg", "2.jpg"])
+    scores = "return [...document.querySelectorAll('.thumb .score')].map((e) => e.offsetParent ? e.innerText : '');"
+    shown = f"return (() => {{ {scores} }})().filter((text) => text).sort().join() === given[0];"
+    page.until(shown, "0.90,0.91,left out")  # taken up while the page is open
+    assert page.browser.value(f"return !document.querySelector('{MASK}');")  # its own photo has none
+    page.key("n")
+    page.until("return document.querySelector('.thumb.here .name').innerText === '1.jpg';")
+    page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
+    page.key("m")
+    page.until(f"return !document.querySelector('{MASK}');")
+    page.key("m")
+    page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
+    page.key("a")
+    page.until("return document.querySelector('.thumb.here .name').innerText === '2.jpg';")
+    page.until(shown, "0.90 ✓,0.91,left out")
+    page.key("a")
+    page.until_text("All masks are accepted")
+    page.open()
+    page.until(shown, "0.90 ✓,0.91 ✓,left out")
+
+
+def test_a_point_is_expected_where_the_other_photos_see_it(page, yard):
+    """Three cameras side by side; the point is 4 in front of them."""
+    lens = np.array([[50.0, 0, 32], [0, 50, 24], [0, 0, 1]])
+    poses = [np.array([[1.0, 0, 0, -k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(3)]
+    folder = yard.path / "results/scenes/yard/sparse"
+    folder.mkdir(parents=True)
+    write_model(folder, [View(f"{k}.jpg", lens, pose, 64, 48) for k, pose in enumerate(poses)])
+    head = "point\tphoto\tx_px\ty_px\n"
+    (yard.path / "clicks.tsv").write_text(head + "top\t0.jpg\t42\t20\n")
+    drawn = "return [...document.querySelectorAll('.leaflet-overlay-pane path')].map((e) => e.getBBox());"
+    count = f"return (() => {{ {drawn} }})().length === given[0];"
+
+    def show(name):
+        thumb = "[...document.querySelectorAll('.thumb')].find((e) => e.innerText.includes(given[0]))"
+        page.until(f"return !!{thumb};", name)
+        page.browser.value(f"{thumb}.click();", name)
+        page.until("return document.querySelector('.thumb.here .name').innerText === given[0];", name)
+
+    page.until("return document.body.innerText.includes('In the scene');")
+    page.key("t")
+    show("1.jpg")
+    page.button("top · 1 photo")
+    page.until(count, 1)  # a dashed line along the ray, which runs level
+    (line,) = page.browser.value(drawn)
+    assert line["width"] > 5 * line["height"]
+    page.path = yard.path / "clicks.tsv"
+    page.path.write_text(head + "top\t0.jpg\t42\t20\ntop\t2.jpg\t17\t20\n")
+    page.until(count, 2)  # the two arms of a cross-hair
+    boxes = page.browser.value(drawn)
+    middle = np.mean([[b["x"] + b["width"] / 2, b["y"] + b["height"] / 2] for b in boxes], axis=0)
+    corner = page.browser.value(
+        "const e = document.querySelector('.photo');"
+        "const p = getElement(+e.id.slice(1)).map.latLngToLayerPoint(given); return [p.x, p.y];",
+        *Picture("", Path(), 64, 48).place(29.5, 20),
+    )
+    assert np.abs(middle - corner).max() < 4  # of the screen's pixels, a photo's being ten of them
+    show("2.jpg")
+    page.until_text("2.jpg: 0.0 px off")
 
 
 def test_a_known_length_is_clicked_in_two_photos_end_after_end(page, yard):

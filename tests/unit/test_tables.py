@@ -100,10 +100,12 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
     assert found["no_crop"]["coarse"] == found["full"]["coarse"]
 
 
-def test_with_recipe_paper_the_papers_registration_is_the_one_that_is_fused(project):
-    both = {"variants": ["full", "paper"]}
-    shipped, paper = (project(object={"recipe": r}, registration=both).variants for r in ("scenefuse", "paper"))
+def test_with_recipe_paper_all_variants_have_the_papers_crop(project):
+    some = {"variants": ["full", "paper", "no_scale", "no_crop"]}
+    shipped, paper = (project(object={"recipe": r}, registration=some).variants for r in ("scenefuse", "paper"))
     assert paper["full"] == shipped["paper"] != shipped["full"]
+    assert paper["no_scale"]["crop"] == paper["full"]["crop"] and paper["no_scale"]["scale"] == {"method": "none"}
+    assert paper["no_crop"]["crop"] == paper["full"]["crop"] | {"whole_scene": True}
 
 
 @pytest.fixture

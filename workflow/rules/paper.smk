@@ -2,7 +2,7 @@
 # Its rules make the files of the rules that they go before.
 #
 # INPUTS    results/objects/{object}/undistorted/, masks/; config: object.stage1 to stage4, object.nerf, object.cloud
-# OUTPUTS   results/objects/{object}/stage1/ to stage4/, their JSON, object.ply, registration/full/
+# OUTPUTS   results/objects/{object}/stage1/ to stage4/, their JSON, object.ply, registration/{variant}/
 #           results/objects/{object}/poses/, poses.json                     poses after stage 1: the pose network's chain, or SfM's
 #           results/objects/{object}/refined_poses/, refined_poses.json     the same after stage 3
 
@@ -13,7 +13,8 @@ ruleorder: train_nerf_as_paper > train_object_nerf
 ruleorder: retrain_nerf_as_paper > retrain_object_nerf
 ruleorder: import_object_cloud > import_posed_object_cloud > make_cloud_as_paper
 ruleorder: make_cloud_as_paper > make_object_cloud
-ruleorder: register_for_fusion_as_paper > estimate_scale > register_coarsely > register_finely
+ruleorder: register_as_paper > register_variant_as_paper
+ruleorder: register_variant_as_paper > estimate_scale > register_coarsely > register_finely
 
 
 def of_paper(stage):
@@ -185,26 +186,34 @@ use rule make_object_cloud as make_cloud_as_paper with:
         "{wildcards.object}: cloud, as rendered"
 
 
-use rule register_as_paper as register_for_fusion_as_paper with:
-    # The paper's registration is the one that is fused; its scale is that of its text (R2).
+def scale_of_paper(wildcards):
+    """How large a variant takes the object: by the paper's text, or as it is in the ablation (R2)."""
+    without = registration_of(wildcards)["scale"].get("method") == "none"
+    return f"--scale {'none' if without else 'ransac_svd'}"
+
+
+use rule register_as_paper as register_variant_as_paper with:
+    # The paper's registration is the one that is fused, and that of its ablation.
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
-        crop="results/objects/{object}/registration/full/crop.ply",
-        crop_json="results/objects/{object}/registration/full/crop.json",
+        crop="results/objects/{object}/registration/{variant}/crop.ply",
+        crop_json="results/objects/{object}/registration/{variant}/crop.json",
         workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
     output:
-        scale="results/objects/{object}/registration/full/scale.json",
-        coarse="results/objects/{object}/registration/full/coarse.json",
-        fine="results/objects/{object}/registration/full/fine.json",
-        picture="results/objects/{object}/registration/full/fine.png",
+        scale="results/objects/{object}/registration/{variant}/scale.json",
+        coarse="results/objects/{object}/registration/{variant}/coarse.json",
+        fine="results/objects/{object}/registration/{variant}/fine.json",
+        picture="results/objects/{object}/registration/{variant}/fine.png",
     log:
-        "results/logs/register_for_fusion_as_paper/{object}.log",
+        "results/logs/register_variant_as_paper/{object}-{variant}.log",
     benchmark:
-        "results/benchmarks/register_for_fusion_as_paper/{object}.tsv"
+        "results/benchmarks/register_variant_as_paper/{object}-{variant}.tsv"
     params:
-        options="--scale ransac_svd",
+        options=scale_of_paper,
         gravity=options_of("workspace_json"),
         seed=config["seed"],
         script=script("registration/register_as_paper.py"),
         code=code("registration/register_as_paper.py"),
+    message:
+        "{wildcards.object}, variant {wildcards.variant}: registration by the paper's recipe"
