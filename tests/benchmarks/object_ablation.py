@@ -1,4 +1,4 @@
-"""What each part of the four stages is worth: the demo's objects again without it, over seeds, against the truth.
+"""What each part of the four stages is worth: objects again without it, over seeds, against a truth if there is one.
 
 make demo; then
 python tests/benchmarks/object_ablation.py --results results --objects house --seeds 3 --settings config/demo.yaml
@@ -27,9 +27,13 @@ from scenefuse.mvs.views import load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import psnr
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
-from scenefuse.stage import StageError, run, value
+from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper
+from scenefuse.paper.monocular import MonocularSettings
+from scenefuse.stage import StageError, read_json, run, value
 
 POSE_RATE = 5e-4
+# Of stage 1 in config/paper.yaml.
+PAPER_EPOCHS = 15
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,8 @@ class Variant:
     masks: bool = True
     prior: bool = True
     feedback: bool = True
+    papers_stage1: bool = False
+    """the paper's stage 1 from SfM's poses as the prior of both NeRF stages"""
     long: bool = False
     """stage 2 alone, with stage 4's epochs added"""
 
@@ -58,11 +64,12 @@ VARIANTS = {
     "no_samples_at_prior": Variant(nerf={"prior_share": 0.0}),
     "papers_rates": Variant(nerf={"learning_rate": 1e-3, "grid_learning_rate": 1e-3, "warmup_epochs": 2}),
     "stage2_longer": Variant(long=True),
+    "papers_stage1": Variant(papers_stage1=True, feedback=False),
 }
 
 
 def one(
-    folder: Path, truth: ObjectTruth, variant: Variant, seed: int, settings: dict[str, Any], photos: int
+    folder: Path, truth: ObjectTruth | None, variant: Variant, seed: int, settings: dict[str, Any], photos: int
 ) -> dict[str, Any]:
     """Stages 2 to 4 and the cloud of one object again, from the workflow's cameras, masks and stage 1, and measured."""
     start = time.monotonic()
@@ -82,8 +89,15 @@ def one(
             )
 
         early, late = settings["stage2"]["epochs"], settings["stage4"]["epochs"]
-        nerf(2, folder / "stage1", None, early + late if variant.long else early)
         prior = folder / "stage1"
+        if variant.papers_stage1:
+            prior, posed = work / "stage1", work / "poses"
+            estimate_as_paper(
+                workspace=folder / "undistorted", masks=masks, pose_source="sfm",
+                outputs=StageOutputs(prior, work / "stage1.json", posed, work / "poses.json"),
+                settings=MonocularSettings(PAPER_EPOCHS), **common,
+            )  # fmt: skip
+        nerf(2, prior, None, early + late if variant.long else early)
         if variant.feedback and variant.prior and not variant.long:
             prior = work / "stage3"
             refine_depth(
@@ -95,16 +109,21 @@ def one(
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if variant.long else "stage4")
         seconds, fusing = time.monotonic() - start, settings["cloud"]
+        measured = {
+            "psnr_2": held_out_psnr(folder, work / "stage2", settings),
+            "psnr_4": held_out_psnr(folder, last, settings),
+            "silhouettes": value(read_json(last.with_suffix(".json")), "silhouette_iou"),
+            **cloud(folder, masks, last, truth, fusing, seed),
+            "seconds": seconds,
+        }
+        if truth is None:
+            return measured
         depth = depth_results([work / "stage2", last], truth, photos)
-        return {
+        return measured | {
             "depth_2_pct": 100 * value(depth, "stage2_depth_error"),
             "depth_4_pct": 100 * value(depth, f"{last.name}_depth_error"),
             "within_4": value(depth, f"{last.name}_depth_within_1pct"),
-            "psnr_2": held_out_psnr(folder, work / "stage2", settings),
-            "psnr_4": held_out_psnr(folder, last, settings),
-            **cloud(folder, masks, last, truth, fusing, seed),
             **as_rendered(cloud(folder, masks, last, truth, fusing | {"match_reach_px": 0}, seed)),
-            "seconds": seconds,
         }
 
 
@@ -114,9 +133,13 @@ def as_rendered(measures: dict[str, Any]) -> dict[str, Any]:
 
 
 def cloud(
-    folder: Path, masks: Path, last: Path, truth: ObjectTruth, settings: dict[str, Any], seed: int
+    folder: Path, masks: Path, last: Path, truth: ObjectTruth | None, settings: dict[str, Any], seed: int
 ) -> dict[str, Any]:
-    """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings."""
+    """The cloud of the last NeRF stage, whole, and only what of it is nearer to the object than to its surroundings.
+
+    Without a truth, what its depths say of themselves: how many photos moved to where they match, how many no two views
+    agree on.
+    """
     path = last.with_name("object.ply")
     workspace = folder / "undistorted"
     inputs = CloudInputs(workspace, workspace.with_suffix(".json"), masks, last, last.with_suffix(".json"))
@@ -126,17 +149,21 @@ def cloud(
     except StageError as error:
         print(f"no cloud: {error}", flush=True)
         return {"accuracy_pct": np.nan, "f_05": 0.0, "f_1": 0.0, "f_1_cut": 0.0}
+    own = read_json(path.with_suffix(".json"))
+    shares = {name: value(own, f"{name}_share") for name in ("refined", "inconsistent")}
+    if truth is None:
+        return shares
     points = truth.fit.truth_from_model.apply(read_cloud(path).points)
     low, high = truth.surface.min(0), truth.surface.max(0)
     to_object, to_rest = (distances(mesh.caster(), points) for mesh in (truth.mesh, truth.rest))
-    own = belongs_to_object(points, to_object, to_rest, low, high, 0.05 * truth.diagonal)
+    near = belongs_to_object(points, to_object, to_rest, low, high, 0.05 * truth.diagonal)
     whole = cloud_results(points, truth, len(truth.surface), seed)
-    cut = value(cloud_results(points[own], truth, len(truth.surface), seed), "cloud_f_score_1pct") if own.any() else 0.0
-    return {
+    alone = cloud_results(points[near], truth, len(truth.surface), seed) if near.any() else {}
+    return shares | {
         "accuracy_pct": value(whole, "cloud_accuracy_median"),
         "f_05": value(whole, "cloud_f_score_05pct"),
         "f_1": value(whole, "cloud_f_score_1pct"),
-        "f_1_cut": cut,
+        "f_1_cut": value(alone, "cloud_f_score_1pct") if alone else 0.0,
     }
 
 
@@ -171,16 +198,16 @@ def object_ablation(
 ) -> None:
     """Print mean and spread of every variant over seeds as Markdown; all runs go to bench/object_ablation.tsv.
 
-    Stage 1 is the workflow's in every variant. `no_masks` calls everything the object, for the NeRF and for the cloud;
-    its cloud thus holds the surroundings, which `F 1 %, cut` leaves out. `no_depth` has no prior at all,
-    `prior_unrefined` one that photos did not move, `no_feedback` takes stage 1's depth in stage 4, `stage2_longer` has
-    as many epochs without alternation. `adaptive_steps` is the paper's adaptive grid as longer steps, `order_of_all`
-    ranks depths that nothing confirms as well (method N9, N3). Depth errors are medians over pixels that truly show the
-    object.
+    Stage 1 is the workflow's in every variant but `papers_stage1` (to compare with `no_feedback`). `no_masks` calls
+    everything the object, for the NeRF and for the cloud; its cloud thus holds the surroundings, which `F 1 %, cut`
+    leaves out. `no_depth` has no prior at all, `prior_unrefined` one that photos did not move, `no_feedback` takes
+    stage 1's depth in stage 4, `stage2_longer` has as many epochs without alternation. `adaptive_steps` is the
+    paper's adaptive grid as longer steps, `order_of_all` ranks depths that nothing confirms as well (method N9, N3).
+    Depth errors are medians over pixels that truly show the object; without a truth, columns that need one are empty.
 
     Args:
-        results: folder of a finished demo.
-        objects: of the demo.
+        results: folder of a finished run.
+        objects: of it; those of the demo have a truth.
         seeds: 0 to this.
         only: these variants; none for all.
         settings: laid over the shipped ones, or none.
@@ -194,9 +221,11 @@ def object_ablation(
     chosen = {name: variant for name, variant in VARIANTS.items() if not only or name in only}
     for name in objects:
         folder, known = results / "objects" / name, results / "demo/demo/truth"
-        truth = read_object_truth(
-            folder / "undistorted", known / "scene", known / name, limits["samples"], shipped["seed"]
-        )
+        truth = None
+        if (known / name).is_dir():
+            truth = read_object_truth(
+                folder / "undistorted", known / "scene", known / name, limits["samples"], shipped["seed"]
+            )
         for seed in range(seeds):
             for variant in chosen:
                 if (name, variant, seed) in done:
@@ -214,6 +243,9 @@ HEAD = {
     "within_4": "within 1 %",
     "psnr_2": "PSNR, stage 2 (dB)",
     "psnr_4": "stage 4 (dB)",
+    "silhouettes": "silhouettes",
+    "refined": "depths that photos moved",
+    "inconsistent": "inconsistent depths",
     "accuracy_pct": "cloud accuracy (%)",
     "f_05": "F 0.5 %",
     "f_1": "F 1 %",
@@ -226,6 +258,7 @@ HEAD = {
 
 
 def print_table(table: pd.DataFrame, seeds: int) -> None:
+    table = table.reindex(columns=["object", "variant", *HEAD])
     groups = table.groupby(["object", "variant"], sort=False)[list(HEAD)]
     means, spreads = groups.mean(), groups.std().fillna(0)
     print(f"\nMean ± standard deviation over {seeds} seeds; lengths in % of the object's diagonal.\n")

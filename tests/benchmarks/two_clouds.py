@@ -1,6 +1,6 @@
 """`scenefuse register --fuse` on a finished demo, against truth: an object's cloud in its scene as a LAZ, no photos.
 
-make demo, then PYTHONPATH=. python tests/benchmarks/two_clouds.py --results results
+make demo, then PYTHONPATH=tests python tests/benchmarks/two_clouds.py --results results
 
 The object's cloud is turned, moved and scaled at random first, so that nothing of its frame is known. It is marked as
 by a person: by the ends of the true object along the scene's axes, a hundredth of its diagonal off.
@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from scipy.spatial.transform import Rotation
+from support.marks import marks_of
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import read_cloud, write_cloud, write_laz
@@ -20,18 +21,10 @@ from scenefuse.metrics.object_truth import read_object_truth, scene_scores, surf
 from scenefuse.metrics.truth import registration_error
 from scenefuse.registration.register import Known
 from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Sim3
 from scenefuse.two_clouds.register import REGISTERED, register
 
 SAMPLES = 60000
-OFF = 0.01
-"""How far off the marks are clicked, one standard deviation over the object's diagonal."""
-
-
-def marks_of(surface: Array, diagonal: float, seed: int) -> Array:
-    """(6, 3) the ends of a surface (N, 3) along the axes, not quite met."""
-    ends = np.concatenate([surface[surface.argmin(0)], surface[surface.argmax(0)]])
-    return ends + np.random.default_rng(seed).normal(0, OFF * diagonal, ends.shape)
 
 
 def trial(results: Path, scene: str, name: str, seed: int, folder: Path) -> dict[str, object]:
