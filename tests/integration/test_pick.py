@@ -201,7 +201,7 @@ def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
     page.until_text("Named points")
     page.button("Named points")
     page.until("return !!document.querySelector('.side input');")
-    page.browser.find(".side input").send_keys("chimney\n")
+    page.write("chimney")
     page.until_text("chimney · 0 photos")
     for _ in range(2):
         action = page.mouse()
@@ -295,7 +295,7 @@ def test_a_point_is_expected_where_the_other_photos_see_it(page, yard):
 def test_a_known_length_is_clicked_in_two_photos_end_after_end(page, yard):
     page.button("Known lengths")
     page.until_text("New length")
-    page.browser.find(".side input").send_keys("bar 1.5\n")
+    page.write("bar 1.5")
     page.until_text("bar, 1.5 m: b · 0 photos")
     for _ in range(2):
         for count, x in ((1, 20), (2, 40)):

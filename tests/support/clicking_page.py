@@ -106,6 +106,13 @@ class Page:
 
     def button(self, text):
         """Press the button of this text, once it can be pressed: a dialogue takes a moment to appear."""
+        self._once_it_can_be_used("button", lambda e: text in e.text and (e.click(), True), f"no button {text}")
+
+    def write(self, text):
+        """Write into the side panel's field, once it can be written into, and press Enter."""
+        self._once_it_can_be_used(".side input", lambda e: (e.send_keys(f"{text}\n"), True), "no field")
+
+    def _once_it_can_be_used(self, selector, use, complaint):
         from selenium.common.exceptions import (
             ElementClickInterceptedException,
             ElementNotInteractableException,
@@ -115,13 +122,12 @@ class Page:
         not_yet = ElementClickInterceptedException, ElementNotInteractableException, StaleElementReferenceException
         end = time.monotonic() + PATIENCE_S
         while time.monotonic() < end:
-            for button in self.browser.window.find_elements("css selector", "button"):
+            for element in self.browser.window.find_elements("css selector", selector):
                 with suppress(*not_yet):
-                    if text in button.text:
-                        button.click()
+                    if use(element):
                         return
             time.sleep(0.05)
-        raise AssertionError(f"no button {text}: {self.text()}")
+        raise AssertionError(f"{complaint}: {self.text()}")
 
     def marks(self, count):
         """Wait until the badge of the shown photo counts so many clicks."""
