@@ -25,6 +25,7 @@ OTHER_ACTIONS = (
     *("scenefuse init", "photos into a folder", "a row of scenes.tsv", "a row of objects.tsv"),
     *("scenefuse pick", "choose the photo", "save", "snakemake"),
 )
+CHOOSE = "[...document.querySelectorAll('.thumb .name')].find((e) => e.innerText === given[0]).click();"
 SHOWN = "return document.querySelector('.thumb.here .name')?.innerText === given[0];"
 CHANGED = f"const m = document.querySelector('{MASK}'); return !!m?.naturalWidth && m.src !== given[0];"
 
@@ -49,9 +50,7 @@ def clicking(*, photos: Path, photo: str, clicks: tuple[float, ...], weights: Pa
             page.until(
                 "return [...document.querySelectorAll('.thumb .name')].some((e) => e.innerText === given[0]);", photo
             )
-            browser.value(
-                "[...document.querySelectorAll('.thumb')].find((e) => e.innerText.includes(given[0])).click();", photo
-            )
+            browser.value(CHOOSE, photo)
             page.until(SHOWN, photo)
             waits = [_click(page, *at) for at in zip(clicks[::2], clicks[1::2])]
             page.save()
@@ -72,12 +71,13 @@ def _project(folder: Path, photos: Path, weights: Path, count: int | None) -> No
     (folder / "close").mkdir()
     files = photo_files(photos)
     for k, path in enumerate(islice(cycle(files), count or len(files))):
-        (folder / "close" / (path.name if k < len(files) else f"{k:03d}_{path.name}")).symlink_to(path.resolve())
+        shutil.copyfile(path, folder / "close" / (path.name if k < len(files) else f"{k:03d}_{path.name}"))
     (folder / "results/weights").mkdir(parents=True)
     shutil.copytree(weights, folder / "results/weights/sam2", copy_function=os.symlink)
     (folder / "objects.tsv").write_text("object\tphotos\tprompts\nthing\tclose\tprompts.tsv\n")
     (folder / "scenes.tsv").write_text("scene\tphotos\n")
-    (folder / "mine.yaml").write_text("scenes: scenes.tsv\nobjects: objects.tsv\n")
+    frames = f"object: {{ frames: {{ max_frames: {count or len(files)} }} }}\n"
+    (folder / "mine.yaml").write_text(f"scenes: scenes.tsv\nobjects: objects.tsv\n{frames}")
 
 
 def _click(page: Page, x: float, y: float) -> float:
