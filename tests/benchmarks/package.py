@@ -39,7 +39,10 @@ def package(*, runs: int = 3, largest: int = 4) -> None:
         parts = sorted(((_megabytes(path), path.name) for path in sites.iterdir() if path.is_dir()), reverse=True)
         print(f"wheel {_megabytes(wheel):.1f} MB; installed {_megabytes(sites) - empty:.0f} MB, of it", end=" ")
         print(", ".join(f"{name} {size:.0f}" for size, name in parts[:largest]))
-        for text, words in (("import", (python, "-c", IMPORT)), ("command", (python.with_name("scenefuse"), "--help"))):
+        for text, words in (
+            ("import", (python, "-c", IMPORT)),
+            ("command", (python.with_name("scenefuse"), "register", "--help")),
+        ):
             print(f"{text} {min(_seconds(words, work)[0] for _ in range(runs)):.1f} s")
         trial = plant("house", 5, ground=False, noise=0.005, object_points=6000, density_ratio=1.0)
         write_cloud(work / "house.ply", trial.object)
