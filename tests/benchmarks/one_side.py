@@ -101,7 +101,7 @@ def _project(folder: Path, name: str, scene: dict[str, object], row: dict[str, o
     for kind, cells in tables.items():
         (folder / f"{kind}.tsv").write_text("\t".join(cells) + "\n" + "\t".join(map(str, cells.values())) + "\n")
     demo = yaml.safe_load((ROOT / "config/demo.yaml").read_text())
-    own = {"scenes": "scenes.tsv", "objects": "objects.tsv", "object": demo["object"]}
+    own = {"scenes": "scenes.tsv", "objects": "objects.tsv"} | {part: demo[part] for part in ("scene", "object")}
     (folder / "mine.yaml").write_text(yaml.safe_dump(own))
 
 
