@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import yaml
-from scipy.spatial.transform import Rotation
-from support.marks import marks_of
+from support.marks import frame_of_its_own, marks_of
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import read_cloud, write_cloud, write_laz
@@ -63,7 +62,9 @@ def one_side(
                         "fiducials": "marks.tsv",
                     }
                 else:
-                    write_cloud(folder / "object.ply", read_cloud(of / "object.ply").transformed(_turned(seed)))
+                    write_cloud(
+                        folder / "object.ply", read_cloud(of / "object.ply").transformed(frame_of_its_own(seed))
+                    )
                     scene = {"photos": results / f"demo/{SCENE}/scene/photos", "cameras": flight / "georeferenced"}
                     scene["cloud"] = flight / "dense.ply"
                     row = {"cloud": "object.ply", "fiducials": results / f"demo/{SCENE}/{name}/fiducials.tsv"}
@@ -88,11 +89,6 @@ def _marks(path: Path, known: ObjectTruth, truth_from_scene: Sim3, seed: int) ->
     surface = truth_from_scene.inverse().apply(known.surface)
     marks = marks_of(surface, known.diagonal / truth_from_scene.scale, seed)
     path.write_text("point\tx\ty\tz\n" + "".join(f"p{k}\t{x}\t{y}\t{z}\n" for k, (x, y, z) in enumerate(marks)))
-
-
-def _turned(seed: int) -> Sim3:
-    rng, turn = np.random.default_rng(seed), Rotation.random(random_state=seed).as_matrix()
-    return Sim3(float(np.exp(rng.uniform(-2, 2))), turn, rng.normal(0, 100, 3))
 
 
 def _project(folder: Path, name: str, scene: dict[str, object], row: dict[str, object]) -> None:

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from scipy.spatial.transform import Rotation
-from support.marks import marks_of
+from support.marks import frame_of_its_own, marks_of
 
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.io.clouds import read_cloud, write_cloud, write_laz
@@ -34,10 +33,7 @@ def trial(results: Path, scene: str, name: str, seed: int, folder: Path) -> dict
     truth_from_scene = Sim3.from_matrix(
         np.array(value(read_json(results / f"scenes/{scene}/truth.json"), "truth_from_scene"))
     )
-    rng = np.random.default_rng(seed)
-    turned = Sim3(
-        float(np.exp(rng.uniform(-2, 2))), Rotation.random(random_state=seed).as_matrix(), rng.normal(0, 100, 3)
-    )
+    turned = frame_of_its_own(seed)
     dense = read_cloud(results / f"scenes/{scene}/dense.ply")
     write_laz(folder / "scene.laz", dense, np.zeros(3), None)
     write_cloud(folder / "object.ply", read_cloud(results / f"objects/{name}/object.ply").transformed(turned))
