@@ -1,4 +1,5 @@
-"""Coarse registration: candidates from features and from gravity, briefly refined, the distinct best kept."""
+"""Coarse registration: the scale's prior, candidates from features and from gravity, briefly refined, the distinct best
+kept."""
 
 import time
 from collections.abc import Sequence
@@ -10,10 +11,11 @@ import numpy as np
 
 from scenefuse.registration.candidates import fpfh, match, ransac_similarities, upright_candidates
 from scenefuse.registration.icp import refine_points
-from scenefuse.registration.problem import Evidence, Inputs, Problem, read_scales
+from scenefuse.registration.problem import Evidence, Inputs, Problem
+from scenefuse.registration.scale import ScaleSettings, estimates, prior, scale_quantities
 from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, best_distinct, score
 from scenefuse.registration.surface import prepare, with_grid, with_queries
-from scenefuse.stage import quantity, read_json, setting, write_json
+from scenefuse.stage import quantity, setting, write_json
 from scenefuse.transforms import Sim3, rotation_between
 
 Candidate = tuple[Sim3, str]
@@ -52,25 +54,31 @@ class CoarseSettings:
     """Distinct hypotheses handed to the fine registration."""
 
 
-def register_coarsely(*, inputs: Inputs, scale_json: Path, report: Path, seed: int, settings: CoarseSettings) -> None:
-    """Find scene_from_object hypotheses of an object of unknown pose and roughly known scale.
+def register_coarsely(
+    *, inputs: Inputs, scale_report: Path, report: Path, seed: int, scale: ScaleSettings, settings: CoarseSettings
+) -> None:
+    """Estimate the object's scale, and find scene_from_object hypotheses of its pose.
 
-    Similarity RANSAC on FPFH matches over a pyramid of voxels (method R3, R4, R6) and, where gravity is known on both
-    sides, a sweep of yaw, scale and shift by correlation; each is briefly refined and scored both ways (R9).
+    The scale first, from the clouds' extents, as a prior with a width (method R1 to R3). Then similarity RANSAC on FPFH
+    matches over a pyramid of voxels (R3, R4, R6) and, where gravity is known on both sides, a sweep of yaw, scale and
+    shift by correlation; each is briefly refined and scored both ways (R9).
 
     Args:
         inputs: the two clouds and their reports.
-        scale_json: JSON of the scale stage.
+        scale_report: output JSON: `scale`, `width_log` and the `ledger` of all estimates.
         report: output JSON with `hypotheses`, best first, and the best `scene_from_object`.
         seed: of all random choices.
+        scale: see ScaleSettings.
         settings: see CoarseSettings.
 
     Raises:
         StageError: a cloud's points lie in one place or along one line.
     """
     start = time.perf_counter()
-    obj, scene = inputs.clouds()
-    problem = Problem(obj, scene, read_scales(read_json(scale_json)), Evidence(inputs.ups()), seed)
+    (obj, scene), ups = inputs.clouds(), inputs.ups()
+    ledger = estimates(obj, scene, ups)
+    problem = Problem(obj, scene, prior(ledger, scale), Evidence(ups), seed)
+    write_json(scale_report, scale_quantities(ledger, problem.scales, scale.method))
     found, notes = find_hypotheses(problem, settings), []
     if not found:
         notes.append("no feature or heading gave a pose; the clouds' centres were laid on each other instead")

@@ -71,7 +71,7 @@ def register_finely(
 
     Args:
         inputs: the two clouds and their reports.
-        scale_json: JSON of the scale stage.
+        scale_json: JSON of the scale, of the coarse stage.
         coarse_json: JSON of the coarse stage.
         evidence: what is known beside the clouds.
         report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.

@@ -69,7 +69,7 @@ def register_as_paper(
 
     Args:
         inputs: the two clouds and their reports.
-        scale_report: output JSON as of the scale stage.
+        scale_report: output JSON of the scale, as of the coarse stage.
         coarse_report: output JSON as of the coarse stage.
         report: output JSON as of the fine stage; its `status` is `ungated`, what has no gate is null.
         picture: output PNG, the object on the scene crop from three sides.

@@ -144,7 +144,7 @@ def check_extent(cloud: Cloud, name: str) -> None:
 
 
 def read_scales(scale: dict[str, Any]) -> ScaleRange:
-    """The scale prior of a scale stage's JSON."""
+    """The scale prior of a coarse stage's JSON of the scale."""
     return ScaleRange(value(scale, "scale"), value(scale, "width_log"))
 
 

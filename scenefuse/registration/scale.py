@@ -1,7 +1,6 @@
 """How large the object is in the scene: estimates from the clouds' extents, and the prior made of them."""
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -9,8 +8,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.io.clouds import Cloud, voxel_downsample
 from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.problem import Inputs
-from scenefuse.stage import quantity, setting, write_json
+from scenefuse.stage import quantity, setting
 from scenefuse.transforms import Array, rotation_between
 
 # Voxels even out the density of both clouds, as a share of their diagonal.
@@ -44,26 +42,8 @@ class Estimate:
     used: bool
 
 
-def estimate_scale(*, inputs: Inputs, report: Path, settings: ScaleSettings) -> None:
-    """Estimate scene units per object unit before any pose is known (method R1 to R3).
-
-    The upper quartile of all estimates of extent is the centre of a prior with a width; the registration finds the
-    scale inside.
-
-    Args:
-        inputs: the two clouds and their reports.
-        report: output JSON: `scale`, `width_log` and the `ledger` of all estimates.
-        settings: see ScaleSettings.
-
-    Raises:
-        StageError: a cloud's points lie in one place or along one line.
-    """
-    ledger = estimates(*inputs.clouds(), inputs.ups())
-    write_json(report, scale_quantities(ledger, prior(ledger, settings), settings.method))
-
-
 def scale_quantities(ledger: list[Estimate], scales: ScaleRange, method: str) -> dict[str, Any]:
-    """The stage JSON; every estimate is printed."""
+    """The JSON of the scale; every estimate is printed."""
     for e in ledger:
         print(f"{e.name:12s} {e.scale:.5g}", flush=True)
     return {
@@ -106,7 +86,8 @@ def estimates(obj: Cloud, scene: Cloud, ups: tuple[Array, Array] | None) -> list
 def prior(ledger: list[Estimate], settings: ScaleSettings) -> ScaleRange:
     """The prior made of the estimates.
 
-    Its centre is their upper quartile: what the crop lacks makes all of them too small, rarely too large.
+    Its centre is their upper quartile: what the crop lacks makes all of them too small, rarely too large. The
+    registration finds the scale within its width.
     """
     if settings.method == "none":
         return ScaleRange(1.0, 0.0)

@@ -1,4 +1,4 @@
-"""Find hypotheses of the object's pose in the scene."""
+"""Estimate the object's scale in the scene, and find hypotheses of its pose there."""
 
 from scenefuse.registration.coarse import register_coarsely
 from scenefuse.stage import run

@@ -21,6 +21,7 @@ from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.fine import EvidenceFiles, register_finely
 from scenefuse.registration.paper import register_as_paper
 from scenefuse.registration.problem import Inputs
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
 
@@ -28,7 +29,7 @@ OBJECTS = ("house", "balloon", "sculpture")
 
 
 def one(results: Path, name: str, variant: str, seed: int, options: dict[str, Any], true: Sim3) -> dict[str, Any]:
-    """Register one object again with another seed, from the workflow's crop and scale, and measure it."""
+    """Register one object again with another seed, from the workflow's crop, and measure it."""
     folder, scene = results / "objects" / name, results / "scenes/demo"
     made = folder / "registration" / variant
     inputs = Inputs(folder / "object.ply", made / "crop.ply", made / "crop.json", folder / "undistorted.json")
@@ -37,10 +38,13 @@ def one(results: Path, name: str, variant: str, seed: int, options: dict[str, An
         if variant == "paper":
             register_as_paper(inputs=inputs, scale_report=scale, coarse_report=coarse, report=fine, seed=seed)
         else:
-            scale, depth = made / "scale.json", tuple(p for p in sorted((scene / "depth").iterdir()) if p.is_dir())
+            depth = tuple(p for p in sorted((scene / "depth").iterdir()) if p.is_dir())
             evidence = EvidenceFiles(folder / "alignment.json", scene / "undistorted", depth)
             settings = build(CoarseSettings, options.get("coarse", {})), build(FineSettings, options.get("fine", {}))
-            register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=seed, settings=settings[0])
+            register_coarsely(
+                inputs=inputs, scale_report=scale, report=coarse, seed=seed,
+                scale=build(ScaleSettings, options.get("scale", {})), settings=settings[0],
+            )  # fmt: skip
             register_finely(
                 inputs=inputs, scale_json=scale, coarse_json=coarse, evidence=evidence, report=fine, seed=seed,
                 settings=settings[1],

@@ -39,7 +39,7 @@ from scenefuse.registration.crop.crop_scene import CropInputs, around_marks, cro
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.fine import register_finely
 from scenefuse.registration.problem import Inputs
-from scenefuse.registration.scale import ScaleSettings, estimate_scale
+from scenefuse.registration.scale import ScaleSettings
 from scenefuse.stage import quantity, read_json, run, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -189,8 +189,9 @@ def register(folder: Path) -> None:
     """Scale, coarse and fine registration, as the workflow runs them."""
     inputs = Inputs(object=folder / "object.ply", crop=folder / "crop.ply", crop_json=folder / "crop.json")
     scale, coarse = folder / "scale.json", folder / "coarse.json"
-    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
-    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=CoarseSettings())
+    register_coarsely(
+        inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=CoarseSettings()
+    )
     fine = folder / "house/fine.json"
     register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=FineSettings())
 

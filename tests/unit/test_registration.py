@@ -20,7 +20,7 @@ from scenefuse.registration.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.registration.paper import register_as_paper
 from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem
 from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.scale import ScaleSettings, estimate_scale, estimates, prior
+from scenefuse.registration.scale import ScaleSettings, estimates, prior
 from scenefuse.registration.score import color_agreement, pair, score
 from scenefuse.registration.surface import prepare
 from scenefuse.registration.uncertainty import ALIKE, Uncertainty, alike, half_sampling
@@ -205,9 +205,8 @@ def stage_inputs(folder, obj, scene, up_in_object=None):
 def test_stages_hand_their_files_on_and_register(tmp_path, house):
     inputs = stage_inputs(tmp_path, house.object, house.scene, house.up_in_object)
     scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
-    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
+    register_coarsely(inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=COARSE)
     assert value(read_json(scale), "width_log") == 0.5
-    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=COARSE)
     register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
     content = read_json(fine)
     assert value(content, "status") == "registered" and value(content, "tilt_deg") < 5
@@ -250,21 +249,25 @@ def test_a_flat_object_keeps_a_sane_scale_prior(scene_thickness):
 def test_a_flat_object_ends_in_a_decision(tmp_path):
     inputs = stage_inputs(tmp_path, plate((4, 3)), plate((8, 6), 1), Z)
     scale, coarse, fine = (tmp_path / f"{name}.json" for name in ("scale", "coarse", "fine"))
-    estimate_scale(inputs=inputs, report=scale, settings=ScaleSettings())
-    register_coarsely(inputs=inputs, scale_json=scale, report=coarse, seed=0, settings=LITTLE[0])
+    register_coarsely(
+        inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=LITTLE[0]
+    )
     register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=LITTLE[1])
     assert value(read_json(fine), "status") in ("registered", "unregistered")
 
 
 @pytest.mark.parametrize("size, where", [((4, 0), "along one line"), ((0, 0), "in one place")])
 def test_a_line_and_a_point_are_one_sentence(tmp_path, house, size, where):
+    scale, coarse = tmp_path / "scale.json", tmp_path / "coarse.json"
     for inputs in (
         stage_inputs(tmp_path, plate(size), house.scene),
         stage_inputs(tmp_path, house.object, plate(size)),
     ):
         with pytest.raises(StageError, match=f"all 3000 points of .*ply lie {where}"):
-            estimate_scale(inputs=inputs, report=tmp_path / "scale.json", settings=ScaleSettings())
-    assert not (tmp_path / "scale.json").exists()
+            register_coarsely(
+                inputs=inputs, scale_report=scale, report=coarse, seed=0, scale=ScaleSettings(), settings=COARSE
+            )
+    assert not scale.exists() and not coarse.exists()
 
 
 def test_frame_ledger_inverts_every_transform(tmp_path):

@@ -6,9 +6,16 @@ def registration_of(wildcards):
     return PROJECT.registration(wildcards.object, wildcards.variant)
 
 
-def variant_options(part):
-    """Params function: the settings of one step of a variant."""
-    return lambda wildcards: flags(registration_of(wildcards)[part])
+def variant_options(*parts):
+    """Params function: settings of a variant, of some parts of `registration`."""
+
+    def words(wildcards):
+        found = registration_of(wildcards)
+        return flags(
+            {key: value for part in parts for key, value in found[part].items()}
+        )
+
+    return words
 
 
 def crop_mode(wildcards):

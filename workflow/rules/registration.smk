@@ -6,7 +6,7 @@
 #
 # `full` is the variant that is fused; the others run beside it by the same scripts, with other options, and are measured at the same
 # thresholds. `paper` has a crop by fiducials, and the paper's recipe is a stage of its own.
-ruleorder: register_as_paper > estimate_scale > register_coarsely > register_finely
+ruleorder: register_as_paper > register_coarsely > register_finely
 
 
 include: "../functions/registration.smk"
@@ -81,48 +81,17 @@ rule crop_scene:
         " --crop {output.crop} --report {output.report} {params.options} &> {log}"
 
 
-rule estimate_scale:
-    """How large the object's unit is in the scene (paper 3.3; R1 to R4)."""
-    input:
-        cloud="results/objects/{object}/object.ply",
-        cloud_json="results/objects/{object}/object.json",
-        crop="results/objects/{object}/registration/{variant}/crop.ply",
-        crop_json="results/objects/{object}/registration/{variant}/crop.json",
-        workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
-    output:
-        "results/objects/{object}/registration/{variant}/scale.json",
-    log:
-        "results/logs/estimate_scale/{object}-{variant}.log",
-    benchmark:
-        "results/benchmarks/estimate_scale/{object}-{variant}.tsv"
-    conda:
-        "../../envs/registration.yaml"
-    resources:
-        mem_mb=lambda wildcards, attempt: 2000 * attempt,
-        runtime=lambda wildcards, attempt: 30 * attempt,
-    params:
-        options=variant_options("scale"),
-        gravity=options_of("workspace_json"),
-        script=script("registration/estimate_scale.py"),
-        code=code("registration/estimate_scale.py"),
-    message:
-        "{wildcards.object}, variant {wildcards.variant}: scale"
-    shell:
-        "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " {params.gravity} --report {output} {params.options} &> {log}"
-
-
 rule register_coarsely:
-    """Hypotheses of the object's pose in the scene (R3, R6)."""
+    """How large the object's unit is in the scene, and hypotheses of its pose there (paper 3.3; R1 to R4, R6)."""
     input:
         cloud="results/objects/{object}/object.ply",
         cloud_json="results/objects/{object}/object.json",
         crop="results/objects/{object}/registration/{variant}/crop.ply",
         crop_json="results/objects/{object}/registration/{variant}/crop.json",
         workspace_json=if_photographed("results/objects/{object}/undistorted.json"),
-        scale="results/objects/{object}/registration/{variant}/scale.json",
     output:
-        "results/objects/{object}/registration/{variant}/coarse.json",
+        scale="results/objects/{object}/registration/{variant}/scale.json",
+        coarse="results/objects/{object}/registration/{variant}/coarse.json",
     log:
         "results/logs/register_coarsely/{object}-{variant}.log",
     benchmark:
@@ -134,16 +103,16 @@ rule register_coarsely:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=variant_options("coarse"),
+        options=variant_options("scale", "coarse"),
         gravity=options_of("workspace_json"),
         seed=config["seed"],
         script=script("registration/register_coarsely.py"),
         code=code("registration/register_coarsely.py"),
     message:
-        "{wildcards.object}, variant {wildcards.variant}: coarse registration"
+        "{wildcards.object}, variant {wildcards.variant}: scale and coarse registration"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json}"
-        " {params.gravity} --scale-json {input.scale} --report {output} --seed {params.seed} {params.options} &> {log}"
+        " {params.gravity} --scale-report {output.scale} --report {output.coarse} --seed {params.seed} {params.options} &> {log}"
 
 
 rule register_finely:
