@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from scenefuse.io.tables import comma_advice, composed, read_cells
 from scenefuse.stage import StageError
-from scenefuse.workspace import read_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -262,6 +261,9 @@ def locate(
     Returns:
         Names, (P, 3) positions, (P,) residuals in pixels, which are 0 for points given by coordinates.
     """
+    # Not above: the workflow reads clicks whenever it plans, and this takes long to import.
+    from scenefuse.workspace import read_model
+
     marked = read_points(path)
     if isinstance(marked, ScenePoints):
         return marked.points, marked.positions, np.zeros(len(marked.points))

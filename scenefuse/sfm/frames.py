@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.pictures import write_picture
+from scenefuse.sfm.photo_files import frame_name, thin_out
 from scenefuse.sfm.photos import JPEG_QUALITY, inspect_photo, photo_names, photo_notes, save_upright, write_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 
@@ -68,19 +69,6 @@ def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:
     if "origin" not in content:
         return {p["name"]: (p["width"], p["height"]) for p in content["photos"]}
     return {name: (entry["width"], entry["height"]) for name, entry in content["origin"]["value"].items()}
-
-
-def frame_name(photo: str) -> str:
-    """The name of the frame that is made of a photo, by its path in the folder of photos."""
-    return photo.replace("/", "_")
-
-
-def thin_out(count: int, step: int, limit: int) -> list[int]:
-    """Indices 0, step, 2 step, ... below count; spread evenly over the same range where more than `limit` (0: none)."""
-    chosen = list(range(0, count, max(step, 1)))
-    if 0 < limit < len(chosen):
-        chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, limit).round().astype(int)]
-    return chosen
 
 
 def sharpness(frame: NDArray[Any]) -> float:

@@ -1,4 +1,5 @@
-"""Which files of a folder are photos, and which hold cameras. Standard library only: the workflow lists them often."""
+"""Which files of a folder are photos, which of these become frames, and which hold cameras. Standard library only: the
+workflow lists them often."""
 
 import os
 from pathlib import Path
@@ -67,6 +68,20 @@ def photo_files(folder: Path) -> list[Path]:
             f" ({len(files)} other files were found)"
         )
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def frame_name(photo: str) -> str:
+    """The name of the frame that is made of a photo, by its path in the folder of photos."""
+    return photo.replace("/", "_")
+
+
+def thin_out(count: int, step: int, limit: int) -> list[int]:
+    """Indices 0, step, 2 step, ... below count; spread evenly over the same range where more than `limit` (0: none)."""
+    chosen = list(range(0, count, max(step, 1)))
+    if 0 < limit < len(chosen):
+        spacing = (len(chosen) - 1) / max(limit - 1, 1)
+        chosen = [chosen[round(k * spacing)] for k in range(limit)]
+    return chosen
 
 
 def _files_below(folder: Path) -> list[Path]:

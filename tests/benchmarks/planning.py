@@ -11,7 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from support.user_project import CLICKS, HEADER, Project
+from support.user_project import Project
 
 from scenefuse.io.settings import ROOT
 from scenefuse.stage import StageError, run
@@ -26,12 +26,7 @@ def planning(*, objects: tuple[int, ...] = (40, 400)) -> None:
     for count in objects:
         with tempfile.TemporaryDirectory() as folder:
             project = Project(Path(folder))
-            project.photos("flight")
-            project.photos("close")
-            for name in ("clicks.tsv", "prompts.tsv"):
-                (project.path / name).write_text(CLICKS)
-            rows = [f"shed{k}\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n" for k in range(count)]
-            project.objects = HEADER + "".join(rows)
+            project.clicked(count)
             print(f"{count} objects: {_planned(project)}", flush=True)
 
 

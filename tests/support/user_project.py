@@ -48,6 +48,14 @@ class Project:
             picture = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
             cv2.imwrite(str(self.path / folder / f"{index}.jpg"), picture)
 
+    def clicked(self, objects: int) -> None:
+        """Photos on both sides, and so many objects that are clicked in both."""
+        self.photos("flight")
+        self.photos("close")
+        for name in ("clicks.tsv", "prompts.tsv"):
+            (self.path / name).write_text(CLICKS)
+        self.objects = HEADER + "".join(f"shed{k}\tyard\tclose\tclicks.tsv\tprompts.tsv\t\t\n" for k in range(objects))
+
     def write(self) -> Path:
         """Write tables and settings; returns the settings file."""
         (self.path / "scenes.tsv").write_text(self.scenes)

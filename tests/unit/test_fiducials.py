@@ -5,7 +5,7 @@ import pycolmap
 import pytest
 
 from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
-from scenefuse.sfm.survey.check import check_marks
+from scenefuse.sfm.survey.check_marks import check_marks
 from scenefuse.sfm.survey.lengths import read_end_clicks
 from scenefuse.stage import StageError
 

@@ -1,4 +1,5 @@
 # Inputs of structure from motion: the photos that the tables name.
+from scenefuse.sfm.photo_files import frame_name, thin_out
 
 
 def photos_of(row, who):
@@ -85,12 +86,13 @@ def surveyed(scene):
 @cache
 def check_survey(scene):
     """Stop before hours of mapping where a survey's file cannot be read or names photos that the scene lacks."""
-    from scenefuse.sfm.photos import photo_names
-    from scenefuse.sfm.survey.check import check_files
-
     row, files = scene_row(scene), surveyed(scene)
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
     if own and not made_here(row["photos"]):
+        # Takes long to import, and most scenes have no survey.
+        from scenefuse.sfm.photos import photo_names
+        from scenefuse.sfm.survey.check import check_files
+
         try:
             check_files(photo_names(Path(row["photos"])), **own)
         except StageError as error:
@@ -129,8 +131,7 @@ def names_in(folder, where):
 @cache
 def check_clicks(name, column):
     """Stop before hours of work where prompts or fiducials cannot be read, or are in photos that will not be used."""
-    from scenefuse.sfm.frames import frame_name, thin_out
-    from scenefuse.sfm.survey.check import check_marks
+    from scenefuse.sfm.survey.check_marks import check_marks
 
     row, used = object_row(name), None
     if column == "prompts":
@@ -156,13 +157,12 @@ def check_clicks(name, column):
 @cache
 def check_lengths(name):
     """Stop before hours of matching where their file cannot be read or names photos that the object lacks."""
-    from scenefuse.sfm.frames import frame_name
-    from scenefuse.sfm.photos import photo_names
-    from scenefuse.sfm.survey.check import check_files
-
     photos = object_row(name)["photos"]
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
+            from scenefuse.sfm.photos import photo_names
+            from scenefuse.sfm.survey.check import check_files
+
             try:
                 names = [frame_name(photo) for photo in photo_names(Path(photos))]
                 check_files(names, lengths=Path(file))

@@ -1,0 +1,34 @@
+"""What planning costs: jobs for each object, and what is imported before any of them runs."""
+
+import re
+
+import pytest
+from support.user_project import Project
+
+
+@pytest.fixture
+def dry_run(tmp_path, snakemake):
+    """What a dry run of so many objects says."""
+
+    def run(objects: int) -> str:
+        project = Project(tmp_path / str(objects))
+        project.path.mkdir()
+        project.clicked(objects)
+        done = snakemake(project.path, "-n", config=project.write())
+        assert done.returncode == 0, done.stdout[-3000:]
+        return done.stdout
+
+    return run
+
+
+def test_one_more_object_costs_twenty_jobs(dry_run):
+    one, two = (int(re.findall(r"^total +(\d+)", dry_run(objects), re.MULTILINE)[0]) for objects in (1, 2))
+    assert two - one == 20
+
+
+def test_planning_imports_nothing_heavy(dry_run, monkeypatch):
+    # Every job on a cluster plans again. Without a survey, clicks are all that is looked into.
+    monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
+    imported = set(re.findall(r"^import time: .*\| +(\S+)$", dry_run(1), re.MULTILINE))
+    assert "scenefuse.sfm.fiducials" in imported
+    assert imported & {"torch", "open3d", "pycolmap", "pyproj", "cv2", "numba", "scipy"} == set()
