@@ -119,6 +119,7 @@ def lengths_flag(wildcards):
     )
 
 
+@cache
 def names_in(folder, where):
     """Names of the photos in a cell's folder; None where it is no folder, or a rule makes it."""
     if not folder or made_here(folder) or not Path(folder).is_dir():
