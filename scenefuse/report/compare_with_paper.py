@@ -104,7 +104,7 @@ def why_not_finished(results: Path, run: RunInputs) -> str:
     if not results.is_dir():
         return f"{results} does not exist"
     if not summary.is_file():
-        return f"{results} holds no finished run: {summary} is missing"
+        return f"{results} holds no finished run: it has no summary/summary.txt"
     parts = ("*.json", "registration/*/*.json")
     written = [file for folder in run.objects for part in parts for file in folder.glob(part)]
     written += [folder / "dense.json" for folder in run.scenes if (folder / "dense.json").is_file()]
@@ -112,7 +112,7 @@ def why_not_finished(results: Path, run: RunInputs) -> str:
         newer = next((file for file in written if file.stat().st_mtime > summary.stat().st_mtime), None)
     except FileNotFoundError as error:
         newer = error.filename
-    return f"the run in {results} is not finished: {newer} is newer than {summary}" if newer else ""
+    return f"the run in {results} is not finished: {newer} is newer than its summary" if newer else ""
 
 
 def why_not_comparable(pairs: list[tuple[Path, Path]], item: Collected, other: Collected) -> str:
