@@ -53,7 +53,8 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         StageError: no variant is given, or not one scene for each object.
     """
     results = Path(settings.compared_with)
-    beside = _of_other_results(run, results)
+    summarised = _summarised(results)
+    beside = _of_other_results(run, results, [v for v in VARIANTS if v in {variant for _, variant in summarised}])
     unfinished = why_not_finished(results, beside)
     rows: list[dict[str, Any]] = []
     for number, (item, other) in enumerate(zip(collect_run(run)[1], collect_run(beside)[1])):
@@ -62,7 +63,8 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         folder, its_folder = run.objects[number], beside.objects[number]
         scene = next(k for k, path in enumerate(run.scenes) if path.name == run.scene_of[number])
         pairs = [(folder, its_folder), (run.scenes[scene], beside.scenes[scene])]
-        why = unfinished or why_not_comparable(pairs, item, other)
+        absent = "" if (item.name, "full") in summarised else f"the run in {results} has no object {item.name}"
+        why = unfinished or absent or why_not_comparable(pairs, item, other)
         columns = {
             PAPER: Column(published(item.name), measured=False),
             HERE: column_of(item),
@@ -79,12 +81,21 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         print(note, flush=True)
 
 
-def _of_other_results(run: RunInputs, results: Path) -> RunInputs:
+def _summarised(results: Path) -> set[tuple[str, str]]:
+    """Objects and variants of the last run that wrote these results; what else lies there is from before."""
+    try:
+        table = pd.read_csv(results / "summary/registration.tsv", sep="\t", dtype=str)
+        return set(zip(table["object"], table["variant"]))
+    except (OSError, ValueError, KeyError):
+        return set()
+
+
+def _of_other_results(run: RunInputs, results: Path, variants: list[str]) -> RunInputs:
     """The same scenes and objects in other results, whose depth maps may be split into other jobs."""
     return replace(
         run,
         chunks=0,
-        variants=list(VARIANTS),
+        variants=variants or ["full"],
         jobs=JobRecords(results / "logs", results / "benchmarks"),
         scenes=tuple(results / "scenes" / folder.name for folder in run.scenes),
         objects=tuple(results / "objects" / folder.name for folder in run.objects),
@@ -123,9 +134,6 @@ def why_not_comparable(pairs: list[tuple[Path, Path]], item: Collected, other: C
         item: what this run made of the object.
         other: what the other one did.
     """
-    missing = next((its for _, its in pairs if not its.is_dir()), None)
-    if missing is not None:
-        return f"{missing} does not exist; that run is of other objects or scenes"
     # Only the paper's stage 1 says whose poses it gives, and only the paper's registration has no gate.
     if find(other.stages, "stage1.pose_source") is not None or status_of(other, "full") == "ungated":
         return f"{pairs[0][1]} is of recipe paper itself"
