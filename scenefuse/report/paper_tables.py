@@ -38,10 +38,10 @@ class Measure:
 
 _FITNESS = "share of the crop's points with a point of the object within tau; higher is better (R10, R11)"
 _RMSE = "RMS distance to the crop of the object's points that lie within tau of it; lower is better (R10, R11)"
-_RMSE_SHARE = "the same over the diagonal of the crop, so that objects of several sizes compare (R11)"
+_RMSE_SHARE = "inlier_rmse over the diagonal of the crop, so that objects of any size compare; lower is better (R11)"
 _NORMALS = (
-    "mean |n . n_nearest| between these points and the crop's nearest to them; higher is better, 0.5 is of unrelated"
-    " normals (G1)"
+    "mean |n . n_nearest| between the object's points that lie within tau of the crop and the crop's nearest to them;"
+    " higher is better, 0.5 is of unrelated normals (G1)"
 )
 _VARIATION = (
     "mean over the added points of the smallest eigenvalue of their neighbours' covariance over the sum of all three;"
