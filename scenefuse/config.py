@@ -37,6 +37,7 @@ from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.scale import ScaleSettings
 from scenefuse.registration.shared_features.align_models import AlignmentSettings
+from scenefuse.report.compare_with_paper import ComparisonSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.mapping import MappingSettings
@@ -158,6 +159,7 @@ SECTIONS: dict[str, list[Any]] = {
     "metrics": [AgreementSettings(), MetricSettings()],
     "evaluation.scene": [SceneEvaluationSettings()],
     "evaluation.object": [ObjectEvaluationSettings()],
+    "evaluation.paper": [ComparisonSettings()],
 }
 # Keys of a dataclass that its section does not hold: the other section of the same stage sets them.
 ELSEWHERE = {("object.nerf", "epochs"), ("object.stage2", "rays_per_epoch"), ("object.stage4", "rays_per_epoch")}

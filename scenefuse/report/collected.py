@@ -8,6 +8,7 @@ from typing import Literal
 
 from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.report.values import Fields, find, load
+from scenefuse.stage import StageError
 
 # What each step leaves, in the order in which the steps run.
 _OBJECT_FILES = (
@@ -22,6 +23,32 @@ Given = Literal["photos", "cloud", "both"]
 """What of a scene or an object the user gave; `both`: photos, cameras, and a cloud in their coordinates."""
 ALONE = "by itself"
 """Status of an object that is done and lies in no scene."""
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What a run works on, and where it leaves results and records."""
+
+    chunks: int
+    """Jobs that a scene's depth maps are split into."""
+    variants: list[str]
+    """Registration variants, the one that is fused first."""
+    jobs: JobRecords
+    """Folders of the rules' logs and benchmarks; see JobRecords."""
+    scenes: tuple[Path, ...] = ()
+    """Result folders of the scenes (results/scenes/{scene})."""
+    objects: tuple[Path, ...] = ()
+    """Result folders of the objects (results/objects/{object}); they need not exist."""
+    scene_of: tuple[str, ...] = ()
+    """Name of the scene that each object lies in; empty for one by itself."""
+    cloud_scenes: tuple[str, ...] = ()
+    """Names of the scenes that were given as clouds without photos."""
+    cloud_objects: tuple[str, ...] = ()
+    """Names of the objects that were."""
+    posed_scenes: tuple[str, ...] = ()
+    """Names of the scenes whose clouds were given with photos and cameras."""
+    posed_objects: tuple[str, ...] = ()
+    """Names of the objects whose were."""
 
 
 @dataclass(frozen=True)
@@ -47,6 +74,42 @@ class Collected:
     failed: str
     failed_variants: dict[str, str]
     alone: bool = False
+
+
+def collect_run(run: RunInputs) -> tuple[dict[str, tuple[Fields, str]], list[Collected]]:
+    """What is left of each scene (see `collect_scene`), by its name, and of each object.
+
+    Raises:
+        StageError: no variant is given, or not one scene for each object.
+    """
+    if not run.variants:
+        raise StageError("no registration variant is given; name at least one, the one that is fused first")
+    if len(run.scene_of) != len(run.objects):
+        raise StageError(
+            f"{len(run.objects)} objects but {len(run.scene_of)} scenes are given; name the scene of each object"
+        )
+    scenes = {
+        folder.name: collect_scene(folder, run.chunks, _given(folder.name, run.cloud_scenes, run.posed_scenes))
+        for folder in run.scenes
+    }
+    objects = [
+        collect(
+            folder,
+            run.variants,
+            run.jobs,
+            scene,
+            scenes[scene][1] if scene in scenes else "",
+            _given(folder.name, run.cloud_objects, run.posed_objects),
+            bool(scene) and folder.name not in run.cloud_objects and scene not in run.cloud_scenes,
+        )
+        for folder, scene in zip(run.objects, run.scene_of)
+    ]
+    return scenes, objects
+
+
+def _given(name: str, clouds: tuple[str, ...], posed: tuple[str, ...]) -> Given:
+    """What of a scene or an object was given."""
+    return "cloud" if name in clouds else "both" if name in posed else "photos"
 
 
 def collect_scene(folder: Path, chunks: int, given: Given = "photos") -> tuple[Fields, str]:

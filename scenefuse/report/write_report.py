@@ -7,6 +7,7 @@ from pathlib import Path
 
 from scenefuse.report.collected import ALONE
 from scenefuse.report.page import document, embedded
+from scenefuse.report.paper_section import paper_section
 from scenefuse.report.values import number
 from scenefuse.report.view.view_file import View, read_view
 from scenefuse.report.view.view_page import view_section
@@ -64,7 +65,13 @@ _OBJECT_FIGURES = {
 
 
 def write_report(
-    *, summary: Path, scenes: tuple[Path, ...] = (), objects: tuple[Path, ...] = (), title: str, report: Path
+    *,
+    summary: Path,
+    scenes: tuple[Path, ...] = (),
+    objects: tuple[Path, ...] = (),
+    paper: Path | None = None,
+    title: str,
+    report: Path,
 ) -> None:
     """Write the report page of a run: every object and scene in 3D, figures, tables with notes, the text summary.
 
@@ -74,6 +81,7 @@ def write_report(
         summary: folder with the summary's TSV files and summary.txt; an absent table is left out.
         scenes: result folders of the scenes; scene.png and the 3D view in it are shown.
         objects: result folders of the objects; figures/ in it is shown. One without figures is named as such.
+        paper: table that compares the run with the paper, which only recipe `paper` has; it may be missing.
         title: heading of the page.
         report: output, one HTML file.
 
@@ -88,12 +96,14 @@ def write_report(
     drawn = [f for f in scenes if (f / "scene.png").is_file()]
     links = {f.name: f.name for f in objects} | {f"scene-{f.name}": f"scene {f.name}" for f in drawn}
     links |= {f"table-{name}": name for name in _TABLES if tables[name]}
+    links |= {"paper": "the paper"} if paper is not None else {}
     body = [
         f"<h1>{escape(title)}</h1>",
         "<p>Objects that the scene's photos left incomplete, completed by their own close-up reconstruction.</p>",
         "<nav>" + " ".join(f'<a href="#{escape(to)}">{escape(name)}</a>' for to, name in links.items()) + "</nav>",
         *(_object_section(folder, tables["registration"], views.get(folder / "figures")) for folder in objects),
         *(_scene_section(folder, tables["scenes"], views.get(folder)) for folder in scenes),
+        *([] if paper is None else [paper_section(_read_table(paper))]),
         *(_table_section(name, rows) for name, rows in tables.items() if rows),
         f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
     ]

@@ -5,9 +5,10 @@ snakemake --configfile config/paper.yaml --directory paper --cores 2
 snakemake --configfile config/paper.yaml config/paper_from_sfm.yaml --directory paper_from_sfm --cores 2
 python tests/benchmarks/paper_preset.py --shipped results --chained paper/results --from-sfm paper_from_sfm/results
 
-Where a stage ended in an error, the table says so, and what follows is empty; without a truth, so are errors. `null`
-is what chance gives: cameras that all stand in their middle, depth that is the same all over a photo, a random cloud in
-the place of the object's points.
+Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/report/paper_tables.py); here
+are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table says
+so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: cameras that all stand in
+their middle, depth that is the same all over a photo, a random cloud in the place of the object's points.
 """
 
 from pathlib import Path
@@ -16,36 +17,19 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.clouds import read_cloud
 from scenefuse.io.settings import build, read_settings
 from scenefuse.job_records import JobRecords, why_unfinished
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import registration_error, true_depth
-from scenefuse.registration.agreement import AgreementSettings, registration_metrics
+from scenefuse.paper.published import OBJECTS, published
+from scenefuse.report.collected import Collected, collect
+from scenefuse.report.paper_tables import NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Sim3
 
-# Tables 2 to 4 of the paper, on its own captures: house, balloon, sculpture. It gives RMSE in metres, and no diagonal
-# to divide it by.
-PUBLISHED = {
-    "fitness": (0.9302, 0.9916, 0.9207),
-    "inlier_rmse": (0.0852, 0.0096, 0.0348),
-    "normal_consistency": (0.6023, 0.6210, 0.7948),
-    "surface_variation": (0.1597, 0.1897, 0.1219),
-    "nue": (1.17, 1.29, 1.21),
-    "primitive_fitting_score": (0.9984, 0.9954, 0.9975),
-    "fitness, no_scale": (0.3083, 0.0820, 0.3085),
-    "inlier_rmse, no_scale": (0.2614, 0.1810, 0.3724),
-    "normal_consistency, no_scale": (0.4448, 0.2196, 0.4834),
-    "fitness, no_crop": (0.4129, 0.5876, 0.3621),
-    "inlier_rmse, no_crop": (0.4424, 0.1804, 0.0655),
-    "normal_consistency, no_crop": (0.3056, 0.5695, 0.7373),
-}
-OBJECTS = ("house", "balloon", "sculpture")
-SCENE, ABLATION = "demo", ("no_scale", "no_crop")
-REGISTRATION = ("fitness", "inlier_rmse", "inlier_rmse_over_diagonal", "normal_consistency")
-COMPLETION = ("surface_variation", "nue", "primitive_fitting_score")
+SCENE = "demo"
 SCORES = {"0.5": "05pct", "1": "1pct", "2": "2pct"}
 TRAJECTORY, TURNED = "trajectory error over extent", "rotation error of the cameras (deg)"
 POSES = {
@@ -53,7 +37,7 @@ POSES = {
     TURNED: "rotation_error_chain_deg",
     "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
 }
-CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", "scenefuse"
+CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", SCENEFUSE
 # Of the true depth maps that the null is measured on.
 WIDTH_PX = 160
 
@@ -64,32 +48,28 @@ class Run:
     def __init__(self, results: Path, name: str, settings: ObjectEvaluationSettings, seed: int) -> None:
         """Read the truth, and the poses of the object's model in it."""
         self.results, self.folder, self.settings, self.seed = results, results / "objects" / name, settings, seed
+        self.jobs = JobRecords(results / "logs", results / "benchmarks")
         truth, self.known = results / "demo" / SCENE / "truth", None
         if (truth / name).is_dir():
             workspace = self.folder / "undistorted"
             self.known = read_object_truth(workspace, truth / "scene", truth / name, settings.samples, seed)
 
+    def collected(self) -> Collected:
+        """What the summary would know of the object."""
+        return collect(self.folder, list(VARIANTS), self.jobs, SCENE)
+
     def measures(self) -> dict[str, Any]:
         """All measures, as far as the run came; lengths in % of the object's diagonal, errors against the truth."""
-        jobs = JobRecords(self.results / "logs", self.results / "benchmarks")
-        rows: dict[str, Any] = {"stopped by": why_unfinished(jobs, self.folder.name) or "nothing stopped it"}
+        rows: dict[str, Any] = {"stopped by": why_unfinished(self.jobs, self.folder.name) or "nothing stopped it"}
         rows |= of_stages(self.folder, self.known, self.settings.max_photos)
         if self.known is not None and (self.folder / "object.ply").is_file():
             points = self.known.fit.truth_from_model.apply(read_cloud(self.folder / "object.ply").points)
             cloud = cloud_results(points, self.known, self.settings.samples, self.seed)
             rows |= {f"cloud: F {name} %": value(cloud, f"cloud_f_score_{key}") for name, key in SCORES.items()}
-        fine, metrics = self.folder / "registration/full/fine.json", self.folder / "metrics.json"
+        fine = self.folder / "registration/full/fine.json"
         if fine.is_file() and self.known is not None:
             rows |= self._pose_errors(read_json(fine), self.known)
-        if metrics.is_file():
-            measured = read_json(metrics)
-            rows |= {name: value(measured["registration"], name) for name in REGISTRATION}
-            rows |= {name: value(measured["completion"], name) for name in COMPLETION}
-        for arm in ABLATION:
-            path = self.folder / f"registration/{arm}/metrics.json"
-            found = read_json(path)["registration"] if path.is_file() else {}
-            rows |= {f"{name}, {arm}": value(found, name) for name in REGISTRATION if name in found}
-        return rows
+        return rows | of_tables(column_of(self.collected()).cells)
 
     def _pose_errors(self, fine: dict[str, Any], known: ObjectTruth) -> dict[str, float]:
         matrix = value(fine, "scene_from_object")
@@ -144,18 +124,18 @@ def _rays(report: dict[str, Any]) -> float:
     return float(value(report, "rays_per_second") * value(report, "training_seconds"))
 
 
+def of_tables(cells: dict[tuple[str, str], tuple[float, str]]) -> dict[str, Any]:
+    """The rows of the paper's tables, without their units."""
+    return {
+        measure if variant == "full" else f"{measure}, {variant}": number
+        for (measure, variant), (number, _) in cells.items()
+    }
+
+
 def of_chance(shipped: Run, chained: Run) -> dict[str, Any]:
     """The same measures of nothing, see the module's text."""
-    reference, known = shipped.folder / "registration/full", shipped.known
-    crop, diagonal = read_cloud(reference / "crop.ply"), value(read_json(reference / "crop.json"), "diagonal")
-    rng = np.random.default_rng(shipped.seed)
-    count = len(read_cloud(shipped.folder / "object.ply"))
-    random = rng.uniform(crop.points.min(0), crop.points.max(0), (count, 3))
-    tau = AgreementSettings().tau_fraction * diagonal
-    found = registration_metrics(Cloud(random), crop, Sim3.identity(), tau, diagonal, "m")
-    completion = read_json(shipped.folder / "metrics.json")["completion"]
-    rows = {name: value(found, name) for name in REGISTRATION}
-    rows |= {name: value(completion, f"{name}_null") for name in COMPLETION}
+    known, null = shipped.known, null_of(shipped.folder, shipped.collected(), shipped.seed)
+    rows: dict[str, Any] = {} if null is None else of_tables(null.cells)
     if (chained.folder / "stage1.json").is_file():
         motion = value(read_json(chained.folder / "stage1.json"), "pose_network_rotation_to_find_deg")
         rows |= {f"rotation error of one motion (deg), stage {number}": motion for number in (1, 3)}
@@ -202,13 +182,9 @@ def paper_preset(
     for name in objects:
         folders = {CHAINED: chained, FROM_SFM: from_sfm, SHIPPED: shipped}
         runs = {column: Run(results, name, evaluation, settings["seed"]) for column, results in folders.items()}
-        columns: dict[str, dict[str, Any]] = {"paper (published, its own data)": {}}
-        if name in OBJECTS:
-            columns["paper (published, its own data)"] |= {
-                key: cells[OBJECTS.index(name)] for key, cells in PUBLISHED.items()
-            }
+        columns: dict[str, dict[str, Any]] = {PAPER: of_tables(published(name))}
         columns |= {column: found.measures() for column, found in runs.items()}
-        columns["null"] = of_chance(runs[SHIPPED], runs[CHAINED])
+        columns[NULL] = of_chance(runs[SHIPPED], runs[CHAINED])
         measures = dict.fromkeys(key for column in (FROM_SFM, *columns) for key in columns[column])
         for measure in measures:
             row = {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}

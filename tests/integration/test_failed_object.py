@@ -62,8 +62,11 @@ def write_stages(folder: Path, files: list[str], date: float) -> None:
 
 
 @pytest.fixture
-def project(tmp_path, snakemake):
-    """A scene with a shed that is done up to its fusion, and a barn with a broken photo; call it to run Snakemake."""
+def project(tmp_path, snakemake, request):
+    """A scene with a shed that is done up to its fusion, and a barn with a broken photo; call it to run Snakemake.
+
+    The objects' recipe may be given as the fixture's parameter.
+    """
     for name in ("flight", "shed", "barn"):
         (tmp_path / name).mkdir()
         for index in range(3):
@@ -79,6 +82,7 @@ def project(tmp_path, snakemake):
         os.utime(tmp_path / name, (1e9, 1e9))
     registration = {"variants": ["full"], "crop": {"mode": "fiducials"}}
     config = {"scenes": "scenes.tsv", "objects": "objects.tsv", "registration": registration}
+    config["object"] = {"recipe": getattr(request, "param", "scenefuse")}
     (tmp_path / "mine.yaml").write_text(yaml.safe_dump(config))
 
     def run(*words):
@@ -131,3 +135,16 @@ def test_a_failed_object_keeps_nobody_back_and_is_taken_in_once_it_is_mended(pro
     assert list(report["added_points"]["value"]) == ["shed"] and list(report["failed"]["value"]) == ["barn"]
     assert set(read_cloud(scene / "completed.ply").fields["source"]) == {0, 1}
     assert "object barn: failed" in (summary / "summary.txt").read_text()
+
+
+@pytest.mark.parametrize("project", ["paper"], indirect=True)
+def test_the_paper_s_tables_are_made_without_an_object_that_failed(project, tmp_path):
+    summary = tmp_path / "results/summary"
+    summary.mkdir()
+    (summary / "paper.tsv").write_text("of before\n")
+    assert project().returncode != 0
+    notes = pd.read_csv(summary / "paper.tsv", sep="\t").set_index("object")["note"]
+    assert notes["barn"].str.contains("paper preset (here): failed, ", regex=False).all()
+    assert notes["barn"].str.contains("2.jpg").all() and not notes["shed"].str.contains("failed").any()
+    page = (summary / "report.html").read_text()
+    assert "Table 4: " in page and "<p>barn: paper preset (here): failed, " in page

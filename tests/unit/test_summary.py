@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.report.collected import RunInputs
 from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, load, number
 from scenefuse.report.write_report import write_report
@@ -82,16 +83,16 @@ def results(tmp_path):
 
 
 def summarise(results, names=("house", "balloon", "sculpture"), lone=(), **posed):
-    write_summary(
+    run = RunInputs(
         scenes=(results / "scenes/demo",),
         chunks=2,
         objects=tuple(results / "objects" / name for name in (*names, *lone)),
         scene_of=("demo",) * len(names) + ("",) * len(lone),
         variants=["full", "paper"],
         jobs=JobRecords(results / "logs", results / "benchmarks"),
-        summary=results / "summary",
         **posed,
     )
+    write_summary(run=run, summary=results / "summary")
     return results / "summary"
 
 
@@ -296,21 +297,21 @@ def test_a_failed_variant_leaves_the_decision_of_the_full_one(results):
 
 
 def test_an_empty_run_is_a_summary_too(tmp_path):
-    write_summary(
-        scenes=[tmp_path / "scenes/demo"],
+    run = RunInputs(
+        scenes=(tmp_path / "scenes/demo",),
         chunks=2,
-        objects=[tmp_path / "objects/house"],
-        scene_of=["demo"],
+        objects=(tmp_path / "objects/house",),
+        scene_of=("demo",),
         variants=["full"],
         jobs=JobRecords(tmp_path / "logs", tmp_path / "benchmarks"),
-        summary=tmp_path / "summary",
     )
+    write_summary(run=run, summary=tmp_path / "summary")
     text = (tmp_path / "summary/summary.txt").read_text()
     assert "it has not run yet" in text and "no benchmark files yet" in text
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
     with pytest.raises(StageError, match="no registration variant"):
-        nothing = {"jobs": JobRecords(tmp_path, tmp_path), "summary": tmp_path}
-        write_summary(scenes=[], chunks=1, objects=[], scene_of=[], variants=[], **nothing)
+        nothing = RunInputs(chunks=1, variants=[], jobs=JobRecords(tmp_path, tmp_path))
+        write_summary(run=nothing, summary=tmp_path)
 
 
 def test_the_last_error_is_that_of_the_named_object(tmp_path):

@@ -33,8 +33,8 @@ def scene_model(wildcards):
     return [folder] if scene_row(wildcards.scene).get("photos") else []
 
 
-def summary_command(log):
-    """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
+def run_options(wildcards=None):
+    """What the run works on, and where it leaves results and records, as options; also a params function."""
     given = {
         "scene_of": [row.get("scene", "") for row in OBJECTS.values()],
         "cloud_scenes": CLOUD_SCENES,
@@ -44,9 +44,15 @@ def summary_command(log):
     }
     given = flags({name: found for name, found in given.items() if found})
     return (
-        f"python {script('report/write_summary.py')} {result_folders()} --chunks {len(CHUNKS)} --variants {' '.join(VARIANTS)}"
-        f" --benchmarks results/benchmarks --logs results/logs --summary results/summary {given} &> {log}"
+        f"{result_folders()} --chunks {len(CHUNKS)} --variants {' '.join(VARIANTS)}"
+        f" --benchmarks results/benchmarks --logs results/logs {given}"
     )
+
+
+def summary_command(log):
+    """The shell line that writes the tables and summary.txt; also run when a job has failed, so that the summary names it."""
+    command = f"python {script('report/write_summary.py')} {run_options()}"
+    return f"{command} --summary results/summary &> {log}"
 
 
 def result_folders(wildcards=None):

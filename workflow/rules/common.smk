@@ -59,6 +59,12 @@ CLOUD_SCENES, CLOUD_OBJECTS, POSED_SCENES, POSED_OBJECTS = (
     for photographed in (False, True)
     for rows in (SCENES, OBJECTS)
 )
+# What compares the paper's recipe with the paper (rules/paper.smk); nothing where another recipe runs.
+PAPER_TABLE = (
+    ["results/summary/paper.tsv"]
+    if config["object"]["recipe"] == "paper" and JOINED
+    else []
+)
 if config["gpu"] == "auto":
     config["gpu"] = int(has_gpu())
 # Jobs on one machine share its memory and take turns on its card, unless `--resources` says otherwise; on a cluster, where

@@ -5,6 +5,7 @@
 # OUTPUTS   results/objects/{object}/stage1/ to stage4/, their JSON, object.ply, registration/{variant}/
 #           results/objects/{object}/poses/, poses.json                     poses after stage 1: the pose network's chain, or SfM's
 #           results/objects/{object}/refined_poses/, refined_poses.json     the same after stage 3
+#           results/summary/paper.tsv    the paper's Tables 2 to 4, beside the run that config names: evaluation.paper
 
 
 ruleorder: estimate_as_paper > train_depth > find_poses
@@ -217,3 +218,44 @@ use rule register_as_paper as register_variant_as_paper with:
         code=code("registration/register_as_paper.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: registration by the paper's recipe"
+
+
+def state_of_compared(wildcards):
+    """Params function: fingerprint of what a finished run of the shipped recipe says of the same objects."""
+    results = Path(config["evaluation"]["paper"]["compared_with"])
+    files = [results / "summary/summary.txt"]
+    for folder in (results / "objects" / name for name in JOINED):
+        files += [*folder.glob("*.json"), *folder.glob("registration/*/*.json")]
+    return files_fingerprint(tuple(map(str, files)))
+
+
+rule compare_with_paper:
+    """Tables 2, 3 and 4 of the paper: its own numbers, those of this run and of the shipped recipe's, and chance."""
+    input:
+        "results/summary/summary.txt",
+    output:
+        report(
+            "results/summary/paper.tsv",
+            category="Tables",
+            caption="../report/paper.rst",
+        ),
+    log:
+        "results/logs/compare_with_paper/all.log",
+    benchmark:
+        "results/benchmarks/compare_with_paper/all.tsv"
+    conda:
+        "../../envs/report.yaml"
+    resources:
+        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        runtime=lambda wildcards, attempt: 30 * attempt,
+    params:
+        run=run_options,
+        options=flags(config["evaluation"]["paper"]),
+        files=state_of_compared,
+        seed=config["seed"],
+        script=script("report/compare_with_paper.py"),
+        code=code("report/compare_with_paper.py"),
+    message:
+        "Summary: the paper's tables"
+    shell:
+        "exec python {params.script} {params.run} {params.options} --table {output} --seed {params.seed} &> {log}"

@@ -213,6 +213,7 @@ rule write_report:
         scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
         views=expand("results/scenes/{scene}/view.json", scene=SCENES),
         figures=expand("results/objects/{object}/figures", object=OBJECTS),
+        paper=PAPER_TABLE,
     output:
         "results/summary/report.html",
     log:
@@ -226,12 +227,13 @@ rule write_report:
         runtime=10,
     params:
         folders=result_folders,
+        paper=flags({"paper": PAPER_TABLE[0]} if PAPER_TABLE else {}),
         script=script("report/write_report.py"),
         code=code("report/write_report.py"),
     message:
         "Summary: report page"
     shell:
-        "exec python {params.script} --summary results/summary {params.folders}"
+        "exec python {params.script} --summary results/summary {params.folders} {params.paper}"
         " --title scenefuse --report {output} &> {log}"
 
 
@@ -272,6 +274,10 @@ onerror:
         + summary_command("results/logs/write_summary/onerror.log")
         + " || true"
     )
+    for job in held_up("compare_with_paper") if keep_going else []:
+        # If it fails, the page may not show one of before.
+        Path(*job.output).unlink(missing_ok=True)
+        run_anyway(job)
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
     print(

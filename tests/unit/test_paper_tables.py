@@ -1,0 +1,307 @@
+"""The paper's tables: each number in its place, what is missing said, no number of a run that does not belong there."""
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.job_records import JobRecords
+from scenefuse.paper.published import OBJECTS, published
+from scenefuse.report.collected import RunInputs
+from scenefuse.report.compare_with_paper import ComparisonSettings, compare_with_paper
+from scenefuse.report.paper_section import paper_section
+from scenefuse.report.paper_tables import HERE, NULL, PAPER, SCENEFUSE
+from scenefuse.report.values import load
+from scenefuse.report.write_report import write_report
+from scenefuse.stage import quantity, write_json
+
+ROOT = Path(__file__).resolve().parents[2]
+NAMES = ("house", "shed")
+OWN, SHIPPED = "paper/results", "results"
+STAGES = ("matches", "sparse", "undistorted", "masks", "stage2", "stage3", "stage4", "object", "alignment")
+COMPLETION = {"surface_variation": 0.1, "nue": 1.5, "primitive_fitting_score": 0.8}
+
+
+def photos_of(name, digest=""):
+    return {"photos": [{"name": "0.jpg", "sha256": digest or f"of {name}"}]}
+
+
+def registration_of(fitness, unit, diagonal=10.0, tau_share=0.016):
+    found = {"fitness": (fitness, "1"), "inlier_rmse": (fitness / 4, unit), "normal_consistency": (fitness / 2, "1")}
+    found |= {"inlier_rmse_over_diagonal": (fitness / 4 / diagonal, "1"), "tau": (tau_share * diagonal, unit)}
+    return {name: quantity(number, u) for name, (number, u) in found.items()}
+
+
+def write_object(folder, recipe, fitness, unit="m", tau_share=0.016):
+    """An object that went through: fitness as given in `full`, a half of it in `no_scale`, a quarter in `no_crop`."""
+    write_json(folder / "photos.json", photos_of(folder.name))
+    (folder / "features.db").touch()
+    for stage in STAGES:
+        write_json(folder / f"{stage}.json", {})
+    write_json(folder / "stage1.json", {"pose_source": quantity("sfm", "")} if recipe == "paper" else {})
+    rng = np.random.default_rng(0)
+    write_cloud(folder / "object.ply", Cloud(rng.uniform(0, 1, (300, 3))))
+    status = quantity("ungated" if recipe == "paper" else "registered", "")
+    for share, variant in ((1, "full"), (2, "no_scale"), (4, "no_crop")):
+        registered = folder / "registration" / variant
+        write_json(registered / "crop.json", {"diagonal": quantity(10.0, unit)})
+        for stage in ("scale", "coarse"):
+            write_json(registered / f"{stage}.json", {})
+        write_json(registered / "fine.json", {"status": status, "reason": quantity("", "")})
+        measured = {"registration": registration_of(fitness / share, unit, tau_share=tau_share)}
+        if variant == "full":
+            write_cloud(registered / "crop.ply", Cloud(rng.uniform(0, 1, (500, 3)) * [8, 6, 0]))
+            completion = {name: quantity(number * fitness, "1") for name, number in COMPLETION.items()}
+            completion |= {f"{name}_null": quantity(number / 10, "1") for name, number in COMPLETION.items()}
+            write_json(folder / "metrics.json", measured | {"completion": completion})
+        else:
+            write_json(registered / "metrics.json", measured)
+    for name in ("evidence", "fusion", "missing"):
+        write_json(folder / f"{name}.json", {})
+
+
+def write_run(results, recipe, fitness):
+    """A finished run."""
+    scene = results / "scenes/yard"
+    for name in ("matches", "sparse", "georeference", "undistorted", "dense", "depth/0"):
+        write_json(scene / f"{name}.json", {})
+    write_json(scene / "photos.json", photos_of("yard"))
+    (scene / "features.db").touch()
+    for name in NAMES:
+        write_object(results / "objects" / name, recipe, fitness)
+    finish(results)
+
+
+def finish(results, names=NAMES, variants=("full", "no_scale", "no_crop")):
+    """Write the summary, which is the last that a run does."""
+    (results / "summary").mkdir(exist_ok=True)
+    rows = [f"{name}\t{variant}\n" for name in names for variant in variants]
+    (results / "summary/registration.tsv").write_text("".join(["object\tvariant\n", *rows]))
+    (results / "summary/summary.txt").write_text("all well\n")
+    dates = [path.stat().st_mtime for path in results.rglob("*.json")]
+    os.utime(results / "summary/summary.txt", (max(dates) + 1, max(dates) + 1))
+
+
+def fail(results, name, words):
+    """Let an object end in an error in stage 2; what stands behind it is from before."""
+    (results / f"objects/{name}/stage2.json").unlink()
+    log = results / f"logs/train_nerf_as_paper/{name}.log"
+    log.parent.mkdir(parents=True, exist_ok=True)
+    log.write_text(f"error: {words}\n")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A run of the shipped recipe (fitness 0.9) and, beside it, one of the paper's (0.4)."""
+    write_run(tmp_path / SHIPPED, "scenefuse", 0.9)
+    write_run(tmp_path / OWN, "paper", 0.4)
+    return tmp_path
+
+
+def compared(folder, compared_with=SHIPPED):
+    """Rows of paper.tsv by object, table, variant and measure."""
+    results = folder / OWN
+    run = RunInputs(
+        chunks=1,
+        variants=["full", "no_scale", "no_crop"],
+        jobs=JobRecords(results / "logs", results / "benchmarks"),
+        scenes=(results / "scenes/yard",),
+        objects=tuple(results / "objects" / name for name in NAMES),
+        scene_of=("yard",) * len(NAMES),
+    )
+    table = results / "summary/paper.tsv"
+    compare_with_paper(run=run, settings=ComparisonSettings(str(folder / compared_with)), table=table, seed=0)
+    read = pd.read_csv(table, sep="\t", na_values=["-"], keep_default_na=False)
+    return read.set_index(["object", "table", "variant", "measure"])
+
+
+def test_each_number_stands_in_its_column_and_row(folder):
+    table = compared(folder)
+    row = table.loc[("house", 2, "full", "fitness")]
+    assert row[[PAPER, HERE, SCENEFUSE]].tolist() == [0.9302, 0.4, 0.9]
+    assert table.loc[("house", 4, "no_scale", "fitness"), [PAPER, HERE, SCENEFUSE]].tolist() == [0.3083, 0.2, 0.45]
+    rmse = table.loc[("house", 4, "no_crop", "inlier_rmse")]
+    assert rmse[[PAPER, HERE, SCENEFUSE]].tolist() == [0.4424, 0.025, 0.05625] and rmse["unit"] == "m"
+    nue = table.loc[("house", 3, "full", "nue"), [PAPER, HERE, SCENEFUSE, NULL]].tolist()
+    assert nue == [1.17, pytest.approx(0.6), pytest.approx(1.35), 0.15]
+    assert table["note"].isna().all() and len(table) == 2 * 15
+    assert table.groupby("measure")["definition"].nunique().eq(1).all() and table["definition"].str.len().min() > 20
+
+
+def test_only_objects_of_the_paper_have_published_numbers(folder):
+    table = compared(folder)
+    assert table.loc["shed", PAPER].isna().all() and table.loc["shed", HERE].notna().all()
+    assert published("shed") == {}
+
+
+def test_published_numbers_are_those_of_the_documents():
+    table = pd.read_csv(ROOT / "docs/results/paper_preset.tsv", sep="\t").set_index(["object", "measure"])
+    found = {(o, f"{m}, {v}".removesuffix(", full")): x for o in OBJECTS for (m, v), (x, _) in published(o).items()}
+    assert {key: float(number) for key, number in table[PAPER].dropna().items()} == found
+    assert published("balloon")["inlier_rmse", "no_crop"][1] == "m" and published("balloon")["nue", "full"][1] == "1"
+
+
+def test_the_null_is_a_random_cloud_on_the_crop_whatever_the_object_is(folder):
+    null = compared(folder)[NULL]
+    # 300 points on 8 x 6: how often one of them lies within a tau of 0.16 of a place.
+    assert null["house", 2, "full", "fitness"] == pytest.approx(1 - np.exp(-300 / 48 * np.pi * 0.16**2), abs=0.06)
+    assert null["house", 2, "full", "fitness"] == null["house", 4, "no_crop", "fitness"]
+    assert null["house", 2, "full", "normal_consistency"] == pytest.approx(1)
+    write_cloud(folder / OWN / "objects/house/object.ply", Cloud(np.random.default_rng(9).uniform(0, 9, (300, 3))))
+    assert compared(folder)[NULL].equals(null)
+
+
+def test_an_object_that_failed_is_empty_with_the_reason_and_the_null_is_the_other_run_s(folder):
+    own = compared(folder)[NULL]
+    fail(folder / OWN, "house", "the visual hull of the masks is empty")
+    table = compared(folder)
+    house = table.loc["house"]
+    assert house[HERE].isna().all() and house[SCENEFUSE].notna().all()
+    assert house["note"].str.contains(r"failed, the visual hull of the masks is empty \[train_nerf_as_paper/").all()
+    assert (
+        house[NULL].equals(own["house"]) and house["note"].str.contains("null: on the crop of the run scenefuse").all()
+    )
+    assert table.loc["shed", HERE].notna().all() and table.loc["shed", "note"].isna().all()
+
+
+def test_without_any_other_run_the_rest_of_the_table_is_made(folder):
+    table = compared(folder, "elsewhere/results")
+    assert table[SCENEFUSE].isna().all() and table[[HERE, NULL]].notna().all(axis=None)
+    assert table["note"].str.fullmatch(r"scenefuse: \S+/elsewhere/results does not exist").all()
+    for name in NAMES:
+        fail(folder / OWN, name, "no volume")
+    assert compared(folder, "elsewhere/results")["note"].str.contains("null: no run came as far as a pose").all()
+
+
+def rewrite(folder, file, **changes):
+    path = folder / SHIPPED / file
+    write_json(path, load(path) | changes)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda f: (f / SHIPPED / "summary/summary.txt").unlink(), "holds no finished run"),
+        (lambda f: os.utime(f / SHIPPED / "objects/house/stage3.json", (4e9, 4e9)), "stage3.json is newer than"),
+        (lambda f: os.utime(f / SHIPPED / "scenes/yard/dense.json", (4e9, 4e9)), "dense.json is newer than"),
+        (lambda f: write_run(f / SHIPPED, "paper", 0.9), "is of recipe paper itself"),
+        (lambda f: (f / SHIPPED / "scenes/yard").rename(f / SHIPPED / "scenes/lawn"), "scenes/yard is of other photos"),
+        (lambda f: finish(f / SHIPPED, names=["barn"]), "has no object"),
+        (lambda f: (f / SHIPPED / "summary/registration.tsv").write_text(""), "has no object"),
+    ],
+    ids=["no summary", "object newer", "scene newer", "recipe paper", "other scene", "objects of before", "no table"],
+)
+def test_a_run_that_does_not_belong_there_gives_no_number_and_is_named(folder, spoil, words):
+    spoil(folder)
+    table = compared(folder)
+    assert table[SCENEFUSE].isna().all() and table[HERE].notna().all()
+    assert table["note"].str.contains(words, regex=False).all()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda house: (house / "photos.json").write_text("{"), "is not valid JSON"),
+        (lambda house: write_json(house / "photos.json", photos_of("house", "other")), "is of other photos than"),
+        (lambda house: write_object(house, "scenefuse", 0.9, tau_share=0.02), "at another tau (0.02 of the crop's"),
+        (lambda house: house.rename(house.with_name("barn")), "house is of other photos than"),
+        (lambda house: (house / "masks.json").unlink(), "scenefuse: missing, no error in its logs"),
+        (lambda house: fail(house.parents[1], "house", "no surface"), "scenefuse: failed, no surface"),
+    ],
+    ids=["damaged", "photos", "tau", "not in it", "being made again", "failed"],
+)
+def test_an_object_that_cannot_be_compared_gives_no_number_and_leaves_the_others(folder, spoil, words):
+    spoil(folder / SHIPPED / "objects/house")
+    finish(folder / SHIPPED)
+    table = compared(folder)
+    assert table.loc["house", SCENEFUSE].isna().all() and table.loc["shed", SCENEFUSE].notna().all()
+    assert table.loc["house", "note"].str.contains(words, regex=False).all() and table.loc["shed", "note"].isna().all()
+
+
+def test_a_pose_that_was_refused_is_said_beside_its_numbers(folder):
+    fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit", "")}
+    write_json(folder / SHIPPED / "objects/house/registration/full/fine.json", fine)
+    finish(folder / SHIPPED)
+    table = compared(folder)
+    assert table.loc[("house", 2, "full"), SCENEFUSE].notna().all()
+    assert set(table.loc[("house", 2, "full"), "note"]) == {"scenefuse: unregistered, two poses fit"}
+    assert table.loc[("house", 4), "note"].isna().all()
+
+
+def test_a_variant_that_did_not_run_and_a_measure_of_nothing_are_said(folder):
+    metrics = folder / OWN / "objects/house/metrics.json"
+    own = {"registration": registration_of(0.0, "m") | {"inlier_rmse": quantity(None, "m")}}
+    write_json(metrics, own | {"completion": {name: quantity(None, "1") for name in COMPLETION}})
+    # That of the shipped run's no_crop is from before.
+    finish(folder / SHIPPED, variants=["full", "no_scale"])
+    table = compared(folder)
+    assert table.loc[("house", 2, "full", "inlier_rmse"), "note"] == f"{HERE}: no point of the object within tau"
+    assert table.loc[("house", 3, "full", "nue"), "note"].startswith(f"{HERE}: too few points were added")
+    assert set(table.loc[("house", 4, "no_crop"), "note"]) == {
+        "scenefuse: missing, no error in its logs; it has not run yet"
+    }
+    assert table.loc[("house", 4, "no_scale"), "note"].isna().all()
+
+
+def test_lengths_in_another_unit_are_left_out_and_said(folder):
+    write_object(folder / SHIPPED / "objects/house", "scenefuse", 0.8, unit="scene units")
+    finish(folder / SHIPPED)
+    table = compared(folder)
+    row = table.loc[("house", 2, "full", "inlier_rmse")]
+    assert np.isnan(row[SCENEFUSE]) and row["note"] == "scenefuse: 0.2 scene units, in another unit"
+    assert table.loc[("house", 2, "full", "fitness"), SCENEFUSE] == 0.8
+
+
+def test_the_truth_changes_nothing(folder):
+    before = compared(folder)
+    for results in (OWN, SHIPPED):
+        for name in NAMES:
+            truth = {"variants": {"full": {"fitness": quantity(0.123, "1")}}, "fitness": quantity(0.123, "1")}
+            write_json(folder / results / f"objects/{name}/truth.json", truth)
+        finish(folder / results)
+    assert compared(folder).equals(before)
+
+
+def page_of(folder, paper):
+    results = folder / OWN
+    page = results / "report.html"
+    write_report(summary=results / "summary", paper=paper, title="test", report=page)
+    return page.read_text()
+
+
+def test_the_page_shows_the_tables_with_definitions_reasons_and_figures(folder):
+    fail(folder / OWN, "house", "no <volume>")
+    compared(folder)
+    page = page_of(folder, folder / OWN / "summary/paper.tsv")
+    text = re.sub(r"<[^>]+>", " ", page)
+    assert '<a href="#paper">' in page and all(f"Table {number}: " in text for number in (2, 3, 4))
+    assert "no &lt;volume&gt;" in page and "<volume>" not in page
+    assert "fitness  (Fitness): share of the crop&#x27;s points" in text
+    assert all(f"Figure {number}" in text for number in (2, 3, 5)) and "before_after.png" in text
+    assert re.search(r"house\s+full\s+1\s+0\.9302\s+-\s+0\.9\s", text)
+
+
+def test_the_page_of_another_recipe_shows_no_table_of_before(folder):
+    compared(folder)
+    assert "Table 2" not in page_of(folder, None)
+
+
+def test_the_page_says_that_the_table_could_not_be_made(folder):
+    assert "paper.tsv is missing" in page_of(folder, folder / OWN / "summary/paper.tsv")
+
+
+def test_the_page_says_which_rows_a_note_is_about():
+    row = {"in_paper": "x", "definition": "y", "unit": "1", PAPER: "-", HERE: "1", SCENEFUSE: "2", NULL: "-"}
+    places = [("2", "full", "fitness"), ("3", "full", "nue"), ("4", "no_crop", "fitness"), ("4", "no_crop", "tau")]
+    notes = ["a", "a", "b", "-"]
+    rows = [
+        {"object": "house", "table": t, "variant": v, "measure": m, "note": note, **row}
+        for (t, v, m), note in zip(places, notes)
+    ]
+    page = paper_section(rows)
+    assert "<p>house (full): a</p>" in page and "<p>house (fitness of no_crop): b</p>" in page
+    assert "<p>house: c</p>" in paper_section([r | {"note": "c"} for r in rows])
