@@ -106,6 +106,7 @@ class Workspace:
         points: (P, 3) float64 sparse points in the model's frame.
         seen: V arrays (K,) of rows of `points` that a photo observes, repeated where it observes one twice.
         seen_at: V arrays (K, 2) of the pixels where it does.
+        by_stereo: how many of the points, the last ones, are not from features but from stereo.
     """
 
     folder: Path
@@ -113,6 +114,7 @@ class Workspace:
     points: Array
     seen: list[Rows]
     seen_at: list[Array]
+    by_stereo: int = 0
 
     def subset(self, rows: Sequence[int]) -> Workspace:
         """The same workspace with only these of its views, and all sparse points."""

@@ -128,6 +128,13 @@ def _make(
     scored = score_masks(found.masks, found.target, photos.views, settings)
     for name in set(scored.dropped) & set(found.reasons):
         scored.dropped[name] += f"; {found.reasons[name]}"
+    against = sorted(set(scored.dropped) & set(found.clicked))
+    if against:
+        note = (
+            f"the masks carried on from the clicks in {', '.join(against)} contradict that photo's own: they lack a"
+            " part of the object, or hold more than it; look at them, and click in a photo where they are wrong"
+        )
+        found = replace(found, notes=(*found.notes, note))
     made = _kept(scored, settings.keep, inputs.sparse, photos.views)
     return replace(made, dropped=unusable | made.dropped), found, by
 

@@ -12,6 +12,7 @@ from scenefuse.masks.clicked.carry import carry
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.clicked.parts import Ask, prompted_parts
+from scenefuse.masks.clicked.stereo_points import with_stereo_points
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
@@ -42,6 +43,7 @@ class Prompted:
         reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
         left_out: clicks that contradict the others, or whose photo has no camera, a sentence each.
         notes: what else a user should know of the clicks.
+    clicked: names of the photos whose masks come from clicks in them.
     """
 
     masks: list[Mask]
@@ -49,6 +51,7 @@ class Prompted:
     reasons: dict[str, str]
     left_out: list[str]
     notes: tuple[str, ...] = ()
+    clicked: tuple[str, ...] = ()
 
 
 def masks_from_prompts(
@@ -78,7 +81,7 @@ def masks_from_prompts(
     """
     if isinstance(marked, Labels):
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
-        clicked = with_depth(photos, own)
+        clicked, photos = with_depth(photos, own), with_stereo_points(photos)
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
@@ -90,7 +93,8 @@ def masks_from_prompts(
         else:
             masks = segment_by_grabcut(target, photos, settings, carried.clicked)
         masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
-        return Prompted(masks, target, carried.reasons, left_out + carried.left_out)
+        names = tuple(photos.views[k].name for k, clicks in carried.clicked.items() if clicks.enough)
+        return Prompted(masks, target, carried.reasons, left_out + carried.left_out, clicked=names)
     points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:

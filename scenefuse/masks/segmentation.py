@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.grabcut import along_edges, cleaned
 from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
@@ -18,6 +20,9 @@ HULL_TOLERANCE = 0.1
 """Share of the photos that may contradict a voxel of the hull: some masks are wrong somewhere."""
 FIRST_TOLERANCE = 2 * HULL_TOLERANCE
 """The same for the first masks, which are made photo by photo."""
+AS_OTHERS = 0.9
+"""Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more: it holds a cloud, or
+lacks a wing."""
 EDGE_LOGITS = 1.0
 """The network's masks are moved to edges of the photo this near, in pixels of the 256 x 256 that it decides on."""
 NOTHING: Mapping[int, PhotoClicks] = {}
@@ -106,12 +111,14 @@ def segment_again(
     clicked: Mapping[int, PhotoClicks] = NOTHING,
 ) -> list[Mask]:
     """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
-    with the hull; then all of them at the photo's resolution."""
+    with the hull, or much more than most; then all of them at the photo's resolution."""
     masks = list(masks)
     hull = carve_trusted(target, photos.views, masks, settings, FIRST_TOLERANCE)
-    for k, view in enumerate(photos.views):
-        outline = silhouette(hull, view)
-        if mask_iou(masks[k], outline) < settings.min_agreement:
+    outlines = [silhouette(hull, view) for view in photos.views]
+    agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
+    least = max(settings.min_agreement, AS_OTHERS * float(np.median(agreement)))
+    for k, (view, outline) in enumerate(zip(photos.views, outlines)):
+        if agreement[k] < least:
             again = segment(network, target, view, outline, clicked.get(k))
             if mask_iou(again, outline) > mask_iou(masks[k], outline):
                 masks[k] = again

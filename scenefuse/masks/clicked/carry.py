@@ -31,6 +31,9 @@ from scenefuse.workspace import View, Workspace
 
 QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
+CERTAIN, AS_GOOD = 0.9, 0.06
+"""Of the masks of clicks alone the largest is taken of those that are this nearly as good, where the network is not
+certain of the best: who clicks on several parts means the whole."""
 FILL_WEIGHT = 0.5
 """Of how well it fills the space that the others leave, likewise."""
 SAME = 0.9
@@ -187,17 +190,19 @@ def _asked(
 ) -> tuple[Mask, float, float]:
     """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
 
-    The space that other photos leave bounds what has no sparse points. Its box prompts once more, and what comes of it
-    is taken if it agrees as well, fills the space better and is not beyond it; but not for another seam alone.
+    Of several about as good for clicks alone, the largest, if the method is certain of none.
+    The space that other photos leave bounds what has no sparse points. Its box prompts once more, and of all masks one
+    is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone.
     """
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
     best = max(found, key=lambda one: one.score)
+    if not len(known.inside) and clicks.enough and best.quality < CERTAIN:
+        best = max((one for one in found if one.score > best.score - AS_GOOD), key=lambda one: one.mask.sum())
     if space is not None and box is None:
-        more = _candidates(ask(view, inside, outside, None, space.box), view.pixels, inside, outside, tolerance_px)
-        other = max(
-            [best, *more], key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask)
-        )
+        more = ask(view, inside, outside, None, space.box)
+        found += _candidates(more, view.pixels, inside, outside, tolerance_px)
+        other = max(found, key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask))
         best = other if mask_iou(other.mask, best.mask) < SAME else best
     mask = with_parts(ask, view, best.mask, inside, outside, known.enclosed, tolerance_px)
     return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)

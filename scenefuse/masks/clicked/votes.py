@@ -98,8 +98,9 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others; and (P,) those
     of the others that the object's enclose.
 
-    In the convex hull of the object's points no mask says that a point is not on it: a first mask that lacks a part (a
-    wall in the shade) would have all others asked to leave it out.
+    A first mask that lacks a part (a wall in the shade) would have all others asked to leave it out. So in the convex
+    hull of the object's points no mask says that a point is not on it, and of points by stereo none says so anywhere:
+    these are dense, and a part is full of them.
     """
     share = shares_of(photos, made)
     known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
@@ -115,6 +116,8 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
             if (inner & (known < 0)).sum() > MOST_FOREIGN * (inner & (known > 0)).sum():
                 enclosed[:] = False
     known[enclosed] = 0
+    by_stereo = np.arange(len(known)) >= len(known) - photos.by_stereo
+    known[by_stereo & (known < 0)] = 0
     return known, enclosed
 
 

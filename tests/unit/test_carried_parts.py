@@ -1,0 +1,93 @@
+"""Points by coarse stereo, which carry parts without features from photo to photo."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.photographed_plane import BLANK, photographs
+
+from scenefuse.masks.clicked.carry import carry
+from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.clicked.stereo_points import with_stereo_points
+from scenefuse.masks.clicked.votes import known_points, voter_of
+from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.workspace import Workspace
+
+NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def plane():
+    """Photos of the painted plane, with sparse points where y < 0 alone."""
+    views = [replace(view, pixels=np.dstack([view.pixels] * 3)) for view in photographs(6, 4.0, size=160)]
+    rng = np.random.default_rng(0)
+    sparse = np.column_stack([rng.uniform([-2, -2], [BLANK, 0], (250, 2)), np.zeros(250)])
+    rows = [view.visible(sparse)[0] for view in views]
+    return Workspace(Path(), views, sparse, rows, [v.project(sparse[r])[0] for v, r in zip(views, rows)])
+
+
+def places_of(view):
+    """(H, W, 3) where the rays of a view's pixels meet the plane."""
+    u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(view.intrinsics).T @ view.cam_from_world[:3, :3]
+    return np.where(rays[..., 2:] < 0, view.centre + rays * (-view.centre[2] / rays[..., 2:]), np.inf)
+
+
+def disc(view, radius=1.0):
+    """A view's mask of the disc of the plane about the origin."""
+    return np.linalg.norm(places_of(view), axis=2) < radius
+
+
+def below(view):
+    """A view's mask of the half of the plane that holds the sparse points."""
+    return places_of(view)[..., 1] < 0
+
+
+def test_stereo_adds_points_where_there_are_none_and_only_on_what_has_texture(plane):
+    more = with_stereo_points(plane)
+    new, known = more.points[len(plane.points) :], len(plane.points)
+    assert (more.points[:known] == plane.points).all()
+    inner = new[(np.abs(new[:, :2]) < 1).all(1)]
+    assert (inner[:, 1] > 0.1).sum() > 150 and np.median(np.abs(inner[:, 2])) < 0.02
+    assert (new[:, 0] > BLANK + 0.2).sum() < 0.01 * len(new)
+    # Each is seen by three photos, where these have it.
+    counts = np.bincount(np.concatenate(more.seen), minlength=len(more.points))[known:]
+    assert counts.min() >= 3
+    for view, rows, at in zip(more.views, more.seen, more.seen_at):
+        added = rows >= known
+        np.testing.assert_allclose(view.project(more.points[rows[added]])[0], at[added], atol=1e-6)
+    # No place gets two.
+    near = np.linalg.norm(inner[:, None] - inner[None], axis=2) + np.eye(len(inner))
+    assert np.median(near.min(1)) > 0.02
+
+
+def test_photos_that_stereo_cannot_match_are_left_as_they_are(plane, capsys):
+    alone = plane.subset([0])
+    assert with_stereo_points(alone) is alone and "no points by stereo" in capsys.readouterr().out
+
+
+def test_points_by_stereo_say_what_is_the_object_and_never_what_is_not(plane):
+    more, sparse = with_stereo_points(plane), len(plane.points)
+    lacking = voter_of(more, 0, disc(more.views[0], 0.5), 0.9, 1.0, NO_CLICKS)
+    kind, _ = known_points(more, {0: lacking})
+    assert (kind[:sparse] == -1).any() and (kind[sparse:] == 1).any() and not (kind[sparse:] == -1).any()
+
+
+def test_a_part_without_features_is_carried_by_stereo_though_the_network_is_surer_of_the_rest(plane):
+    def ask(view, inside, outside, box, likely):
+        whole, lower = disc(view), disc(view) & below(view)
+        return [lower, whole], np.array([0.95, 0.9 if view.name == "0.png" else 0.85])
+
+    own = [plane.points[rows][:, 1] < -0.2 for rows in plane.seen]
+    few = replace(
+        plane,
+        seen=[rows[keep] for rows, keep in zip(plane.seen, own)],
+        seen_at=[at[keep] for at, keep in zip(plane.seen_at, own)],
+    )
+    places = few.views[0].project(np.array([[0.0, -0.5, 0], [0.0, 0.9, 0], [0.5, 0.0, 0]]))[0]
+    told = {0: PhotoClicks(places, np.ones(3, dtype=bool))}
+    carried = carry(ask, few, told, 2)
+    assert mask_iou(carried.masks[1], disc(few.views[1])) < 0.8
+    carried = carry(ask, with_stereo_points(few), told, 2)
+    assert all(mask_iou(m, disc(v)) > 0.99 for m, v in zip(carried.masks, few.views))
