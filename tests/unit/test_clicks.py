@@ -239,6 +239,21 @@ def test_a_part_that_the_objects_points_enclose_is_added(photos):
         assert (found == whole).all()
 
 
+@pytest.mark.parametrize(("quality", "count", "whole"), [(0.7, 3, True), (0.7, 2, False), (0.95, 3, False)])
+def test_of_masks_about_as_good_for_several_clicks_the_largest_is_taken_unless_one_is_certain(
+    photos, quality, count, whole
+):
+    ball, view = true_mask(photos.views[3]), photos.views[3]
+    part = ball & (np.arange(WIDTH) < 75)
+
+    def ask(view, inside, outside, box, likely):
+        return [part, ball, ~ball], np.array([quality, quality - 0.1, 0.1])
+
+    told = clicks([MIDDLE, (50, 45), (65, 50)][:count])
+    mask, *_ = one_photo(ask, view, told, 2)
+    assert (mask == (ball if whole else part)).all()
+
+
 def test_a_click_that_missed_the_outline_is_no_part(photos):
     view = photos.views[0]
     edge = int(np.flatnonzero(true_mask(view)[45]).max())

@@ -258,10 +258,10 @@ def test_prompts_away_from_the_object_are_an_error(capture, tmp_path):
 
 
 class TrueNetwork:
-    """Answers with the true mask and ever more beside it, the fifth photo at first with the ground."""
+    """Answers with the true mask and ever more beside it, the fifth photo at first with something else."""
 
-    def __init__(self, *_):
-        self.segmented = []
+    def __init__(self, first):
+        self.first, self.segmented = first, []
 
     def encode(self, image):
         k = next(k for k in range(PHOTOS) if np.array_equal(image, self.images[k]))
@@ -274,19 +274,37 @@ class TrueNetwork:
         assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()
         assert (points_px > box_px[0]).all() and (points_px < box_px[1]).all()
         if k == 5 and self.segmented.count(5) == 1:
-            return [~ball] * 3, np.ones(3)
+            return [self.first(ball)] * 3, np.ones(3)
         half = ball & (np.arange(size[1]) < points_px[:, 0].mean())
         return [half, ball, ball | np.roll(ball, 30, axis=1)], np.array([0.9, 0.8, 0.6])
 
 
-def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_others(capture, tmp_path, monkeypatch):
-    network = TrueNetwork()
+@pytest.mark.parametrize("first", [lambda ball: ~ball, lambda ball: ball | np.roll(ball, -8, axis=0)])
+def test_a_photo_that_disagrees_is_segmented_again_with_the_outline_of_the_others(
+    capture, tmp_path, monkeypatch, first
+):
+    network = TrueNetwork(first)
     network.images = [read_rgb(capture / "undistorted" / "images" / f"f{k}.png") for k in range(PHOTOS)]
     monkeypatch.setattr(masks_module, "load_network", lambda *_: (network, "own weights"))
     run_stage(capture, tmp_path, method="sam2")
     assert network.segmented == [*range(PHOTOS), 5]
     assert min(iou_with_truth(capture, tmp_path)) > 0.95
     assert value(read_json(tmp_path / "masks.json"), "weights") == "own weights"
+
+
+def test_a_note_says_that_the_carried_masks_contradict_the_photo_that_was_clicked_in(capture, tmp_path, monkeypatch):
+    def elsewhere(*arguments):
+        found = masks_from_prompts(*arguments)
+        (k,) = (k for k, v in enumerate(arguments[3].views) if v.name == "f0.png")
+        return dataclasses.replace(found, masks=[np.roll(m, 40 * (i == k), axis=1) for i, m in enumerate(found.masks)])
+
+    monkeypatch.setattr(masks_module, "masks_from_prompts", elsewhere)
+    (x, y), *_ = view(0).project(CENTRE[None])[0]
+    rows = [f"inside\tf0.png\t{column}\t{y}\n" for column in (x, x - 9, x + 9)]
+    (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + "".join(rows))
+    run_stage(capture, tmp_path, prompts=tmp_path / "clicks.tsv")
+    (note,) = value(read_json(tmp_path / "masks.json"), "notes")
+    assert "the clicks in f0.png contradict that photo's own" in note
 
 
 MARKS = {
