@@ -124,7 +124,10 @@ def span(points: Array, margin: float) -> Array:
 def in_hull(points: Array, corners: Array) -> NDArray[np.bool_]:
     """(N,) True where (N, 3) points lie in the convex hull of (M, 3) corners."""
     hull = ConvexHull(corners)
-    return (points @ hull.equations[:, :3].T + hull.equations[:, 3] <= 1e-9).all(1)
+    near = ((points >= corners.min(0) - 1e-9) & (points <= corners.max(0) + 1e-9)).all(1)
+    # Of many points few are near: distances to all faces take far more room than the points.
+    near[near] = (points[near] @ hull.equations[:, :3].T + hull.equations[:, 3] <= 1e-9).all(1)
+    return np.asarray(near)
 
 
 def _quadratic(flat: Array) -> Array:

@@ -124,14 +124,14 @@ def _make(
         network, by = _network(settings)
         found = masks_from_prompts(marked, inputs.sparse, sizes, photos, up, network, settings, seed)
     own = found.target.kind
-    print(f"{np.sum(own > 0)} sparse points on the object, {np.sum(own < 0)} not", flush=True)
+    print(f"{np.sum(own > 0)} points on the object, {np.sum(own < 0)} not", flush=True)
     scored = score_masks(found.masks, found.target, photos.views, settings)
     for name in set(scored.dropped) & set(found.reasons):
         scored.dropped[name] += f"; {found.reasons[name]}"
-    against = sorted(set(scored.dropped) & set(found.clicked))
+    against = sorted(set(scored.dropped) & set(found.clicked) - set(found.reasons))
     if against:
         note = (
-            f"the masks carried on from the clicks in {', '.join(against)} contradict that photo's own: they lack a"
+            f"the masks carried on from the clicks in {', '.join(against)} contradict the masks there: they lack a"
             " part of the object, or hold more than it; look at them, and click in a photo where they are wrong"
         )
         found = replace(found, notes=(*found.notes, note))

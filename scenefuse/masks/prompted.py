@@ -43,7 +43,7 @@ class Prompted:
         reasons: why a photo's mask was not good enough to be carried on, by the photo's name.
         left_out: clicks that contradict the others, or whose photo has no camera, a sentence each.
         notes: what else a user should know of the clicks.
-    clicked: names of the photos whose masks come from clicks in them.
+        clicked: names of the photos whose masks come from clicks in them.
     """
 
     masks: list[Mask]

@@ -21,8 +21,7 @@ HULL_TOLERANCE = 0.1
 FIRST_TOLERANCE = 2 * HULL_TOLERANCE
 """The same for the first masks, which are made photo by photo."""
 AS_OTHERS = 0.9
-"""Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more: it holds a cloud, or
-lacks a wing."""
+"""Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more."""
 EDGE_LOGITS = 1.0
 """The network's masks are moved to edges of the photo this near, in pixels of the 256 x 256 that it decides on."""
 NOTHING: Mapping[int, PhotoClicks] = {}
@@ -120,7 +119,7 @@ def segment_again(
     for k, (view, outline) in enumerate(zip(photos.views, outlines)):
         if agreement[k] < least:
             again = segment(network, target, view, outline, clicked.get(k))
-            if mask_iou(again, outline) > mask_iou(masks[k], outline):
+            if mask_iou(again, outline) > agreement[k]:
                 masks[k] = again
             print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
     return [

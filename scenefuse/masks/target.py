@@ -105,7 +105,7 @@ def target_from_votes(
     own = photos.points[kind > 0]
     if len(own) < LEAST_OWN:
         raise StageError(
-            f"only {len(own)} sparse points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
+            f"only {len(own)} points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
             " a photo that shows more of the object, or in several"
         )
     target = target_from_points(np.concatenate([clicked, _without_outermost(own, up)]), photos, up, seed)

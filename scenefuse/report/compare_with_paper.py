@@ -25,6 +25,9 @@ from scenefuse.report.paper_tables import (
 from scenefuse.report.values import find, load
 from scenefuse.stage import StageError, atomic_file, read_json, setting
 
+ON_DEMAND = ("fused_scene.json",)
+"""Files of an object that no run makes unless they are asked for, at any time."""
+
 
 @dataclass(frozen=True)
 class ComparisonSettings:
@@ -118,6 +121,7 @@ def why_not_finished(results: Path, run: RunInputs) -> str:
         return f"{results} holds no finished run: it has no summary/summary.txt"
     parts = ("*.json", "registration/*/*.json")
     written = [file for folder in run.objects for part in parts for file in folder.glob(part)]
+    written = [file for file in written if file.name not in ON_DEMAND]
     written += [folder / "dense.json" for folder in run.scenes if (folder / "dense.json").is_file()]
     try:
         newer = next((file for file in written if file.stat().st_mtime > summary.stat().st_mtime), None)

@@ -88,7 +88,7 @@ def column_of(item: Collected) -> Column:
     for variant in VARIANTS:
         status = status_of(item, variant)
         if status not in ("registered", "ungated"):
-            notes[variant] = f"{status}, {reason_of(item, variant)}"
+            notes[variant] = ", ".join(filter(None, (status, reason_of(item, variant))))
     return Column(_cells({v: _measured(item.variants.get(v, {})) for v in VARIANTS}), notes)
 
 

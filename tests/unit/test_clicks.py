@@ -210,6 +210,13 @@ def test_what_the_objects_points_enclose_is_asked_about_and_never_said_to_be_out
     assert not known(300, votes=1)[1].any()
     kind, enclosed = known(200)
     assert (kind[200:] == -1).all() and not enclosed.any()
+    # Points by stereo are dense: those that a first mask lacks do not outweigh it.
+    photos = replace(photos, points=np.concatenate([points[200:], points[:200] / 4]), by_stereo=200)
+    rows = np.arange(303)
+    voter = Voter(empty, 0.9, 1.0, rows, rows < 100, PhotoClicks(NONE, NONE[:, 0]))
+    kind, enclosed = known_points(photos, dict.fromkeys(range(2), voter))
+    assert enclosed.tolist() == [False] * 100 + [True, True] + [False] * 201
+    assert kind[100:].tolist() == [0, 0, -1] + [0] * 200
 
 
 def test_one_of_four_points_that_a_mask_lacks_is_no_reason_to_doubt_it():

@@ -304,7 +304,7 @@ def test_a_note_says_that_the_carried_masks_contradict_the_photo_that_was_clicke
     (tmp_path / "clicks.tsv").write_text("label\tphoto\tx_px\ty_px\n" + "".join(rows))
     run_stage(capture, tmp_path, prompts=tmp_path / "clicks.tsv")
     (note,) = value(read_json(tmp_path / "masks.json"), "notes")
-    assert "the clicks in f0.png contradict that photo's own" in note
+    assert "the clicks in f0.png contradict the masks there" in note
 
 
 MARKS = {

@@ -221,9 +221,11 @@ use rule register_as_paper as register_variant_as_paper with:
 
 
 def state_of_compared(wildcards):
-    """Params function: fingerprint of what a finished run of the shipped recipe says of the same objects."""
+    """Params function: fingerprint of what the run compared with says of the same objects."""
     results = Path(config["evaluation"]["paper"]["compared_with"])
-    files = [results / "summary/summary.txt"]
+    files = [results / "summary/summary.txt", results / "summary/registration.tsv"]
+    for folder in (results / "scenes" / name for name in SCENES):
+        files += [folder / "photos.json", folder / "dense.json"]
     for folder in (results / "objects" / name for name in JOINED):
         files += [*folder.glob("*.json"), *folder.glob("registration/*/*.json")]
     return files_fingerprint(tuple(map(str, files)))

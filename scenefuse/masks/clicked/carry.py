@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.clicked.clicks import ENOUGH, PhotoClicks
 from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
 from scenefuse.masks.clicked.space import Left, Space
 from scenefuse.masks.clicked.votes import (
@@ -32,8 +32,8 @@ from scenefuse.workspace import View, Workspace
 QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
 CERTAIN, AS_GOOD = 0.9, 0.06
-"""Of the masks of clicks alone the largest is taken of those that are this nearly as good, where the network is not
-certain of the best: who clicks on several parts means the whole."""
+"""For several clicks alone, where the network is not certain of its best mask (a lower quality), the largest is taken
+of those within so much of its score: who clicks on several parts means the whole."""
 FILL_WEIGHT = 0.5
 """Of how well it fills the space that the others leave, likewise."""
 SAME = 0.9
@@ -190,14 +190,14 @@ def _asked(
 ) -> tuple[Mask, float, float]:
     """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
 
-    Of several about as good for clicks alone, the largest, if the method is certain of none.
+    For several clicks alone the largest of those about as good, if the method is certain of none.
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and of all masks one
     is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone.
     """
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
     best = max(found, key=lambda one: one.score)
-    if not len(known.inside) and clicks.enough and best.quality < CERTAIN:
+    if not len(known.inside) and len(clicks.on) >= ENOUGH and best.quality < CERTAIN:
         best = max((one for one in found if one.score > best.score - AS_GOOD), key=lambda one: one.mask.sum())
     if space is not None and box is None:
         more = ask(view, inside, outside, None, space.box)

@@ -33,8 +33,8 @@ def with_stereo_points(photos: Workspace) -> Workspace:
     small = [replace(view, pixels=_gray(view)).at_most(SETTINGS.max_image_size_px) for view in photos.views]
     try:
         chosen = select_views(replace(photos, views=small), SETTINGS.sources, SETTINGS.min_angle_deg)
-    except StageError as error:
-        print(f"no points by stereo: {error}", flush=True)
+    except StageError:
+        print("no points by stereo: no two photos share enough points from different places", flush=True)
         return photos
     depths = {
         name: estimate_depth(one.view, one.sources, one.near, one.far, SETTINGS, "cpu").depth

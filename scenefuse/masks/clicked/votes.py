@@ -99,8 +99,8 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     of the others that the object's enclose.
 
     A first mask that lacks a part (a wall in the shade) would have all others asked to leave it out. So in the convex
-    hull of the object's points no mask says that a point is not on it, and of points by stereo none says so anywhere:
-    these are dense, and a part is full of them.
+    hull of the object's points no mask says that a point is not on it. Points by stereo are known to be the object's,
+    or unknown: they are dense, so a part is full of them, and so is what lies between the object's parts.
     """
     share = shares_of(photos, made)
     known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
@@ -108,17 +108,17 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
     known[(known > 0) & ~_near_most(photos.points, known > 0)] = 0
     own = central(photos.points[(known > 0) & (counts >= SPANNING_VOTES)])
-    enclosed = np.zeros(len(known), dtype=bool)
+    enclosed, sparse = np.zeros(len(known), dtype=bool), np.arange(len(known)) < len(known) - photos.by_stereo
     if len(own) >= LEAST_SPANNING:
         with suppress(QhullError):  # of points in a plane, which enclose nothing
             inner = in_hull(photos.points, own)
             enclosed = (known <= 0) & inner
-            if (inner & (known < 0)).sum() > MOST_FOREIGN * (inner & (known > 0)).sum():
+            foreign, mine = ((inner & sparse & side).sum() for side in (known < 0, known > 0))
+            if foreign > MOST_FOREIGN * mine:
                 enclosed[:] = False
     known[enclosed] = 0
-    by_stereo = np.arange(len(known)) >= len(known) - photos.by_stereo
-    known[by_stereo & (known < 0)] = 0
-    return known, enclosed
+    known[~sparse & (known < 0)] = 0
+    return known, enclosed & sparse
 
 
 def _near_most(points: Array, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
