@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.cores import use_threads
 from scenefuse.io.pictures import write_picture
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.contact_sheet import draw_contact_sheet
@@ -76,7 +77,8 @@ def make_masks(
     Raises:
         StageError: prompts, weights or masks are missing or wrong; too few good masks.
     """
-    # On several threads GrabCut does not repeat to the last pixel; the network has them all.
+    use_threads(threads())
+    # On several threads GrabCut does not repeat to the last pixel; stereo and the network have them all.
     cv2.setNumThreads(1)
     workspace = read_workspace(inputs.workspace)
     photos = replace(workspace, views=[workspace.rgb(view) for view in workspace.views])
