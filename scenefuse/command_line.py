@@ -54,6 +54,7 @@ def _pick() -> None:
     from scenefuse.pick.pick import pick
     from scenefuse.stage import run
 
+    _need_project("--configfile", "-h", "--help")
     run(pick)
 
 
@@ -65,6 +66,15 @@ def _init() -> None:
     run(init)
 
 
+def _need_project(*elsewhere: str) -> None:
+    """End with a sentence where the folder holds no project, and no option with one of these beginnings is given."""
+    from scenefuse.io.settings import ROOT
+
+    if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
+        where = f"there is no {SCENES} here ({Path.cwd()})"
+        sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
+
+
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
     from scenefuse.io.settings import ROOT
@@ -73,10 +83,7 @@ def _run() -> None:
         raise ModuleNotFoundError(name="snakemake")
     words = sys.argv[1:]
     # Options of Snakemake that say where the project is, or that none is needed.
-    elsewhere = ("--config", "--directory", "-d", "-h", "--help", "--version")
-    if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in words)):
-        where = f"there is no {SCENES} here ({Path.cwd()})"
-        sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
+    _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
     if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
         words = ["--configfile", str(OWN_SETTINGS), *words]
     command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), *words]

@@ -1,6 +1,7 @@
 """Coordinate reference systems as survey files name them, and their way to WGS84."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pyproj
@@ -12,6 +13,8 @@ from scenefuse.transforms import Array
 UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
 # A CRS is used so far beyond its area at most, in degrees: one UTM zone.
 BEYOND_DEG = 6.0
+# Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
+NEAR_ZERO = 10_000.0
 
 
 def read_crs(text: str, where: str) -> pyproj.CRS:
@@ -84,6 +87,16 @@ def to_wgs84(crs: pyproj.CRS, points: Array, where: str) -> Array:
     """
     found = check_in_area(crs, points, where)
     return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
+
+
+def check_place(crs: str, points: Array, source: Path) -> None:
+    """StageError where the middle of a file's points (N, 3) lies far from where their projected CRS is used; near the
+    CRS's zero, where it lies outside at all."""
+    known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
+    if known.is_projected:
+        middle = np.median(points, axis=0)
+        beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
+        check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)
 
 
 def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = BEYOND_DEG) -> Array:

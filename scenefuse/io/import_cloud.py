@@ -25,8 +25,6 @@ STRAY_PERCENT = 1.0
 SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
-# Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
-NEAR_ZERO = 10_000.0
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -52,7 +50,9 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
-        _check_place(crs, own, source)
+        from scenefuse.io.crs import check_place
+
+        check_place(crs, own.sample, source)
     origin = near_origin(own.sample)
     shift = Sim3(1.0, np.eye(3), origin)
     content = write_placed(cloud, source, parts, own, lambda part: part.transformed(shift.inverse()), unit)
@@ -208,20 +208,6 @@ def import_report(source: Path, own: Survey, step: float, diagonal: float, unit:
         "has_normals": quantity(bool(own.unit_normals), ""),
         "notes": quantity(notes, ""),
     }
-
-
-def _check_place(crs: str, own: Survey, source: Path) -> None:
-    """StageError where the middle of a file's points lies far from where its CRS is used; near the CRS's zero, where it
-    lies outside at all."""
-    import pyproj
-
-    from scenefuse.io.crs import BEYOND_DEG, check_in_area, plane, registered
-
-    known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
-    if known.is_projected:
-        middle = np.median(own.sample, axis=0)
-        beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
-        check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)
 
 
 def unit_and_name(crs: str) -> tuple[str, str]:

@@ -93,6 +93,9 @@ def register(
     scales = known.scales()
     _clear(out, [object, scene, *(path for path in (known.fiducials, config) if path)])
     given = _read(object, scene, settings, known)
+    notes = _notes(object, scene)
+    for note in notes:
+        print(f"note       {note}", flush=True)
     if scales is not None:
         _check_size(scales, given)
     found = register_clouds(given.object, given.part, settings, seed, ups=given.ups, scales=scales)
@@ -103,6 +106,7 @@ def register(
         "searched": quantity(given.searched, ""),
         "inputs": quantity({"object": object, "scene": scene} | points, ""),
         "seed": quantity(seed, ""),
+        "notes": quantity(notes, ""),
         "version": quantity(VERSION, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
@@ -146,10 +150,29 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     cloud, whole = read_cloud(object), read_cloud(scene)
     for path, points in ((object, cloud.points), (scene, whole.points)):
         check_not_degrees(path, points)
+    crs = las_crs(scene)
+    if crs is not None:
+        from scenefuse.io.crs import check_place
+
+        check_place(crs, whole.points, scene)
     box = None if known.crop_box is None else np.array(known.crop_box)
     part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     return Given(cloud, whole, part, searched, ups)
+
+
+def _notes(object: Path, scene: Path) -> list[str]:
+    """What a user should know of the coordinate systems of both files."""
+    texts = las_crs(object), las_crs(scene)
+    if texts[0] is None:
+        return []
+    import pyproj
+
+    own, other = (None if text is None else pyproj.CRS.from_wkt(text) for text in texts)
+    if own == other:
+        return []
+    there = "names no CRS" if other is None else f"is in {other.name}"
+    return [f"{object} is in {own.name}, which is not used: its points are laid on those of {scene}, which {there}"]
 
 
 def _write(out: Path, format: str, given: Given, found: Registration, scene: Path, seed: int) -> list[Path]:

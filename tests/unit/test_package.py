@@ -178,8 +178,9 @@ def test_an_empty_project_says_what_is_missing(installed, tmp_path):
     )
 
 
-def test_a_run_in_a_folder_without_a_project_does_not_plan_the_demo(tmp_path):
-    status, output = scenefuse("run", "-n", cwd=tmp_path)
+@pytest.mark.parametrize("words", [("run", "-n"), ("pick", "--object", "house")])
+def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, words):
+    status, output = scenefuse(*words, cwd=tmp_path)
     assert status == 1 and "there is no config/scenes.tsv here" in output and "scenefuse init" in output
 
 

@@ -61,6 +61,16 @@ def test_a_house_in_e57_is_found_in_a_scene_in_laz_at_utm_coordinates(tmp_path, 
     assert len(printed) == 6 and printed[0].startswith("registered: ") and "whole scene" in printed[3]
 
 
+def test_a_note_says_that_the_object_s_own_crs_is_not_used(tmp_path, house, capsys, monkeypatch):
+    write_laz(tmp_path / "house.laz", house.object, UTM, "EPSG:32633")
+    write_laz(tmp_path / "scene.laz", house.scene, UTM, "EPSG:32632")
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    assert register(object=tmp_path / "house.laz", scene=tmp_path / "scene.laz", out=tmp_path / "out") == 0
+    (note,) = value(read_json(tmp_path / "out/transform.json"), "notes")
+    assert "house.laz is in WGS 84 / UTM zone 33N, which is not used" in note and "UTM zone 32N" in note
+    assert note in capsys.readouterr().out
+
+
 def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
     trial = plant("house", 5, noise=0.005, object_points=6000, density_ratio=1.0)
     write_cloud(tmp_path / "scene.ply", Cloud(trial.scene.points + UTM, None, trial.scene.colors))
@@ -155,11 +165,16 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"object": Path("repeated.ply")}, "the object has only 3 different positions among its 5000 points; 200"),
         ({"object": Path("line.ply")}, "all 500 points of the object lie along one line"),
         ({"out": Path("three.txt")}, "is a file"),
+        (
+            {"scene": Path("elsewhere.laz")},
+            "elsewhere.laz, the middle of its points: .* does not lie in WGS 84 / UTM zone 32N",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words):
     monkeypatch.chdir(tmp_path)
     write_cloud(Path("scene.ply"), house.scene)
+    write_laz(Path("elsewhere.laz"), house.scene, np.zeros(3), "EPSG:32632")
     write_cloud(Path("few.ply"), Cloud(np.eye(3)))
     write_cloud(Path("repeated.ply"), Cloud(np.eye(3)[np.arange(5000) % 3]))
     write_cloud(Path("line.ply"), Cloud(np.outer(np.arange(500.0), [1, 2, 3])))
@@ -168,7 +183,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
     Path("typo.yaml").write_text("registration: {fine: {min_fscore: 0.1}}")
     files = {"object": Path("scene.ply"), "scene": Path("scene.ply")}
-    others = {name: option for name, option in options.items() if name in ("object", "config", "out")}
+    others = {name: option for name, option in options.items() if name in ("object", "scene", "config", "out")}
     known = Known(**{name: option for name, option in options.items() if name not in others})
     with pytest.raises(StageError, match=words):
         register(**(files | others), known=known)
