@@ -109,7 +109,7 @@ def test_steps_of_seconds_are_one_job_with_the_time_of_all(ran, jobs):
     of_house = ran / "clouds/results/objects/house/registration/full"
     assert all((of_house / f"{step}.json").exists() for step in ("crop", "scale", "coarse", "fine"))
     assert len([job for job in jobs if job["JobState"] == "COMPLETED" and job["Partition"] == "main"]) == 4
-    assert "03:00:00" in [job["TimeLimit"] for job in jobs]
+    assert "02:30:00" in [job["TimeLimit"] for job in jobs]
 
 
 def test_a_job_that_asks_for_a_card_gets_one_in_its_partition(ran, jobs):
