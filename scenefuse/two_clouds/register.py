@@ -163,12 +163,12 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
 
 def _notes(object: Path, scene: Path) -> list[str]:
     """What a user should know of the coordinate systems of both files."""
-    texts = las_crs(object), las_crs(scene)
-    if texts[0] is None:
+    own_text, scene_text = las_crs(object), las_crs(scene)
+    if own_text is None:
         return []
     import pyproj
 
-    own, other = (None if text is None else pyproj.CRS.from_wkt(text) for text in texts)
+    own, other = pyproj.CRS.from_wkt(own_text), None if scene_text is None else pyproj.CRS.from_wkt(scene_text)
     if own == other:
         return []
     there = "names no CRS" if other is None else f"is in {other.name}"
