@@ -81,7 +81,8 @@ def masks_from_prompts(
     """
     if isinstance(marked, Labels):
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
-        clicked, photos = with_depth(photos, own), with_stereo_points(photos)
+        clicked = with_depth(photos, own)
+        photos = with_stereo_points(photos) if network else photos
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
