@@ -86,7 +86,9 @@ def _run() -> None:
     _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
     if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
         words = ["--configfile", str(OWN_SETTINGS), *words]
-    command = [sys.executable, "-m", "snakemake", "--snakefile", str(ROOT / "Snakefile"), *words]
+    # As `python -m snakemake`, but its help and its complaints name the command that was typed.
+    start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
+    command = [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]
     # The process becomes Snakemake: signals and the exit status are its own.
     os.execv(sys.executable, command)
 

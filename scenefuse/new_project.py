@@ -1,6 +1,7 @@
 """A folder for a project of one's own: tables, settings and a text that says what comes next."""
 
 import re
+import unicodedata
 from pathlib import Path
 from typing import Literal
 
@@ -8,6 +9,7 @@ import tyro
 
 from scenefuse.io.formats import READERS
 from scenefuse.io.settings import ROOT, schema_of
+from scenefuse.sfm.photo_files import VIDEO_SUFFIXES, photo_files
 from scenefuse.stage import StageError
 
 SCENES = ("scene", "photos", "cameras", "cloud")
@@ -24,9 +26,12 @@ README = """\
 2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
    Without a scene, an object's photos become a cloud by themselves.
    In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.
-3. `scenefuse pick --configfile config/config.yaml --object NAME`: click on an object in its photos; not for a cloud.
+3. Say what the object is:
+   - of photos: `scenefuse pick --configfile config/config.yaml --object NAME` opens a page to click on it;
+   - where the scene or the object is a cloud, and the scene shows much more than the object: name a text file in the
+     column `fiducials` with at least four points around the object, a line `x y z` each, in the scene's coordinates.
 4. `scenefuse run -n` says what would run, `scenefuse run --cores 2` runs it; options are Snakemake's.
-5. Look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
+5. Of photos, look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
 """
 
 
@@ -46,15 +51,18 @@ def init(
         preset: what config.yaml holds: settings for a first look, the shipped ones, or larger ones for a GPU.
 
     Raises:
-        StageError: the folder is a file or holds a project, a path does not exist, or two names are the same.
+        StageError: the folder is a file or holds a project, a path is neither photos nor a cloud, or two names are the
+            same.
     """
     names = [_name(path) for path in objects]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
     lying_in = "" if scene is None else _name(scene)
-    scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder)]
-    rows = [{"object": name, "scene": lying_in} | _source(path, folder) for name, path in zip(names, objects)]
+    scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder, video=False)]
+    rows = [
+        {"object": name, "scene": lying_in} | _source(path, folder, video=True) for name, path in zip(names, objects)
+    ]
     for row in rows:
         # Where `pick` saves what is clicked.
         row |= {"prompts": f"config/{row['object']}_prompts.tsv"} if "photos" in row else {}
@@ -70,22 +78,37 @@ def init(
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
+    for path, name in [*([] if scene is None else [(scene, lying_in)]), *zip(objects, names)]:
+        renamed = "" if name == _stem(path) else "; names hold only A-Z, a-z, 0-9, _ and -"
+        print(f"{path} is called {name} in the tables and results{renamed}", flush=True)
     print(f"{folder}/README.md says what comes next", flush=True)
 
 
 def _name(path: Path) -> str:
-    """A name for the tables from that of a file or folder."""
-    stem = path.stem if path.is_file() else path.resolve().name
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", stem).lstrip("-") or "_"
+    """A name for the tables from that of a file or folder; letters lose their accents."""
+    letters = "".join(a for a in unicodedata.normalize("NFKD", _stem(path)) if not unicodedata.combining(a))
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", letters).lstrip("-") or "_"
 
 
-def _source(path: Path, folder: Path) -> dict[str, str]:
+def _stem(path: Path) -> str:
+    return path.stem if path.is_file() else path.resolve().name
+
+
+def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
     """The cell of a row that names photos or a cloud, relative to the project where it lies in it."""
+    wanted = "a folder of photos, a video or a cloud" if video else "a folder of photos or a cloud"
     if not path.exists():
-        raise StageError(f"{path} does not exist; give a folder of photos, a video or a cloud")
+        raise StageError(f"{path} does not exist; give {wanted}")
+    suffix = path.suffix.lower()
+    is_cloud = path.is_file() and suffix in READERS
+    if path.is_dir():
+        photo_files(path)
+    elif not (is_cloud or (video and suffix in VIDEO_SUFFIXES)):
+        raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
+    elif path.stat().st_size == 0:
+        raise StageError(f"{path} is empty; export it again")
     place, project = path.resolve(), folder.resolve()
     cell = place.relative_to(project) if place.is_relative_to(project) else place
-    is_cloud = path.is_file() and path.suffix.lower() in READERS
     return {"cloud" if is_cloud else "photos": cell.as_posix()}
 
 

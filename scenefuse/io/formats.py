@@ -58,7 +58,13 @@ def read_columns(path: Path) -> Columns:
 
 @contextmanager
 def readable(path: Path) -> Iterator[None]:
-    """What a library says of a damaged file, as one sentence."""
+    """What a library says of a damaged file, as one sentence.
+
+    Raises:
+        StageError: the file is empty, or cannot be read.
+    """
+    if path.is_file() and path.stat().st_size == 0:
+        raise StageError(f"{path} is empty (0 bytes); copy or export it again")
     try:
         yield
     except (StageError, MemoryError):
@@ -66,7 +72,9 @@ def readable(path: Path) -> Iterator[None]:
     except Exception as error:  # each library has its own errors for a damaged file
         kind = path.suffix.removeprefix(".").upper()
         why = (str(error) or type(error).__name__).splitlines()[0]
-        raise StageError(f"{path} is not a readable {kind} cloud ({why}); export it again") from None
+        raise StageError(
+            f"{path} is not a readable {kind} cloud: damaged or cut short ({why}); copy or export it again"
+        ) from None
 
 
 def checked(path: Path, columns: Columns) -> Columns:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +22,8 @@ CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
 POINT_COLUMNS = ["point", "x", "y", "z"]
 LABEL_COLUMNS = ["label", "photo", "x_px", "y_px"]
 LABELS = ("inside", "outside", "box")
+# Between the columns of points in the scene, which have no names with spaces.
+SEPARATORS = re.compile(r"\s*[,;]\s*|\s+")
 
 
 @dataclass(frozen=True)
@@ -76,14 +79,25 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     """Read a tab-separated file of clicks (point, photo, x_px, y_px), scene points (point, x, y, z) or labelled
     pixels (label, photo, x_px, y_px).
 
+    Scene points may be separated by spaces, commas or semicolons too; without a header, or with `x y z`, a
+    line is x y z, and the points are called 1, 2, ... in their order.
+
     Raises:
         StageError: the file is missing or empty, its header is none of these, or a line is not well formed.
     """
     rows = read_cells(path)
+    loose = [(number, SEPARATORS.split(" ".join(cells).strip())) for number, cells in rows]
+    if loose and (_all_numbers(loose[0][1]) or loose[0][1] == POINT_COLUMNS[1:]):
+        return _bare_points(path, loose[loose[0][1] == POINT_COLUMNS[1:] :])
+    if loose and loose[0][1] == POINT_COLUMNS:
+        rows = loose if len(rows[0][1]) == 1 else rows
     header = rows[0][1] if rows else []
     if header not in (CLICK_COLUMNS, POINT_COLUMNS, LABEL_COLUMNS):
+        spaced = loose and loose[0][1] in (CLICK_COLUMNS, LABEL_COLUMNS)
         raise StageError(
-            f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
+            f"{path}: separate its columns by tabs (one between two columns); names of photos may hold spaces"
+            if spaced
+            else f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
             f"'label photo x_px y_px', not with '{' '.join(header)}'"
         )
     if len(rows) == 1:
@@ -98,6 +112,24 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     if header == POINT_COLUMNS:
         return ScenePoints(path, [n[0] for n in names], np.array(numbers))
     return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
+
+
+def _all_numbers(words: list[str]) -> bool:
+    try:
+        return len(words) > 1 and bool(np.isfinite([float(word) for word in words]).all())
+    except ValueError:
+        return False
+
+
+def _bare_points(path: Path, rows: list[tuple[int, list[str]]]) -> ScenePoints:
+    """Points without names, numbered."""
+    if not rows:
+        raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
+    for number, words in rows:
+        if len(words) != 3 or not _all_numbers(words):
+            raise StageError(f"{path}, line {number}: expected x y z, got '{' '.join(words)}'; or give a header")
+    positions = np.array([[float(word) for word in words] for _, words in rows])
+    return ScenePoints(path, [str(index) for index in range(1, len(rows) + 1)], positions)
 
 
 def _split(

@@ -16,7 +16,6 @@ from scenefuse.sfm.photo_files import frame_name, thin_out
 from scenefuse.sfm.photos import JPEG_QUALITY, inspect_photo, photo_names, photo_notes, save_upright, write_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 
-VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 
 
 @dataclass(frozen=True)

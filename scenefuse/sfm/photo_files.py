@@ -9,6 +9,7 @@ from scenefuse.stage import StageError
 # Positions of the photos beside it, as OpenDroneMap names the file.
 GEO_FILE = "geo.txt"
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
+VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
 UNREADABLE = frozenset(
     (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")

@@ -71,7 +71,7 @@ def register(
 ) -> int:
     """Find the place, size and orientation of one point cloud in another, or refuse.
 
-    Reads PLY, LAS, LAZ, E57, PCD, XYZ, PTS, TXT, ASC and CSV, and meshes as PLY, OBJ and GLB. Exit status: 0
+    Reads PLY, LAS, LAZ (COPC too), E57, PCD, XYZ, PTS, TXT, ASC and CSV, and meshes as PLY, OBJ and GLB. Exit status: 0
     registered, 3 unregistered, 1 bad input. docs/register.md says how to read what it writes.
 
     Args:

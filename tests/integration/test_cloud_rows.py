@@ -115,7 +115,13 @@ def test_a_cloud_that_is_not_there_is_one_sentence(project, tmp_path, snakemake)
     (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\tyrad.laz\n")
     refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
     assert refused.returncode != 0
-    assert "scenes.tsv, scene 'yard': yrad.laz in the column cloud does not exist" in refused.stdout
+    # Once, and nothing of rules that would make the same file of photos.
+    assert refused.stdout.count("scenes.tsv, scene 'yard': yrad.laz in the column cloud does not exist") == 1
+    assert "is given as a cloud" not in refused.stdout
+    (tmp_path / "scenes.tsv").write_text("scene\tcloud\nyard\thouse.ply\n")
+    (tmp_path / "points.tsv").unlink()
+    refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
+    assert "does not exist" in refused.stdout and "write it with a line `x y z`" in refused.stdout
 
 
 SFM = {"map_scene_photos", "map_object_photos", "undistort_scene_photos", "undistort_object_photos", "align_models"}

@@ -133,10 +133,35 @@ def test_both_kinds_of_file(tmp_path):
 
 
 @pytest.mark.parametrize(
+    "text, names",
+    [
+        ("1 2 3\n4 5 60\n", ["1", "2"]),
+        ("# of the site\n1;2;3\n\n4; 5; 6e1\n", ["1", "2"]),
+        ("1, 2, 3\n4, 5, 60\n", ["1", "2"]),
+        ("1\t2\t3\n4\t5\t60\n", ["1", "2"]),
+        ("x,y,z\n1,2,3\n4,5,60\n", ["1", "2"]),
+        ("point x y z\na 1 2 3\nb  4 5 60\n", ["a", "b"]),
+        ("point,x,y,z\na,1,2,3\nb,4,5,60\n", ["a", "b"]),
+    ],
+)
+def test_scene_points_as_other_programs_write_them(tmp_path, text, names):
+    path = tmp_path / "f.txt"
+    path.write_text(text)
+    points = read_points(path)
+    assert isinstance(points, ScenePoints) and points.points == names
+    np.testing.assert_array_equal(points.positions, [[1, 2, 3], [4, 5, 60]])
+
+
+@pytest.mark.parametrize(
     "text, sentence",
     [
         ("", "has to begin with the tab-separated header"),
-        ("point x y z\na 1 2 3\n", "has to begin with the tab-separated header"),
+        ("name x y z\na 1 2 3\n", "has to begin with the tab-separated header"),
+        ("point photo x_px y_px\na 1.jpg 2 3\n", "separate its columns by tabs"),
+        ("1 2 3\n4 5\n", "line 2: expected x y z, got '4 5'; or give a header"),
+        ("1 2 3\n4 5 nan\n", "line 2: expected x y z"),
+        ("1 2 3 4\n", "line 1: expected x y z"),
+        ("x y z\n", "holds no points below its header"),
         ("point\tx\ty\tz\n", "holds no points below its header"),
         ("point\tx\ty\tz\na\t1\t2\n", "line 2: expected point x y z separated by tabs, got 'a 1 2'"),
         ("point\tx\ty\tz\na\t1\t2\tnan\n", "line 2"),

@@ -187,7 +187,7 @@ def test_longitude_and_latitude_without_a_word_are_refused(tmp_path, cloud):
 @pytest.mark.parametrize(
     "name, content, sentence",
     [
-        ("a.xyz", "", "holds no points"),
+        ("a.xyz", "", r"is empty \(0 bytes\)"),
         ("a.xyz", "1 2 3\n" * 300, "only 1 different positions among its 300 points; 200 or more are needed"),
         ("a.xyz", "nan nan nan\n" * 300, "no point with a finite position"),
         ("a.dwg", "", r"'\.dwg' is no known ending"),

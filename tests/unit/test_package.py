@@ -178,6 +178,17 @@ def test_an_empty_project_says_what_is_missing(installed, tmp_path):
     )
 
 
+def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for name in ("Häuschen neu.ply", "site.laz"):
+        Path(name).write_bytes(b"cloud")
+    init(Path("new"), scene=Path("site.laz"), objects=(Path("Häuschen neu.ply"),))
+    said = capsys.readouterr().out
+    assert "Häuschen neu.ply is called Hauschen_neu in the tables and results; names hold only" in said
+    assert "site.laz is called site in the tables and results\n" in said
+    assert "Hauschen_neu\tsite\t" in Path("new/config/objects.tsv").read_text()
+
+
 @pytest.mark.parametrize("words", [("run", "-n"), ("pick", "--object", "house")])
 def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, words):
     status, output = scenefuse(*words, cwd=tmp_path)
@@ -191,6 +202,10 @@ def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, wor
         ({"folder": Path("file")}, "file exists already"),
         ({"folder": Path("new"), "scene": Path("nowhere")}, "nowhere does not exist"),
         ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
+        ({"folder": Path("new"), "scene": Path("taken")}, "taken holds no photos"),
+        ({"folder": Path("new"), "scene": Path("walk.mp4")}, "walk.mp4 is not a folder of photos nor a cloud"),
+        ({"folder": Path("new"), "objects": (Path("code.py"),)}, "code.py is not a folder of photos, a video nor a cloud"),
+        ({"folder": Path("new"), "objects": (Path("empty.ply"),)}, "empty.ply is empty"),
     ],
 )
 def test_a_project_that_cannot_be_made_is_one_sentence(tmp_path, monkeypatch, options, words):
@@ -198,7 +213,8 @@ def test_a_project_that_cannot_be_made_is_one_sentence(tmp_path, monkeypatch, op
     for folder in ("taken", "a/x", "b/x"):
         Path(folder).mkdir(parents=True)
     Path("taken/README.md").touch()
-    Path("file").touch()
+    for name in ("file", "walk.mp4", "code.py", "empty.ply"):
+        Path(name).touch()
     with pytest.raises(StageError, match=words):
         init(**options)
     assert not Path("new").exists()

@@ -112,9 +112,12 @@ def own_file(kind, name, column):
     """The file or folder that the user names in a cell, in a list; none where the cell is empty."""
     path = (scene_row if kind == "scene" else object_row)(name).get(column)
     if path and not (made_here(path) or Path(path).exists()):
+        click = f"click them with scenefuse pick --object {name} (docs/clicking.md)"
+        if column == "fiducials" and object_row(name)["scene"] in CLOUD_SCENES:
+            click = "write it with a line `x y z` for each of at least four points around the object"
         advice = {
-            "prompts": f"; click them with scenefuse pick --object {name} (docs/clicking.md), or correct the path",
-            "fiducials": f"; click them with scenefuse pick --object {name} (docs/clicking.md), or leave the cell empty",
+            "prompts": f"; {click}, or correct the path",
+            "fiducials": f"; {click}, or leave the cell empty",
         }
         raise WorkflowError(
             f"{config[f'{kind}s']}, {kind} '{name}': {path} in the column {column} does not exist (relative paths"
