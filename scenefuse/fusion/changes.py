@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from scenefuse.fusion.evidence import FIELDS, KEPT, MEASURED, unchecked
 from scenefuse.io.clouds import Cloud, concatenate
+from scenefuse.io.formats import LAS_DIMENSIONS
 from scenefuse.io.tiles.tiled_cloud import Rows, TiledCloud, open_cloud
 from scenefuse.transforms import Array
 
@@ -35,7 +36,7 @@ class Changes:
     fields: dict[str, NDArray[Any]]
 
     def left_of(self, rows: Rows, cloud: Cloud) -> Cloud:
-        """What is left of some points of the scene, with fields of evidence and `source` 0.
+        """What is left of some points of the scene, with fields of evidence, `source` 0, and what LAS knows of them.
 
         Args:
             rows: (N,) rising, of these points in the scene's cloud.
@@ -48,6 +49,7 @@ class Changes:
         at = at[there]
         for name, values in self.fields.items():
             part.fields[name][at] = values[mine][there]
+        part.fields.update({name: cloud.fields[name] for name in LAS_DIMENSIONS if name in cloud.fields})
         kept[at] = ~self.removed[mine][there]
         return part[kept]
 

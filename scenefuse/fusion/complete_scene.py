@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.fusion.changes import Changes, added_by, merged, read_changes, with_source
 from scenefuse.io.clouds import Cloud, records_of, spacing
+from scenefuse.io.formats import LAS_DIMENSIONS
 from scenefuse.io.tiles.copc import write_copc
 from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
 from scenefuse.io.tiles.write_tiles import reserved
@@ -116,12 +117,18 @@ def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) 
 
 
 def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
-    """A cloud with only the columns that another has; normals and colours that only the object has are left out."""
+    """A cloud with only the columns that another has; normals and colours that only the object has are left out, and
+    classes and intensities that only the scene has are 0."""
     return replace(
         cloud,
         normals=None if like.normals is None else cloud.normals,
         colors=None if like.colors is None else cloud.colors,
-        fields={name: cloud.fields[name] for name in like.fields},
+        fields={
+            name: np.zeros(len(cloud), values.dtype)
+            if name in LAS_DIMENSIONS and name not in cloud.fields
+            else cloud.fields[name]
+            for name, values in like.fields.items()
+        },
     )
 
 

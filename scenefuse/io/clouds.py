@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from scenefuse.io.formats import COLOR, NORMAL, POSITION, Columns, bytes_of, read_columns
+from scenefuse.io.formats import COLOR, LAS_DIMENSIONS, NORMAL, POSITION, Columns, bytes_of, read_columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 
@@ -26,6 +26,14 @@ LAS_DESCRIPTIONS = {
     "evidence": "1 measured; 0, 2, 3 not (README)",
 }
 """What fields mean, in the header of a LAS file: 32 bytes at most."""
+
+
+FAR = 10.0
+"""Sizes of a cloud; what lies so far from it is none of it."""
+
+
+SINGLE_STEP = 0.25
+"""Of the spacing of points, from which the steps of single precision show."""
 
 
 @dataclass(frozen=True)
@@ -187,10 +195,37 @@ def read_counted(path: Path) -> tuple[Cloud, int]:
 
 def finite_rows(columns: Columns) -> tuple[Columns, int]:
     """The rows with a finite position, and how many were left out."""
-    finite = np.isfinite([columns[k] for k in POSITION]).all(0)
-    if finite.all():
+    return chosen_rows(columns, np.isfinite(np.stack([columns[k] for k in POSITION])).all(0))
+
+
+def chosen_rows(columns: Columns, chosen: NDArray[np.bool_]) -> tuple[Columns, int]:
+    """Some rows (a mask (N,)), and how many are left out."""
+    if chosen.all():
         return columns, 0
-    return {name: values[finite] for name, values in columns.items()}, int(np.sum(~finite))
+    return {name: values[chosen] for name, values in columns.items()}, int(np.sum(~chosen))
+
+
+def at_nothing(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """(N,) which points (N, 3) are 0 0 0 while all but strays lie far from there: scanners write so what returned
+    nothing."""
+    nothing = (points == 0).all(1)
+    if not nothing.any() or nothing.all():
+        return np.zeros(len(points), bool)
+    low, high = np.percentile(points[~nothing], [1, 99], axis=0)
+    away = np.linalg.norm(np.maximum(np.maximum(low, -high), 0))
+    return nothing & (away > FAR * np.linalg.norm(high - low))
+
+
+def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list[str]:
+    """What to say of coordinates in single precision, whose steps are not small beside the spacing `step`."""
+    farthest = float(np.abs(points).max(initial=0))
+    coarse = float(np.spacing(np.float32(farthest)))
+    if coarse < SINGLE_STEP * step or not (points == points.astype(np.float32)).all():
+        return []
+    return [
+        f"{path.name} has coordinates up to {farthest:.6g} in single precision, which knows them in steps of"
+        f" {coarse:.3g}, and its points are {step:.3g} apart: export it in double precision, or shifted to near zero"
+    ]
 
 
 def cloud_of(columns: Columns, most_color: float | None = None) -> Cloud:
@@ -279,8 +314,12 @@ class LasLayout:
         header.global_encoding.wkt = True  # LAS 1.4 asks it of these columns, with or without a CRS
         if crs is not None:
             header.add_crs(pyproj.CRS.from_user_input(crs))
-        names = _file_names(path, list(like.fields), set(header.point_format.dimension_names))
-        for name, values in like.fields.items():
+        # Classes and intensities of LAS stay what they are; of other fields none takes their names.
+        own = [name for name, kind in LAS_DIMENSIONS.items() if name in like.fields and like.fields[name].dtype == kind]
+        further = [name for name in like.fields if name not in own]
+        names = dict(zip(own, own)) | _file_names(path, further, set(header.point_format.dimension_names))
+        for name in further:
+            values = like.fields[name]
             kind = f"{values.dtype.kind}{values.dtype.itemsize}"
             header.add_extra_dim(laspy.ExtraBytesParams(names[name], kind, LAS_DESCRIPTIONS.get(name, "")))
         return cls(header, names, origin)

@@ -22,12 +22,23 @@ from scenefuse.stage import StageError
 Columns = dict[str, NDArray[Any]]
 
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+# What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
+LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
+# Classes of LAS that are no surface: low and high noise.
+NOISE = (7, 18)
 # What other programs call the same columns, in lower case and without spaces, dots and underscores.
 OTHER_NAMES = {
     **dict(zip(("normalx", "normaly", "normalz"), NORMAL)),
     **dict(zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), COLOR * 3)),
 }
 
+TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
+# What surveyors call the columns of text, in lower case.
+EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
+NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
+ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
+# By how much the better of two places for the colours among a text's columns has to be.
+CLEARLY = 0.1
 # Points of a LAS file that are looked at for what they say beside positions and colours.
 LOOKED_AT = 1_000_000
 # Narrower than this share of its height, a cloud at coordinates like longitude and latitude is in degrees.
@@ -135,6 +146,21 @@ def check_not_degrees(path: Path, points: NDArray[np.float64]) -> None:
         )
 
 
+def las_noise(path: Path) -> NDArray[np.bool_] | None:
+    """(N,) which points of a LAS or LAZ file are classed as noise or withheld; None where none is, and for others."""
+    if path.suffix.lower() not in (".las", ".laz"):
+        return None
+    import laspy
+
+    with readable(path), laspy.open(path) as file:
+        parts = [
+            np.isin(np.asarray(part.classification), NOISE) | (np.asarray(part.withheld) != 0)
+            for part in file.chunk_iterator(LOOKED_AT)
+        ]
+    noise = np.concatenate(parts) if parts else np.zeros(0, bool)
+    return noise if noise.any() else None
+
+
 def las_dimensions(path: Path) -> list[str]:
     """What a LAS or LAZ file says of its points beside position, colour and extra dimensions, as far as it differs
     among the first million or is a class: names of the format; empty for any other file."""
@@ -198,14 +224,14 @@ def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
 
 def _las(path: Path) -> Columns:
     """Positions, colours (unless all are black, which means none), and extra dimensions of one number."""
-    columns = _joined(_las_parts(path, -1))
+    columns = {name: values for name, values in _joined(_las_parts(path, -1)).items() if name not in LAS_DIMENSIONS}
     if set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR):
         columns = {name: values for name, values in columns.items() if name not in COLOR}
     return columns
 
 
 def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
-    """The same, so many points at a time, and black colours too."""
+    """The same, so many points at a time, with classes and intensities, and black colours too."""
     import laspy
 
     with laspy.open(path) as file:
@@ -214,9 +240,12 @@ def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
         for points in file.chunk_iterator(at_once):
             count += len(points)
             extra = {name: np.asarray(points[name]) for name in form.extra_dimension_names}
-            yield {name: np.asarray(points[name]) for name in named} | {
-                name: values for name, values in extra.items() if values.ndim == 1
-            }
+            own = {name: np.asarray(points[name]).astype(kind) for name, kind in LAS_DIMENSIONS.items()}
+            yield (
+                {name: np.asarray(points[name]) for name in named}
+                | own
+                | {name: values for name, values in extra.items() if values.ndim == 1 and name not in own}
+            )
         if count < file.header.point_count:
             missing = file.header.point_count - count
             raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
@@ -376,9 +405,10 @@ def _lzf(packed: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
 def _text(path: Path) -> Columns:
     """Rows of numbers, separated by blanks, commas or semicolons, below any number of other lines.
 
-    A line above the rows that names the columns (`//X Y Z R G B`) is believed. Without one, the first three columns are
-    x, y, z and each three that follow are normals if they have unit length, else colours; PTS may have an intensity
-    between. A first column that names or numbers the points is left out, and so is what follows: that is printed.
+    A line above the rows that names the columns (`//X Y Z R G B`, `Point,Northing,Easting,Elevation`) is believed.
+    Without one, the first three columns are x, y, z and each three that follow are normals if they have unit length,
+    else colours, if they can be; an intensity may stand before or behind these. A first column that names or numbers
+    the points is left out, and so is what follows: that is printed.
     """
     with open(path, encoding="utf-8-sig") as file:
         head = list(islice(file, 50))
@@ -388,30 +418,76 @@ def _text(path: Path) -> Columns:
     separator = _separator(head[above])
     # A name counts as a number, so that rows of another length are still an error.
     first_cell: Any = {0: lambda name: 0.0} if named else None
-    rows = np.loadtxt(path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", converters=first_cell)
+    rows = np.loadtxt(
+        path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", converters=first_cell,
+        comments=None if named else "#",
+    )  # fmt: skip
     titles = head[above - 1].strip(" \t\r\n/#").split(separator) if above else []
     names = [title.strip().strip("\"'") for title in titles]
-    if len(names) == rows.shape[1] and set(POSITION) <= {_common_name(name) for name in names}:
-        return dict(zip(names, rows.T))
+    if len(names) == rows.shape[1]:
+        if set(POSITION) <= {_common_name(name) for name in names}:
+            return dict(zip(names, rows.T))
+        axes = [[name for name in names if name.lower() in known] for known in (EASTING, NORTHING, ELEVATION)]
+        if all(len(found) == 1 for found in axes):
+            own = {found[0]: axis for axis, found in zip(POSITION, axes)}
+            print(f"{path.name}: {', '.join(f'{axis} is {name}' for name, axis in own.items())}", flush=True)
+            return {own.get(name, name): values for name, values in zip(names, rows.T) if not named or name != names[0]}
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
     if named or _numbers_points(rows):
         rows = rows[:, 1:]
         print(f"{path.name}: its first column names or numbers the points and is left out", flush=True)
+    if names and len(names) in (rows.shape[1], rows.shape[1] + 1) and above:
+        print(f"{path.name}: '{head[above - 1].strip()[:60]}' names no columns x, y, z; the first three are these")
     columns, start = dict(zip(POSITION, rows.T)), 3
-    if path.suffix.lower() == ".pts" and rows.shape[1] % 3 == 1:
-        columns["intensity"], start = rows[:, 3], 4
+    if rows.shape[1] % 3 == 1 and rows.shape[1] > 4:
+        start = _colors_at(path, rows)
+        columns |= {"intensity": rows[:, 3]} if start == 4 else {}
     for first in range(start, rows.shape[1] - 2, 3):
         three = rows[:, first : first + 3]
         unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
         kind = NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR
-        if kind[0] in columns:
+        if kind[0] in columns or (kind == COLOR and not _may_be_colors(three)):
             break
         columns |= dict(zip(kind, three.T))
     if further := rows.shape[1] - len(columns):
-        print(f"{path.name}: its last {further} columns have no names and are left out", flush=True)
+        print(f"{path.name}: {further} of its columns have no names and are left out", flush=True)
     return columns
+
+
+def _may_be_colors(three: NDArray[np.float64]) -> bool:
+    """Whether (N, 3) lie in a range of colours; coordinates, times and directions mostly do not."""
+    three = three[np.isfinite(three).all(1)]
+    return bool(three.min(initial=0) >= 0 and three.max(initial=0) <= 65535)
+
+
+def _colors_at(path: Path, rows: NDArray[np.float64]) -> int:
+    """Where the colours begin among (N, C) columns of which one is an intensity: 3, or 4 where it stands before them.
+
+    The file does not say. Colours are alike, red and blue most like green; where both places are possible, and neither
+    is clearly the better one, they are at none: C.
+    """
+    if path.suffix.lower() == ".pts":
+        return 4
+    finite = rows[np.isfinite(rows).all(1)]
+    places = [first for first in (3, 4) if _may_be_colors(finite[:, first : first + 3])]
+    whole = [first for first in places if (finite[:, first : first + 3] == np.rint(finite[:, first : first + 3])).all()]
+    places = whole if len(whole) == 1 else places
+    lengths = {first: np.linalg.norm(finite[:, first : first + 3], axis=1) for first in (3, 4)}
+    unit = [first for first, length in lengths.items() if (np.abs(length - 1) < 0.02).all()]
+    if len(unit) == 1 or len(places) == 1:
+        return (unit or places)[0]
+    varying = len(places) == 2 and len(finite) > 1 and (np.ptp(finite[:, 3:7], axis=0) > 0).all()
+    alike = np.array(np.corrcoef(finite[:, 3:7].T)) if varying else np.zeros((4, 4))
+    behind, before = min(alike[0, 1], alike[1, 2]), min(alike[1, 2], alike[2, 3])
+    if abs(before - behind) > CLEARLY:
+        first = 4 if before > behind else 3
+        said = f"columns {first + 1} to {first + 3} are taken for red, green and blue"
+    else:
+        first, said = rows.shape[1], "which columns are colours cannot be told, and none are read"
+    print(f"{path.name}: {said}; name the columns in a first line (x y z intensity r g b) if this is wrong", flush=True)
+    return first
 
 
 def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
@@ -482,5 +558,5 @@ READERS = {
     ".laz": _las,
     ".e57": _e57,
     ".pcd": _pcd,
-    **dict.fromkeys((".xyz", ".pts", ".txt", ".asc", ".csv"), _text),
+    **dict.fromkeys(TEXTS, _text),
 }

@@ -1,14 +1,33 @@
 """A user's cloud or mesh in the place of photos: a scene's dense cloud, or an object's."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefuse.io.clouds import Cloud, cloud_of, concatenate, finite_rows, spacing, write_cloud
-from scenefuse.io.formats import COLOR, check_not_degrees, las_crs, las_dimensions
+from scenefuse.io.clouds import (
+    Cloud,
+    at_nothing,
+    chosen_rows,
+    cloud_of,
+    concatenate,
+    finite_rows,
+    precision_note,
+    spacing,
+    write_cloud,
+)
+from scenefuse.io.formats import (
+    COLOR,
+    LAS_DIMENSIONS,
+    NOISE,
+    POSITION,
+    Columns,
+    check_not_degrees,
+    las_crs,
+    las_dimensions,
+)
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
 from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled
@@ -34,7 +53,8 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
-        cloud: output PLY in the scene's frame, tile by tile (`open_cloud`); however large, it is never all in memory.
+        cloud: output PLY in the scene's frame, tile by tile (`open_cloud`), with classes and intensities of LAS;
+            however large, it is never all in memory.
         report: output JSON: points, spacing, notes.
         georeference_json: output JSON: `crs` (null where the file names none), `length_unit`, `origin_in_crs` and
             `crs_from_scene`, the shift back into the file's coordinates.
@@ -44,7 +64,7 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
             too few different points.
     """
     parts = columns_in_parts(source)
-    own = survey(source, parts)
+    own = survey(source, parts, LAS_DIMENSIONS)
     check_not_degrees(source, own.sample)
     crs = las_crs(source)
     unit, name = "scene units", None
@@ -105,36 +125,48 @@ class Survey:
 
     Attributes:
         count: of the rows with a finite position.
-        left_out: rows without.
+        left_out: why rows were left out -> how many.
         sample: (S, 3) positions of every so manyth of them: of all up to SAMPLE.
         unit_normals: whether there are normals, all of unit length; None where there are none.
         most_color: the greatest colour; None where there are none.
+        is_las: whether the file is LAS or LAZ.
+        kept: names of further columns that are taken over.
         unused: names of further columns.
     """
 
     count: int
-    left_out: int
+    left_out: dict[str, int]
     sample: Array
     unit_normals: bool | None
     most_color: float | None
+    is_las: bool
+    kept: tuple[str, ...]
     unused: list[str]
 
 
-def survey(source: Path, parts: ColumnParts) -> Survey:
+def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Survey:
     """Go through a file once.
+
+    Args:
+        source: the file.
+        parts: its columns.
+        keep: dimensions of LAS to take over, where the file says something by them.
 
     Raises:
         StageError: it is damaged, or has too few different points.
     """
-    count, left_out, every, sample = 0, 0, 1, np.zeros((0, 3))
-    unit_normals, most_color, unused = None, None, set[str]()
+    known = set(LAS_DIMENSIONS) if source.suffix.lower() in (".las", ".laz") else set()
+    count, left_out, every, sample = 0, dict[str, int](), 1, np.zeros((0, 3))
+    unit_normals, most_color, unused, kept = None, None, set[str](), set[str]()
     for columns in parts():
-        columns, without = finite_rows(columns)
+        columns, without = _usable(columns, bool(known))
+        left_out = {why: left_out.get(why, 0) + rows for why, rows in without.items()}
         part = cloud_of(columns)
         sample = np.concatenate([sample, part.points[-count % every :: every]])
         while len(sample) > 2 * SAMPLE:
             sample, every = sample[::2], 2 * every
-        count, left_out, unused = count + len(part), left_out + without, unused | set(part.fields)
+        count, unused = count + len(part), unused | (set(part.fields) - known)
+        kept |= {name for name in known.intersection(keep) - kept if part.fields[name].any()}
         if part.normals is not None:
             off = np.abs(np.linalg.norm(part.normals, axis=1) - 1) > UNIT_TOLERANCE
             unit_normals = unit_normals is not False and not off.any()
@@ -142,9 +174,9 @@ def survey(source: Path, parts: ColumnParts) -> Survey:
             here = max(float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0)) for name in COLOR)
             most_color = max(here, most_color or 0.0)
     if count == 0:
-        what = "point with a finite position" if left_out else "points"
+        what = "point with a finite position" if any(left_out.values()) else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
-    unused |= set(las_dimensions(source))
+    unused = (unused | set(las_dimensions(source))) - kept
     different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
     if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
         raise StageError(
@@ -153,17 +185,31 @@ def survey(source: Path, parts: ColumnParts) -> Survey:
         )
     if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
         most_color = None  # Formats with colours are used for points without, which are black then.
-    return Survey(count, left_out, sample, unit_normals, most_color, sorted(unused - {""}))
+    names = tuple(sorted(kept)), sorted(unused - {""})
+    return Survey(count, left_out, sample, unit_normals, most_color, bool(known), *names)
+
+
+def _usable(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
+    """The rows that are points of a surface, and why others were left out -> how many."""
+    without = dict[str, int]()
+    columns, without["rows without a finite position"] = finite_rows(columns)
+    points = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
+    columns, without["points at 0 0 0, far from all others,"] = chosen_rows(columns, ~at_nothing(points))
+    if is_las:
+        columns, noise = chosen_rows(columns, ~np.isin(columns["classification"], NOISE))
+        without[f"points of the classes {NOISE[0]} and {NOISE[1]} (noise)"] = noise
+    return columns, without
 
 
 def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
-    """The file's points in parts, with unit normals or none, colours as bytes or none, and no further fields."""
+    """The file's points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
     for columns in parts():
-        cloud = cloud_of(finite_rows(columns)[0], own.most_color)
+        cloud = cloud_of(_usable(columns, own.is_las)[0], own.most_color)
         normals = None
         if own.unit_normals and cloud.normals is not None:
             normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
-        yield Cloud(cloud.points, normals, None if own.most_color is None else cloud.colors)
+        colors = None if own.most_color is None else cloud.colors
+        yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in own.kept})
 
 
 def write_placed(
@@ -191,7 +237,8 @@ def write_placed(
 
 def import_report(source: Path, own: Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
     """What was taken over, and what became of the rest; printed too."""
-    notes = [f"{own.left_out} rows without a finite position were left out"] if own.left_out else []
+    notes = [f"{count} {why} were left out" for why, count in own.left_out.items() if count]
+    notes += precision_note(source, own.sample, step)
     if own.unit_normals is False:
         notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
     if own.unused:

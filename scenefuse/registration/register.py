@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.formats import TEXTS
 from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
@@ -281,7 +282,7 @@ def _unit(flag: str, direction: Direction | None) -> Array | None:
 
 def _fiducials(path: Path) -> tuple[list[str], Array]:
     """Names and positions (F, 3) of marked points in the scene's coordinates."""
-    if path.suffix.lower() != ".tsv":
+    if path.suffix.lower() not in (".tsv", *TEXTS):
         points = read_cloud(path).points
         return [str(number) for number in range(1, len(points) + 1)], points
     marked = read_points(path)

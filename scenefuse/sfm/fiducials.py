@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +21,6 @@ CLICK_COLUMNS = ["point", "photo", "x_px", "y_px"]
 POINT_COLUMNS = ["point", "x", "y", "z"]
 LABEL_COLUMNS = ["label", "photo", "x_px", "y_px"]
 LABELS = ("inside", "outside", "box")
-# Between the columns of points in the scene, which have no names with spaces.
-SEPARATORS = re.compile(r"\s*[,;]\s*|\s+")
 
 
 @dataclass(frozen=True)
@@ -79,15 +76,15 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     """Read a tab-separated file of clicks (point, photo, x_px, y_px), scene points (point, x, y, z) or labelled
     pixels (label, photo, x_px, y_px).
 
-    Scene points may be separated by spaces, commas or semicolons too; without a header, or with `x y z`, a
-    line is x y z, and the points are called 1, 2, ... in their order.
+    Scene points may be separated by semicolons, commas or spaces too; without a header, or with `x y z`, a
+    line is x y z, perhaps behind a name, and points without one are called 1, 2, ... in their order.
 
     Raises:
         StageError: the file is missing or empty, its header is none of these, or a line is not well formed.
     """
     rows = read_cells(path)
-    loose = [(number, SEPARATORS.split(" ".join(cells).strip())) for number, cells in rows]
-    if loose and (_all_numbers(loose[0][1]) or loose[0][1] == POINT_COLUMNS[1:]):
+    loose = [(number, _words(cells)) for number, cells in rows]
+    if loose and (_is_point(loose[0][1]) or loose[0][1] == POINT_COLUMNS[1:]):
         return _bare_points(path, loose[loose[0][1] == POINT_COLUMNS[1:] :])
     if loose and loose[0][1] == POINT_COLUMNS:
         rows = loose if len(rows[0][1]) == 1 else rows
@@ -98,7 +95,7 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
             f"{path}: separate its columns by tabs (one between two columns); names of photos may hold spaces"
             if spaced
             else f"{path} has to begin with the tab-separated header 'point photo x_px y_px' or 'point x y z' or "
-            f"'label photo x_px y_px', not with '{' '.join(header)}'"
+            f"'label photo x_px y_px', not with '{' '.join(header)}'{comma_advice(loose[0][1] if loose else [])}"
         )
     if len(rows) == 1:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
@@ -114,22 +111,37 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
     return Clicks(path, [n[0] for n in names], [n[1] for n in names], np.array(numbers))
 
 
-def _all_numbers(words: list[str]) -> bool:
+def _words(cells: list[str]) -> list[str]:
+    """The cells of a line that tabs do not separate, by semicolons, commas or blanks."""
+    if len(cells) > 1:
+        return cells
+    mark = next((mark for mark in ";," if mark in cells[0]), None)
+    return [word.strip() for word in cells[0].split(mark)]
+
+
+def _is_point(words: list[str]) -> bool:
+    """Whether a line is x y z, perhaps behind a name."""
     try:
-        return len(words) > 1 and bool(np.isfinite([float(word) for word in words]).all())
+        return len(words) in (3, 4) and bool(np.isfinite([float(word) for word in words[-3:]]).all())
     except ValueError:
         return False
 
 
 def _bare_points(path: Path, rows: list[tuple[int, list[str]]]) -> ScenePoints:
-    """Points without names, numbered."""
+    """Points of lines below which header there was; those without a name are numbered."""
     if not rows:
         raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
     for number, words in rows:
-        if len(words) != 3 or not _all_numbers(words):
-            raise StageError(f"{path}, line {number}: expected x y z, got '{' '.join(words)}'; or give a header")
-    positions = np.array([[float(word) for word in words] for _, words in rows])
-    return ScenePoints(path, [str(index) for index in range(1, len(rows) + 1)], positions)
+        if not _is_point(words):
+            raise StageError(
+                f"{path}, line {number}: expected x y z, perhaps behind a name, got '{' '.join(words)}'"
+                f"{comma_advice(words)}"
+            )
+    names = [words[0] if len(words) == 4 else str(index) for index, (_, words) in enumerate(rows, 1)]
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"{path}: {twice} is given more than once; keep one line of it")
+    return ScenePoints(path, names, np.array([[float(word) for word in words[-3:]] for _, words in rows]))
 
 
 def _split(

@@ -9,8 +9,8 @@ import numpy as np
 import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.io.formats import check_not_degrees, las_crs
+from scenefuse.io.clouds import Cloud, at_nothing, precision_note, read_cloud, spacing, write_cloud, write_laz
+from scenefuse.io.formats import check_not_degrees, las_crs, las_noise
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
@@ -32,6 +32,8 @@ REGISTERED, UNREGISTERED = 0, 3
 NOTHING = Known()
 # An object may be so many times as large as the part of the scene that shows it.
 LARGEST = 10.0
+# And has to be at least so many times as large as its points are apart.
+SMALLEST = 10.0
 OUTPUTS = (
     *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
     *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
@@ -48,6 +50,7 @@ class Given:
         scene: the whole scene's, likewise.
         part: the scene's points among which the object is looked for.
         searched: what that part is, in words.
+        notes: what a user should know of the files.
         ups: unit up directions in the object's and the scene's coordinates; None where one is not known.
     """
 
@@ -55,6 +58,7 @@ class Given:
     scene: Cloud
     part: Cloud
     searched: str
+    notes: list[str]
     ups: tuple[Array, Array] | None
 
 
@@ -93,7 +97,7 @@ def register(
     scales = known.scales()
     _clear(out, [object, scene, *(path for path in (known.fiducials, config) if path)])
     given = _read(object, scene, settings, known)
-    notes = _notes(object, scene)
+    notes = given.notes
     for note in notes:
         print(f"note       {note}", flush=True)
     if scales is not None:
@@ -150,15 +154,32 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     cloud, whole = read_cloud(object), read_cloud(scene)
     for path, points in ((object, cloud.points), (scene, whole.points)):
         check_not_degrees(path, points)
+    notes = _notes(object, scene)
     crs = las_crs(scene)
     if crs is not None:
         from scenefuse.io.crs import check_place
 
         check_place(crs, whole.points, scene)
     box = None if known.crop_box is None else np.array(known.crop_box)
-    part, searched = cut_scene(whole, settings.crop, up_scene, known.fiducials, box)
+    cloud, surface = _surface(object, cloud, notes), _surface(scene, whole, notes)
+    if scene.suffix.lower() not in (".las", ".laz"):  # which are copied row by row
+        whole = surface
+    part, searched = cut_scene(surface, settings.crop, up_scene, known.fiducials, box)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
-    return Given(cloud, whole, part, searched, ups)
+    return Given(cloud, whole, part, searched, notes, ups)
+
+
+def _surface(path: Path, cloud: Cloud, notes: list[str]) -> Cloud:
+    """The points of a file that are of a surface; notes on the others are added."""
+    nothing, noise = at_nothing(cloud.points), las_noise(path)
+    odd = {"points at 0 0 0, far from all others,": nothing}
+    odd |= {} if noise is None else {"points classed as noise, or withheld,": noise}
+    notes += [f"{mask.sum()} {why} of {path} are not used" for why, mask in odd.items() if mask.any()]
+    used = cloud[~np.logical_or.reduce(list(odd.values()))]
+    if not len(used):
+        raise StageError(f"all points of {path} are classed as noise, or withheld; give its surface")
+    notes += precision_note(path, used.points, spacing(used.points))
+    return used
 
 
 def _notes(object: Path, scene: Path) -> list[str]:
@@ -196,12 +217,15 @@ def write_matrix(path: Path, pose: Sim3) -> None:
 
 
 def _check_size(scales: ScaleRange, given: Given) -> None:
-    """StageError where the object would be much larger than the part of the scene that shows it."""
-    most, part = scales.centre * float(np.exp(scales.width)), given.part.diagonal
-    if most * given.object.diagonal > LARGEST * part:
+    """StageError where the object would be much larger than the part of the scene that shows it, or lost between its
+    points."""
+    most, part, step = scales.centre * float(np.exp(scales.width)), given.part.diagonal, spacing(given.part.points)
+    across = most * given.object.diagonal
+    if across > LARGEST * part or across < SMALLEST * step:
         raise StageError(
-            f"at a scale of {most:.4g} the object would be {most * given.object.diagonal:.4g} across, and the searched"
-            f" part of the scene is {part:.4g}; correct --scale or --scale-range: scene units per object unit"
+            f"at a scale of {most:.4g} the object would be {across:.4g} across, and the searched part of the scene is"
+            f" {part:.4g}, its points {step:.4g} apart; correct --scale or --scale-range: scene units per object unit"
+            " (1000 from metres to millimetres)"
         )
 
 

@@ -10,8 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
+from scipy import ndimage
 
-from scenefuse.demo.prompts import PromptSettings, clicks_on
+from scenefuse.demo.prompts import PromptSettings, clicks_on, random_misses
 from scenefuse.io.mask_files import mask_files
 from scenefuse.io.pictures import read_mask
 from scenefuse.io.settings import build, read_settings
@@ -28,6 +29,8 @@ from scenefuse.workspace import Workspace, read_workspace
 
 RIGHT = 0.97
 """IoU from which a mask is right."""
+LEAST_PART_PX = 10.0
+"""A part whose middle is nearer to its rim is not clicked: clicks miss by up to as much."""
 
 
 class Remembering:
@@ -71,6 +74,7 @@ def clicked_masks(
     photos: int = 10,
     clicks: int = 5,
     box: bool = False,
+    part: bool = False,
     wrong: tuple[str, ...] = (),
     config: Path | None = None,
 ) -> None:
@@ -87,6 +91,8 @@ def clicked_masks(
         photos: how many photos to click in, spread evenly.
         clicks: how many times to click in each.
         box: three clicks inside and the corners of a box in the place of five inside.
+        part: the last click inside is in the middle of the thickest of the smaller parts, as docs/clicking.md asks for
+            a click on each part.
         wrong: photos whose true mask is wrong.
         config: settings file of the capture; the shipped settings without one.
 
@@ -102,7 +108,7 @@ def clicked_masks(
     rows, prompts = [], PromptSettings(inside=3 if box else 5, box=box)
     for name in [names[k] for k in np.linspace(0, len(names) - 1, photos).round().astype(int)]:
         for trial in range(clicks):
-            rows.append(_trial(thing, name, trial, prompts, network, settings))
+            rows.append(_trial(thing, name, trial, prompts, part, network, settings))
             print(" ".join(f"{key} {cell}" for key, cell in rows[-1].items()), flush=True)
     table = pd.DataFrame(rows)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -128,12 +134,30 @@ def _read(folder: Path, truth: Path, wrong: tuple[str, ...]) -> Object:
     )
 
 
+def _smaller_part(mask: Mask) -> Array | None:
+    """The middle (2,) of the thickest part that a disk of half the object's inner radius does not fit into."""
+    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    radius = depth.max() / 2
+    # An opening by the disk; what is left of the large part's rim is thin.
+    opened = ndimage.distance_transform_edt(depth <= radius) < radius
+    rest = np.where(opened, 0, ndimage.distance_transform_edt(np.pad(mask & ~opened, 1))[1:-1, 1:-1])
+    if rest.max() < LEAST_PART_PX:
+        return None
+    row, column = np.unravel_index(rest.argmax(), rest.shape)
+    return np.array([column, row]) + 0.5
+
+
 def _trial(
-    thing: Object, name: str, trial: int, prompts: PromptSettings, network: Any, settings: MaskSettings
+    thing: Object, name: str, trial: int, prompts: PromptSettings, part: bool, network: Any, settings: MaskSettings
 ) -> dict[str, Any]:
     """Masks from one choice of clicks, and how like the true ones they are."""
     rng = np.random.default_rng([trial, *name.encode()])
-    labels, pixels = clicks_on(read_mask(thing.files[Path(name).stem]), prompts, rng)
+    true = read_mask(thing.files[Path(name).stem])
+    labels, pixels = clicks_on(true, prompts, rng)
+    middle = _smaller_part(true) if part else None
+    if middle is not None:
+        miss = random_misses(1, prompts.least_miss_px, prompts.most_miss_px, rng)[0]
+        pixels[prompts.inside - 1] = np.clip(middle + miss, 1.0, np.array(true.shape[::-1]) - 1.0)
     marked = Labels(Path(name), labels, [name] * len(pixels), pixels)
     row: dict[str, Any] = {"photo": name, "trial": trial}
     try:

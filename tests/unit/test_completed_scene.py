@@ -138,6 +138,20 @@ def test_the_copc_file_holds_the_same_points_with_their_sources(tmp_path):
     assert np.array_equal(las["source"][order], whole.fields["source"][other]) and whole.fields["source"].max() == 1
 
 
+def test_classes_and_intensities_of_the_scene_are_in_its_copc_file(tmp_path):
+    scene = strip(0, 20)
+    fields = {"classification": (scene.points[:, 0] < 7).astype(np.uint8) * 6}
+    fields["intensity"] = (100 * scene.points[:, 0]).astype(np.uint16)
+    whole, _ = run(tmp_path, replace(scene, fields=fields), {"left": strip(0.03, 3, 1.54)})
+    las = laspy.read(tmp_path / "completed.copc.laz")
+    added = np.asarray(las["source"]) == 1
+    assert added.any() and not las.classification[added].any() and not las.intensity[added].any()
+    assert np.array_equal(np.asarray(las.classification)[~added] == 6, las.x[~added] < 7)
+    assert np.allclose(np.asarray(las.intensity)[~added], 100 * np.asarray(las.x)[~added], atol=1.01)
+    assert {"classification", "intensity"} <= set(whole.fields)
+    assert not {"classification", "intensity"} & set(las.point_format.extra_dimension_names)
+
+
 def test_a_scene_of_which_nothing_is_left_is_an_error_without_outputs(tmp_path):
     with pytest.raises(StageError, match=r"of .*scene\.ply no point is left, and no object adds any"):
         run(tmp_path, strip(0, 0), {})

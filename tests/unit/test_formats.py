@@ -163,6 +163,50 @@ def test_text_of_any_layout(tmp_path, cloud, ending, above, columns, mark):
     assert found.normals is None or np.array_equal(found.normals, cloud.normals)
 
 
+@pytest.mark.parametrize(("order", "where"), [("pic", "5 to 7"), ("pci", "4 to 6")])
+def test_an_intensity_before_or_behind_the_colours_is_told_from_them(tmp_path, capsys, order, where):
+    rng = np.random.default_rng(0)
+    points, grey = rng.uniform(0, 9, (500, 3)), rng.uniform(30, 220, (500, 1))
+    colors = np.rint(grey + rng.normal(0, 10, (500, 3))).clip(0, 255)
+    parts = {"p": points, "c": colors, "i": np.rint(rng.uniform(0, 255, (500, 1)))}
+    np.savetxt(tmp_path / "a.txt", np.hstack([parts[part] for part in order]), fmt="%.3f")
+    assert np.array_equal(read_cloud(tmp_path / "a.txt").colors, colors)
+    assert f"columns {where} are taken for red, green and blue" in capsys.readouterr().out
+
+
+def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    np.savetxt(tmp_path / "a.txt", np.hstack([rng.uniform(0, 9, (500, 3)), rng.integers(0, 255, (500, 4))]), fmt="%.3f")
+    assert read_cloud(tmp_path / "a.txt").colors is None
+    assert "which columns are colours cannot be told" in capsys.readouterr().out
+    np.savetxt(tmp_path / "b.txt", np.hstack([rng.uniform(0, 9, (500, 3)), rng.normal(0, 99, (500, 3))]), fmt="%.3f")
+    assert read_cloud(tmp_path / "b.txt").colors is None
+    assert "3 of its columns have no names and are left out" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("header", "row"),
+    [
+        ("Northing,Easting,Elevation", "{y},{x},{z}"),
+        ("Point,Northing,Easting,Elevation,Code", "{k},{y},{x},{z},7"),
+        ("Punkt;Rechtswert;Hochwert;Höhe", "P{k};{x};{y};{z}"),
+        ("E N H", "{x} {y} {z}"),
+    ],
+)
+def test_columns_by_their_surveyors_names(tmp_path, capsys, header, row):
+    points = np.random.default_rng(0).uniform(100, 900, (20, 3)).round(3)
+    lines = [row.format(k=k, x=x, y=y, z=z) for k, (x, y, z) in enumerate(points.tolist(), 1)]
+    (tmp_path / "a.csv").write_text("\n".join([header, *lines]))
+    assert np.array_equal(read_cloud(tmp_path / "a.csv").points, points)
+    assert "y is " in capsys.readouterr().out
+
+
+def test_a_header_that_is_not_understood_is_named(tmp_path, capsys):
+    (tmp_path / "a.csv").write_text("left,right,up\n1,2,3\n4,5,6\n")
+    assert read_cloud(tmp_path / "a.csv").points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert "'left,right,up' names no columns x, y, z; the first three are these" in capsys.readouterr().out
+
+
 def test_rows_that_are_not_finite_are_dropped_and_counted(tmp_path, capsys, cloud):
     points = cloud.points.copy()
     points[3, 1], points[7, 0] = np.nan, np.inf
@@ -226,7 +270,7 @@ def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_pat
         assert f"{name}: its first column names or numbers the points" in capsys.readouterr().out
     np.savetxt(tmp_path / "more.xyz", np.column_stack([points, numbers]), fmt="%.3f")
     np.testing.assert_allclose(read_cloud(tmp_path / "more.xyz").points, points)
-    assert "its last 1 columns have no names" in capsys.readouterr().out
+    assert "1 of its columns have no names" in capsys.readouterr().out
 
 
 def test_whole_coordinates_are_no_numbers_of_points(tmp_path):

@@ -147,13 +147,50 @@ def test_normals_that_are_none_are_left_out_and_that_is_said(tmp_path, cloud):
     assert found.normals is None and "not all of unit length" in value(report, "notes")[0]
 
 
-def test_classes_of_a_laz_are_not_taken_over_and_that_is_said(tmp_path, cloud):
+def test_classes_and_intensities_of_a_laz_are_kept_for_a_scene_and_named_for_an_object(tmp_path, cloud):
     las = laspy.read(write_as(tmp_path / "a.laz", cloud))
-    las.classification[:100] = 6
+    las.classification[:100], las.intensity[:], las.user_data[:7] = 6, np.arange(500), 1
     las.write(tmp_path / "classed.laz")
-    _, report, _ = imported_scene(tmp_path, tmp_path / "classed.laz")
-    assert value(report, "columns_not_used") == ["classification"]
-    assert value(report, "notes") == ["not taken over, and so not in the results: classification"]
+    found, report, _ = imported_scene(tmp_path, tmp_path / "classed.laz")
+    assert found.fields["classification"].dtype == np.uint8 and (found.fields["classification"] == 6).sum() == 100
+    assert found.fields["intensity"].tolist() == list(range(500))
+    assert value(report, "columns_not_used") == ["user_data"]
+    import_object_cloud(source=tmp_path / "classed.laz", cloud=tmp_path / "object.ply", report=tmp_path / "object.json")
+    assert not read_cloud(tmp_path / "object.ply").fields
+    unused = value(read_json(tmp_path / "object.json"), "columns_not_used")
+    assert unused == ["classification", "intensity", "user_data"]
+
+
+def test_noise_of_a_laz_and_points_at_nothing_are_left_out_and_counted(tmp_path, cloud):
+    las = laspy.read(write_as(tmp_path / "a.laz", cloud))
+    las.classification[:30], las.classification[30:50] = 7, 18
+    las.z[:50] = 4000.0
+    las.write(tmp_path / "noisy.laz")
+    found, report, _ = imported_scene(tmp_path, tmp_path / "noisy.laz")
+    assert len(found) == 450 and value(report, "diagonal") < 100
+    assert value(report, "notes") == ["50 points of the classes 7 and 18 (noise) were left out"]
+    points = cloud.points.copy()
+    points[:4] = 0
+    write_cloud(tmp_path / "zero.ply", Cloud(points))
+    found, report, _ = imported_scene(tmp_path, tmp_path / "zero.ply")
+    assert len(found) == 496 and value(report, "diagonal") < 100
+    assert value(report, "notes") == ["4 points at 0 0 0, far from all others, were left out"]
+    near = cloud.points - UTM
+    near[0] = 0
+    write_cloud(tmp_path / "near.ply", Cloud(near))
+    assert len(imported_scene(tmp_path, tmp_path / "near.ply")[0]) == 500
+
+
+def test_coordinates_in_single_precision_that_are_too_coarse_are_named(tmp_path, cloud):
+    write_cloud(tmp_path / "a.ply", Cloud(cloud.points.astype(np.float32).astype(float)))
+    notes = value(imported_scene(tmp_path, tmp_path / "a.ply")[1], "notes")
+    assert len(notes) == 1 and "in steps of 0.5, and its points are" in notes[0]
+    write_cloud(tmp_path / "b.ply", Cloud((cloud.points - UTM).astype(np.float32).astype(float)))
+    assert not value(imported_scene(tmp_path, tmp_path / "b.ply")[1], "notes")
+
+
+def test_dimensions_of_a_laz_that_say_nothing_are_no_columns(tmp_path, cloud):
+    assert not imported_scene(tmp_path, write_as(tmp_path / "a.laz", cloud))[0].fields
 
 
 @pytest.mark.parametrize("version", ["WKT2_2019", "WKT1_GDAL"])

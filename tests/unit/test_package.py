@@ -204,7 +204,7 @@ def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, wor
         ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
         ({"folder": Path("new"), "scene": Path("taken")}, "taken holds no photos"),
         ({"folder": Path("new"), "scene": Path("walk.mp4")}, "walk.mp4 is not a folder of photos nor a cloud"),
-        ({"folder": Path("new"), "objects": (Path("code.py"),)}, "code.py is not a folder of photos, a video nor a cloud"),
+        ({"folder": Path("new"), "objects": (Path("code.py"),)}, "code.py is not a folder of photos, a video nor"),
         ({"folder": Path("new"), "objects": (Path("empty.ply"),)}, "empty.ply is empty"),
     ],
 )

@@ -152,6 +152,7 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
     ("options", "words"),
     [
         ({"scale": -1.0}, "a scale has to be positive"),
+        ({"scale": 1e-6}, "its points .* apart; correct --scale or --scale-range"),
         ({"scale": 1.0, "scale_range": (1.0, 2.0)}, "give one"),
         ({"up_object": (0.0, 0.0, 1.0)}, "--up-scene"),
         ({"up_scene": (0.0, 0.0, 0.0)}, "needs a direction"),

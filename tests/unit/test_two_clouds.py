@@ -14,7 +14,7 @@ from support.cloud_files import UTM
 from support.planted import plant
 
 from scenefuse.fusion.modes import FusionSettings
-from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import RegistrationSettings
@@ -242,6 +242,25 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
     assert sorted(path.name for path in out.iterdir()) == ["picture.png", "report.html", "transform.json"]
     page = (out / "report.html").read_text()
     assert "unregistered" in page and "The pose was refused" in page
+
+
+def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_file(tmp_path, house, monkeypatch, capsys):
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    write_cloud(tmp_path / "house.ply", house.object)
+    write_laz(tmp_path / "clean.laz", house.scene, np.zeros(3), None)
+    las = laspy.read(tmp_path / "clean.laz")
+    noisy = laspy.LasData(las.header)
+    noisy.points = laspy.ScaleAwarePointRecord.zeros(len(las.points) + 40, header=las.header)
+    for name in las.points.array.dtype.names:
+        noisy.points.array[name][40:] = las.points.array[name]
+    noisy.x[:40] = las.header.maxs[0] + 5 * np.arange(40)
+    noisy.classification[:30], noisy.withheld[30:40] = 7, 1
+    noisy.write(tmp_path / "noisy.laz")
+    files = {"object": tmp_path / "house.ply", "scene": tmp_path / "noisy.laz"}
+    assert register(**files, out=tmp_path / "out", fuse=True) == 0
+    assert "40 points classed as noise, or withheld, of" in capsys.readouterr().out
+    written = laspy.read(tmp_path / "out/completed.laz")
+    assert (np.asarray(written.classification) == 7).sum() == 30 and (np.asarray(written["source"]) == 1).any()
 
 
 def test_bad_input_leaves_nothing_of_an_earlier_run(tmp_path, house):

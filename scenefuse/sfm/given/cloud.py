@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, concatenate, spacing, write_cloud
 from scenefuse.io.crs import plane
-from scenefuse.io.formats import las_crs
+from scenefuse.io.formats import LAS_DIMENSIONS, las_crs
 from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, survey, write_placed
 from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
@@ -76,7 +76,7 @@ def import_posed_cloud(
             coordinates than the cameras.
     """
     parts = columns_in_parts(source, degrees=True)
-    own = survey(source, parts)
+    own = survey(source, parts, () if georeference_json is None else LAS_DIMENSIONS)
     way, fit = _way_to_cameras(source, own.sample, sparse, read_json(sparse_json))
     if georeference_json is None:
         whole = way.apply(concatenate(list(clouds_in_parts(parts, own))))
