@@ -8,8 +8,8 @@ from typing import Literal
 import tyro
 
 from scenefuse.io.formats import READERS
+from scenefuse.io.photo_files import VIDEO_SUFFIXES, photo_files
 from scenefuse.io.settings import ROOT, schema_of
-from scenefuse.sfm.photo_files import VIDEO_SUFFIXES, photo_files
 from scenefuse.stage import StageError
 
 SCENES = ("scene", "photos", "cameras", "cloud")

@@ -12,7 +12,7 @@ import pandas as pd
 from PIL import Image
 from PIL.ExifTags import Base
 
-from scenefuse.sfm.photo_files import photo_files
+from scenefuse.io.photo_files import photo_files
 from scenefuse.stage import StageError
 
 # Fitted by hand to what the demo took (docs/results.md, The room on the disk).

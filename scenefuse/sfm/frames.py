@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
 from scenefuse.io.pictures import write_picture
-from scenefuse.sfm.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
 from scenefuse.sfm.photos import JPEG_QUALITY, inspect_photo, photo_names, photo_notes, save_upright, write_photos
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from PIL.ExifTags import GPS, IFD, Base
 
-from scenefuse.sfm.photo_files import GEO_FILE, photo_files
+from scenefuse.io.photo_files import GEO_FILE, photo_files
 from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
 

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from scenefuse.io.photo_files import thin_out
 from scenefuse.sfm.frames import FrameSettings, extract_frames, original_sizes, sharpness
-from scenefuse.sfm.photo_files import thin_out
 from scenefuse.sfm.photos import read_photos
 from scenefuse.stage import StageError, read_json, value
 

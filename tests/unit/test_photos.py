@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.sfm.photo_files import photo_files
+from scenefuse.io.photo_files import photo_files
 from scenefuse.sfm.photos import check_unchanged, gps_positions, inspect_photo, list_photos, read_photos
 from scenefuse.stage import StageError, read_json, value
 

@@ -1,5 +1,5 @@
 # Inputs of structure from motion: the photos that the tables name.
-from scenefuse.sfm.photo_files import frame_name, thin_out
+from scenefuse.io.photo_files import frame_name, thin_out
 
 
 def photos_of(row, who):

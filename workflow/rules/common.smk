@@ -14,7 +14,7 @@ from scenefuse.fingerprint import files_fingerprint, fingerprint
 from scenefuse.io.project import read_project
 from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.machine import has_gpu, megapixels, memory_mb
-from scenefuse.sfm.photo_files import GEO_FILE, camera_files, photo_files
+from scenefuse.io.photo_files import GEO_FILE, camera_files, photo_files
 from scenefuse.stage import StageError
 
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.

@@ -7,9 +7,9 @@ import numpy as np
 import pycolmap
 from PIL import Image
 
+from scenefuse.io.photo_files import bundler_list, photo_files
 from scenefuse.io.tables import read_lines
 from scenefuse.sfm.given.names import find_photo
-from scenefuse.sfm.photo_files import bundler_list, photo_files
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array

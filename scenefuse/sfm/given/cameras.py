@@ -6,12 +6,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
+from scenefuse.io.photo_files import BUNDLER
 from scenefuse.sfm.given.bundler import read_bundler
 from scenefuse.sfm.given.metashape import metashape_place, read_metashape
 from scenefuse.sfm.given.opensfm import find_opensfm, opensfm_place, read_opensfm
 from scenefuse.sfm.given.place import Place
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.photo_files import BUNDLER
 from scenefuse.sfm.photos import SHAPE_TOLERANCE
 from scenefuse.sfm.posed_photos import PosedPhoto, find_posed_photos
 from scenefuse.stage import StageError, scratch_directory

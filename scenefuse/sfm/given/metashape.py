@@ -9,9 +9,9 @@ import pyproj
 from scipy.optimize import least_squares
 
 from scenefuse.io.crs import usable
+from scenefuse.io.photo_files import photo_files
 from scenefuse.sfm.given.names import find_photo
 from scenefuse.sfm.given.place import Place, check_crs
-from scenefuse.sfm.photo_files import photo_files
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3

@@ -9,9 +9,9 @@ import pycolmap
 from scipy.spatial.transform import Rotation
 
 from scenefuse.io.crs import plane, read_crs
+from scenefuse.io.photo_files import COORDS
 from scenefuse.io.tables import read_lines
 from scenefuse.sfm.given.place import Place, check_crs
-from scenefuse.sfm.photo_files import COORDS
 from scenefuse.sfm.posed_photos import PosedPhoto
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
