@@ -176,7 +176,7 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     if count == 0:
         what = "point with a finite position" if any(left_out.values()) else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
-    unused = (unused | set(las_dimensions(source))) - set(keep)
+    unused = (unused | set(las_dimensions(source))) - known.intersection(keep)
     different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
     if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
         raise StageError(
