@@ -23,16 +23,46 @@ def read_crs(text: str, where: str) -> pyproj.CRS:
     Raises:
         StageError: `text` names none, or what `usable` says.
     """
-    zone = UTM.fullmatch(text.strip())
-    code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
-    try:
-        crs = pyproj.CRS.from_user_input(code)
-    except pyproj.exceptions.CRSError:
+    crs = _named(text)
+    if crs is None:
         raise StageError(
             f"{where} begins with '{text.strip()[:60]}', which names no coordinate reference system; write one in the"
             " first line: EPSG:25832, with heights EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
-        ) from None
+        )
     return usable(crs, where)
+
+
+def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:
+    """The projected CRS that a cell of a table names, as `read_crs` has it; with heights of its own only if `heights`.
+
+    Raises:
+        StageError: `text` names none, one in degrees, or one with heights where there may be none.
+    """
+    crs = _named(text)
+    if crs is None:
+        raise StageError(
+            f"{where}: '{text.strip()[:60]}' names no coordinate reference system; write EPSG:25832, with heights"
+            " EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
+        )
+    crs = usable(crs, where)
+    if not plane(crs).is_projected:
+        raise StageError(f"{where}: {crs.name} is in degrees; name a projected one, a UTM zone for instance")
+    if crs.is_compound and not heights:
+        raise StageError(
+            f"{where}: heights of GPS are not those of {crs.name}; name its plane alone, {plane(crs).to_string()}, or"
+            " give control points with such heights"
+        )
+    return crs
+
+
+def _named(text: str) -> pyproj.CRS | None:
+    """The CRS that a text names, if it does."""
+    zone = UTM.fullmatch(text.strip())
+    code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
+    try:
+        return pyproj.CRS.from_user_input(code)
+    except pyproj.exceptions.CRSError:
+        return None
 
 
 def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:

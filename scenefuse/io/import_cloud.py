@@ -48,11 +48,14 @@ UNIT_TOLERANCE = 0.05
 IMPORTED = "imported"
 
 
-def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_json: Path) -> None:
+def import_scene_cloud(
+    *, source: Path, crs: str | None = None, cloud: Path, report: Path, georeference_json: Path
+) -> None:
     """Take a cloud for a scene. The scene's frame has its axes, and z is up; its origin is near the points.
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
+        crs: of its coordinates, where the file does not say it.
         cloud: output PLY in the scene's frame, tile by tile (`open_cloud`), with classes and intensities of LAS;
             however large, it is never all in memory.
         report: output JSON: points, spacing, notes.
@@ -60,13 +63,13 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
             `crs_from_scene`, the shift back into the file's coordinates.
 
     Raises:
-        StageError: the file is missing, damaged, in degrees, of an unknown ending, not where its CRS is used, or has
-            too few different points.
+        StageError: the file is missing, damaged, in degrees, of an unknown ending, not where its CRS is used, in
+            another CRS than `crs`, or has too few different points.
     """
     parts = columns_in_parts(source)
     own = survey(source, parts, LAS_DIMENSIONS)
     check_not_degrees(source, own.sample)
-    crs = las_crs(source)
+    crs = _crs_of(source, crs)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
@@ -84,6 +87,22 @@ def import_scene_cloud(*, source: Path, cloud: Path, report: Path, georeference_
         "crs_from_scene": quantity(shift.matrix, unit),
     }
     write_json(georeference_json, place)
+
+
+def _crs_of(source: Path, said: str | None) -> str | None:
+    """The CRS of a file: its own, or the one that a user says, perhaps with heights that the file does not know."""
+    known = las_crs(source)
+    if said is None:
+        return known
+    import pyproj
+
+    from scenefuse.io.crs import plane, projected_crs, registered
+
+    crs = projected_crs(said, f"the column crs for {source.name}", heights=True)
+    own = None if known is None else registered(pyproj.CRS.from_wkt(known))
+    if own is not None and (plane(own) != plane(crs) or (own.is_compound and own != crs)):
+        raise StageError(f"{source} is in {own.name}, but the column crs says {crs.name}; empty that cell")
+    return str(crs.to_string())
 
 
 def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:

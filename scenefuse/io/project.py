@@ -68,7 +68,7 @@ def read_project(config: Mapping[str, Any]) -> Project:
         )
     for kind, rows in (("scene", scenes), ("object", objects)):
         for name, row in rows.items():
-            wrong = _cloud_problem(row)
+            wrong = _cloud_problem(row) or _crs_problem(row)
             if wrong:
                 raise StageError(f"{settings[f'{kind}s']}: {kind} '{name}' {wrong}")
     for name, row in objects.items():
@@ -113,6 +113,17 @@ def _cloud_problem(row: Row) -> str:
     for column in OF_PHOTOS:
         if row.get(column):
             return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
+    return ""
+
+
+def _crs_problem(row: Row) -> str:
+    """What is wrong with a row that names a CRS; "" where nothing is."""
+    if not row.get("crs"):
+        return ""
+    if row.get("control"):
+        return "names a crs, and its control points name theirs, in which the results are; empty the cell crs"
+    if row.get("cloud") and row.get("photos"):
+        return "names a crs, but its cloud lies where its cameras are; empty the cell crs"
     return ""
 
 

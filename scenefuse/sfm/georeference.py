@@ -8,10 +8,10 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.io.crs import grid_name
+from scenefuse.io.crs import check_in_area, grid_name, projected_crs
 from scenefuse.sfm.bundle.adjustment import Freedom, drop_outliers
 from scenefuse.sfm.bundle.lens import LENSES
-from scenefuse.sfm.geodesy import local_frame
+from scenefuse.sfm.geodesy import LocalFrame, local_frame
 from scenefuse.sfm.given.place import Place, read_place
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_photos
@@ -48,6 +48,7 @@ def georegister(
     control: Path | None = None,
     lengths: Path | None = None,
     held: bool = False,
+    crs: str | None = None,
     georeferenced: Path,
     residuals: Path,
     report: Path,
@@ -66,6 +67,7 @@ def georegister(
         control: control and check points with their clicks, an OpenDroneMap gcp_list.txt.
         lengths: known lengths between clicked points, `lengths.tsv`; beside control points or GPS only measured.
         held: whether the model is only moved: a dense cloud is given that goes with its cameras as they are.
+        crs: projected, of the results; without it the UTM zone, or what control points and given cameras are in.
         georeferenced: output, COLMAP model.
         residuals: output, tab-separated: what is left at every surveyed point and every photo with a position.
         report: output, JSON: status, transform, origin, CRS, residuals.
@@ -73,7 +75,8 @@ def georegister(
         seed: of RANSAC.
 
     Raises:
-        StageError: what `read_sighted`, `read_lengths`, `place_by_control` and `beside_gps` say.
+        StageError: what `read_sighted`, `read_lengths`, `place_by_control` and `beside_gps` say; `crs` is given and
+            nothing says where the scene lies, or it lies elsewhere.
     """
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
@@ -85,6 +88,8 @@ def georegister(
         found = placed_as_given(place, model, gps)
     else:
         found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
+    if crs is not None:
+        found = replace(found, frame=_in_grid(found, crs))
     sizes = {p.name: (p.width, p.height) for p in listed}
     if lengths is not None and not found.metric:
         known = read_lengths(lengths, model, sizes)
@@ -100,6 +105,20 @@ def georegister(
     write_residuals(residuals, found, left)
     _, turned, _ = camera_poses(model)
     write_json(report, georeference_report(found, left, cue, roll_spread_deg(turned, UP)) | adjustment)
+
+
+def _in_grid(found: Georeference, crs: str) -> LocalFrame:
+    """The frame of a scene whose results are to be in a CRS."""
+    where = "the column crs"
+    grid = projected_crs(crs, where, heights=False)
+    if found.frame is None:
+        raise StageError(
+            f"{where} names {grid.name}, but nothing says where the scene lies: {found.placement.reason}; empty that"
+            " cell, or give control points, which name a CRS themselves"
+        )
+    frame = replace(found.frame, grid=grid_name(grid))
+    check_in_area(grid, frame.in_crs(np.zeros((1, 3))), f"{where}: the scene")
+    return frame
 
 
 def georeference(

@@ -124,6 +124,15 @@ def test_a_cloud_that_is_not_there_is_one_sentence(project, tmp_path, snakemake)
     assert "does not exist" in refused.stdout and "write it with a line `x y z`" in refused.stdout
 
 
+def test_a_crs_that_is_none_stops_before_anything_runs(project, tmp_path, snakemake):
+    for name in ("objects.tsv", "mine.yaml", "house.ply", "points.tsv", "yard.laz"):
+        shutil.copy(project.path / name, tmp_path)
+    (tmp_path / "scenes.tsv").write_text("scene\tcloud\tcrs\nyard\tyard.laz\tEPSG:1\n")
+    refused = snakemake(tmp_path, "-n", config=tmp_path / "mine.yaml")
+    assert refused.returncode != 0
+    assert "scene 'yard', column crs: 'EPSG:1' names no coordinate reference system" in refused.stdout
+
+
 SFM = {"map_scene_photos", "map_object_photos", "undistort_scene_photos", "undistort_object_photos", "align_models"}
 STEREO = {"estimate_depth_maps", "fuse_depth_maps"}
 TRAINING = {"train_depth", "train_object_nerf", "refine_depth", "retrain_object_nerf", "make_object_cloud"}

@@ -10,7 +10,7 @@ from scenefuse.sfm.geodesy import LocalFrame, local_frame, scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.sfm.survey.placement import GeoreferenceSettings, fit_level, place_by_gps
-from scenefuse.stage import quantity, read_json, value, write_json
+from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_angle_deg
 from scenefuse.workspace import View, write_model
 
@@ -220,13 +220,14 @@ def listed(names, centres):
     return [Photo(n, 100, 100, "", *(float(v) for v in p)) for n, p in zip(names, positions)]
 
 
-def georegister_in(folder, photos):
+def georegister_in(folder, photos, crs=None):
     write_photos(folder / "photos.json", photos, folder, "photos", [])
     write_json(folder / "sparse.json", {"lens": quantity("held", "")})
     georegister(
         sparse=folder / "sparse",
         sparse_json=folder / "sparse.json",
         photos=folder / "photos.json",
+        crs=crs,
         georeferenced=folder / "georeferenced",
         residuals=folder / "residuals.tsv",
         report=folder / "georeference.json",
@@ -246,6 +247,22 @@ def test_stage_brings_a_model_into_metres(model):
     np.testing.assert_allclose(centres, origin.apply(FRAME.inverse(truth)), atol=1e-3)
     crs_from_scene = Sim3.from_matrix(np.array(value(report, "crs_from_scene")))
     np.testing.assert_allclose(crs_from_scene.translation, value(report, "origin_in_crs"))
+
+
+def test_results_are_in_the_crs_that_the_table_names(model):
+    folder, names, truth = model
+    report, _ = georegister_in(folder, listed(names, truth), "EPSG:2056")
+    assert value(report, "crs") == "EPSG:2056" and value(report, "status") == "georeferenced"
+    assert np.allclose(value(report, "origin_in_crs")[:2], [2_684_000, 1_247_000], atol=2000)
+    for crs, sentence in {
+        "EPSG:2056+5728": r"heights of GPS are not those of .*; name its plane alone, EPSG:2056",
+        "EPSG:32618": "the column crs: the scene: .* does not lie in WGS 84 / UTM zone 18N",
+        "EPSG:4326": "is in degrees",
+    }.items():
+        with pytest.raises(StageError, match=sentence):
+            georegister_in(folder, listed(names, truth), crs)
+    with pytest.raises(StageError, match="nothing says where the scene lies: 0 registered photos have a GPS position"):
+        georegister_in(folder, [Photo(n, 100, 100, "") for n in names], "EPSG:2056")
 
 
 def test_stage_without_altitudes_says_so(tmp_path):

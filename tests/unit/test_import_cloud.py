@@ -28,14 +28,14 @@ def cloud():
     return Cloud(points, None, rng.integers(0, 256, (500, 3)).astype(np.uint8))
 
 
-def imported_scene(path, source):
+def imported_scene(path, source, crs=None):
     """The scene's cloud, report and georeference."""
     files = {
         "cloud": path / "dense.ply",
         "report": path / "dense.json",
         "georeference_json": path / "georeference.json",
     }
-    import_scene_cloud(source=source, **files)
+    import_scene_cloud(source=source, crs=crs, **files)
     return read_cloud(files["cloud"]), read_json(files["report"]), read_json(files["georeference_json"])
 
 
@@ -119,6 +119,29 @@ def test_a_crs_is_kept_and_gives_the_unit_and_latitudes(tmp_path, cloud):
 def test_without_a_crs_nothing_is_called_metres(tmp_path, cloud):
     georeference = imported_scene(tmp_path, write_as(tmp_path / "a.ply", cloud))[2]
     assert (value(georeference, "crs"), value(georeference, "length_unit")) == (None, "scene units")
+
+
+@pytest.mark.parametrize("crs", ["EPSG:32632", "EPSG:25832+7837", "WGS84 UTM 32N"])
+def test_a_cloud_whose_file_does_not_say_its_crs_has_the_tables(tmp_path, cloud, crs):
+    georeference = imported_scene(tmp_path, write_as(tmp_path / "a.ply", cloud), crs)[2]
+    wanted = crs.replace("WGS84 UTM 32N", "EPSG:32632")
+    assert (value(georeference, "crs"), value(georeference, "length_unit")) == (wanted, "m")
+    assert scene_frame(georeference).inverse(np.zeros((1, 3)))[0][0] == pytest.approx(50.3, abs=0.01)
+
+
+@pytest.mark.parametrize(
+    ("name", "crs", "sentence"),
+    [
+        ("a.ply", "EPSG:32633+1", "names no coordinate reference system; write EPSG:25832"),
+        ("a.ply", "EPSG:4326", "is in degrees; name a projected one"),
+        ("a.ply", "EPSG:2056", r"does not lie in CH1903\+"),
+        ("a.laz", "EPSG:25832", "is in WGS 84 / UTM zone 32N, but the column crs says ETRS89 / UTM zone 32N"),
+    ],
+)
+def test_a_crs_of_the_table_that_is_not_the_clouds_is_one_sentence(tmp_path, cloud, name, crs, sentence):
+    with pytest.raises(StageError, match=sentence):
+        imported_scene(tmp_path, write_as(tmp_path / name, cloud), crs)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
 def test_feet_are_called_by_their_name(tmp_path, cloud):

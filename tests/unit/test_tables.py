@@ -270,6 +270,14 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
             {"scene": {"photos": "flight"}},
             "scenes.tsv: scene 'yard' has both photos and a cloud, but no cameras, .*; fill the column",
         ),
+        (
+            {"scene": {"photos": "flight", "cameras": "sparse", "crs": "EPSG:25832"}},
+            "scene 'yard' names a crs, but its cloud lies where its cameras are; empty the cell crs",
+        ),
+        (
+            {"scene": {"cloud": "", "photos": "flight", "control": "gcp_list.txt", "crs": "EPSG:25832"}},
+            "scene 'yard' names a crs, and its control points name theirs",
+        ),
         ({"obj": {"photos": "close"}}, "objects.tsv: object 'shed' has both photos and a cloud, but no cam"),
         (
             {"obj": {"scene": "", "photos": "close", "cameras": "sparse"}},
@@ -283,7 +291,7 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
             "'shed' has a truth, but its scene 'yard' is a cloud",
         ),
     ],
-    ids=["no scene", "no object", "both", "object both", "alone", "masks", "prompts", "calibration", "truth"],
+    ids=["no scene", "no object", "both", "posed crs", "control crs", "object both", "alone", "masks", "prompts", "calibration", "truth"],
 )
 def test_a_bad_row_with_a_cloud_is_one_sentence(cloud_project, rows, sentence):
     with pytest.raises(StageError, match=sentence):

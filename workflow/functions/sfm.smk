@@ -101,6 +101,27 @@ def check_survey(scene):
             ) from None
 
 
+@cache
+def crs_of(scene):
+    """The CRS that the table names for a scene, checked before anything runs; none where it names none."""
+    row = scene_row(scene)
+    if not row.get("crs"):
+        return {}
+    from scenefuse.io.crs import projected_crs
+
+    try:
+        where = f"{config['scenes']}, scene '{scene}', column crs"
+        projected_crs(row["crs"], where, heights=bool(row.get("cloud")))
+    except StageError as error:
+        raise WorkflowError(str(error)) from None
+    return {"crs": row["crs"]}
+
+
+def crs_flag(wildcards):
+    """The same, as a command-line option."""
+    return flags(crs_of(wildcards.scene))
+
+
 def survey_of(wildcards):
     """Input function: their files."""
     check_survey(wildcards.scene)

@@ -34,13 +34,14 @@ rule import_scene_cloud:
         runtime=by_size(30, all=0.1),
     params:
         source=cloud_path("scene"),
+        crs=crs_flag,
         files=state_of(cloud_of("scene")),
         script=script("io/import_scene_cloud.py"),
         code=code("io/import_scene_cloud.py"),
     message:
         "Scene {wildcards.scene}: cloud of the table"
     shell:
-        "exec python {params.script} --source {params.source} --cloud {output.cloud} --report {output.report}"
+        "exec python {params.script} --source {params.source} {params.crs} --cloud {output.cloud} --report {output.report}"
         " --georeference-json {output.georeference} &> {log}"
 
 

@@ -279,6 +279,7 @@ rule georegister:
         options=settings("scene.georegister"),
         survey=survey_flags,
         held=lambda wildcards: wildcards.scene in POSED_SCENES,
+        crs=crs_flag,
         files=state_of(survey_of),
         seed=config["seed"],
         script=script("sfm/georegister.py"),
@@ -287,7 +288,7 @@ rule georegister:
         "Scene {wildcards.scene}: georeferencing"
     shell:
         "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.survey}"
-        " --held {params.held} --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
+        " --held {params.held} {params.crs} --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
 rule estimate_scene_spread:
