@@ -59,7 +59,9 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
         shutil.rmtree(frames)
         raise StageError(f"{source} yields {len(listed)} frames, at least 3 are needed; lower frame_step")
     print(f"{len(listed)} frames from {source}", flush=True)
-    write_photos(photos, listed, frames, kind, photo_notes(listed), origin=quantity(origin, ""))
+    turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
+    more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
+    write_photos(photos, listed, frames, kind, photo_notes(listed), **more)
 
 
 def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:
@@ -94,7 +96,7 @@ def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[st
             shutil.copyfile(source / name, target)
         else:
             width, height = save_upright(source / name, target, settings.max_width_px)
-        return target.name, {"source": name, "width": width, "height": height}
+        return target.name, {"source": name, "width": width, "height": height, "orientation": photo.orientation}
 
     with ThreadPoolExecutor(threads()) as pool:
         return dict(pool.map(copy, flat.values()))

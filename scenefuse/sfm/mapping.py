@@ -26,7 +26,7 @@ from scenefuse.sfm.frames import original_sizes
 from scenefuse.sfm.given.cameras import place_of, triangulated
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.matches import MIN_INLIERS
-from scenefuse.sfm.photos import read_photos
+from scenefuse.sfm.photos import orientations_in, read_photos
 from scenefuse.sfm.survey.lengths import read_lengths
 from scenefuse.stage import (
     StageError,
@@ -89,7 +89,8 @@ def map_photos(
     """
     names = [p.name for p in read_photos(photos)]
     if cameras is not None:
-        model, content = _taken(cameras, folder, names, database, sparse, settings, seed)
+        turned = orientations_in(read_json(photos))
+        model, content = _taken(cameras, folder, names, turned, database, sparse, settings, seed)
     else:
         model, content = _mapped(names, folder, database, sparse, calibrated, settings, seed)
     content |= in_metres(model, lengths, original_sizes(read_json(photos)))
@@ -224,11 +225,19 @@ def _doubt(doubtful: dict[str, float]) -> str:
 
 
 def _taken(
-    cameras: Path, folder: Path, names: list[str], database: Path, sparse: Path, settings: MappingSettings, seed: int
+    cameras: Path,
+    folder: Path,
+    names: list[str],
+    orientations: Mapping[str, int],
+    database: Path,
+    sparse: Path,
+    settings: MappingSettings,
+    seed: int,
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The same from given cameras."""
     work, place = sparse.with_name(f"{sparse.name}-given"), place_of(cameras)
-    model = triangulated(cameras, folder, database, work, _mapper_options(len(names), True, seed))
+    options = _mapper_options(len(names), True, seed)
+    model = triangulated(cameras, folder, orientations, database, work, options)
     _check_registered([model], names, settings.min_registered_share)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)

@@ -1,7 +1,7 @@
 """Photos as the reconstruction reads them: checked, upright, and what their EXIF says."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -14,7 +14,7 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from scenefuse.io.photo_files import GEO_FILE, photo_files
 from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
-from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, write_json
+from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
 
 # Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
 MOST_PIXELS = 250_000_000
@@ -88,8 +88,9 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     names = photo_names(folder)
     positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
     with atomic_directory(upright) as temporary, ThreadPoolExecutor(threads()) as pool:
-        listed = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
-    turned = [p.name for p in listed if not (upright / p.name).is_symlink()]
+        stood = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
+    turned = {p.name: orientation for p, orientation in stood if orientation != 1}
+    listed = [p for p, _ in stood]
     notes = photo_notes(listed)
     if positions is not None:
         listed = [replace(p, **place) for p, place in zip(listed, positions_of(names, positions, folder / GEO_FILE))]
@@ -97,7 +98,8 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
             f"{GEO_FILE} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
         )
     if turned:
-        notes.append(f"{len(turned)} photos ({turned[0]}, ...) carry an EXIF rotation; upright copies of them are used")
+        first = next(iter(turned))
+        notes.append(f"{len(turned)} photos ({first}, ...) carry an EXIF rotation; upright copies of them are used")
     with_gps, stated = sum(p.has_gps for p in listed), sum(p.has_gps and bool(p.horizontal_sd_m) for p in listed)
     print(f"{len(listed)} photos in {folder}, {with_gps} with a GPS position, {stated} with its accuracy", flush=True)
     write_photos(photos, listed, upright, kind="photos", notes=notes, turned=quantity(turned, ""))
@@ -116,16 +118,23 @@ def photo_names(folder: Path) -> list[str]:
     return names
 
 
-def _stood_upright(folder: Path, name: str, output: Path) -> Photo:
-    """Link or turn one photo into `output`; what is listed is the result."""
+def orientations_in(content: Mapping[str, Any]) -> dict[str, int]:
+    """The EXIF orientation that photos had before they were stood upright, by name, from the content of photos.json."""
+    turned: dict[str, int] = value(content, "turned") if "turned" in content else {}
+    return turned
+
+
+def _stood_upright(folder: Path, name: str, output: Path) -> tuple[Photo, int]:
+    """Link or turn one photo into `output`; what is listed is the result, and the EXIF orientation that it had."""
     photo, target = inspect_photo(folder, name), output / name
     target.parent.mkdir(parents=True, exist_ok=True)
     if photo.orientation == 1:
         target.symlink_to(os.path.relpath(os.path.realpath(folder / name), os.path.realpath(target.parent)))
-        return photo
+        return photo, 1
     save_upright(folder / name, target)
     turned = inspect_photo(output, name)
-    return replace(turned, horizontal_sd_m=photo.horizontal_sd_m, vertical_sd_m=photo.vertical_sd_m)
+    stated = replace(turned, horizontal_sd_m=photo.horizontal_sd_m, vertical_sd_m=photo.vertical_sd_m)
+    return stated, photo.orientation
 
 
 def save_upright(source: Path, target: Path, max_width_px: int | None = None) -> tuple[int, int]:

@@ -1,7 +1,9 @@
 """Cameras of other programs in the place of mapping: written by the test, read back, and triangulated."""
 
 import json
+from dataclasses import replace
 from html import escape
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,10 +15,12 @@ from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
 
 from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.given.cameras import place_of, read_given
+from scenefuse.sfm.given.upright import stood_upright
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.photos import write_photos
-from scenefuse.stage import StageError, read_json, value
-from scenefuse.workspace import write_model
+from scenefuse.sfm.posed_photos import PosedPhoto
+from scenefuse.stage import StageError, quantity, read_json, value
+from scenefuse.workspace import View, write_model
 
 FLIGHT = fly(rows=3, columns=3)
 
@@ -162,6 +166,46 @@ def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     places = np.array([model.points3D[p].xyz for p in sorted(model.point3D_ids())])
     nearest = np.linalg.norm(places[:, None] - FLIGHT.ground[None], axis=2).min(1)
     assert nearest.max() < 1e-3
+
+
+def as_stored(view, quarters):
+    """The view of a photo that so many clockwise quarter turns stand upright, before these."""
+    for _ in range(quarters):
+        (focal, _, cx), (_, _, cy), _ = view.intrinsics
+        turned = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # right is what was down
+        intrinsics = np.array([[focal, 0, cy], [0, focal, view.width - cx], [0, 0, 1]])
+        view = View(view.name, intrinsics, turned @ view.cam_from_world, view.height, view.width)
+    return view
+
+
+@pytest.mark.parametrize(("orientation", "quarters"), [(6, 1), (3, 2), (8, 3)])
+def test_cameras_of_photos_as_stored_are_turned_with_what_exif_turns(tmp_path, orientation, quarters):
+    with_database(tmp_path)
+    names = [view.name for view in FLIGHT.views]
+    turned = dict.fromkeys(names[::2], orientation)
+    write_photos(tmp_path / "photos.json", FLIGHT.photos(), tmp_path, "photos", [], turned=quantity(turned, ""))
+    (tmp_path / "given/sparse").mkdir(parents=True)
+    views = [as_stored(view, quarters if view.name in turned else 0) for view in FLIGHT.views]
+    write_model(tmp_path / "given/sparse", views)
+    report, model = mapped(tmp_path, tmp_path / "given")
+    np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
+    assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
+
+
+def test_a_turned_lens_bends_as_before():
+    camera = pycolmap.Camera(
+        model="OPENCV", width=400, height=300, params=[500, 510, 190, 160, 0.1, -0.05, 0.01, -0.02]
+    )
+    before = PosedPhoto("a", Path("a.jpg"), camera, np.eye(4), None, False)
+    after = stood_upright(before, 1)
+    rays = np.random.default_rng(0).uniform(-0.3, 0.3, (50, 3)) + [0, 0, 1]
+    pixels = camera.img_from_cam(rays)
+    turned = after.camera.img_from_cam(rays @ np.linalg.inv(after.object_from_cam)[:3, :3].T)
+    np.testing.assert_allclose(turned, np.stack([300 - pixels[:, 1], pixels[:, 0]], axis=1), atol=1e-9)
+    assert (after.camera.width, after.camera.height) == (300, 400)
+    bent = pycolmap.Camera(model="THIN_PRISM_FISHEYE", width=400, height=300, params=[500, 500, 200, 150, *[0.0] * 8])
+    with pytest.raises(StageError, match=r"a\.jpg is rotated by EXIF, and its camera, a THIN_PRISM_FISHEYE, cannot"):
+        stood_upright(replace(before, camera=bent), 1)
 
 
 def test_wrong_cameras_are_named(tmp_path):

@@ -93,7 +93,7 @@ def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
     assert turned.has_gps and turned.altitude_m == 77.0 and turned.focal_px == pytest.approx(32.0)
     with Image.open(tmp_path / "upright/sub/b.jpg") as seen:
         assert seen.getpixel((24, 8))[0] > 200 and seen.getpixel((8, 8))[0] < 50
-    assert value(read_json(tmp_path / "photos.json"), "turned") == ["sub/b.jpg"]
+    assert value(read_json(tmp_path / "photos.json"), "turned") == {"sub/b.jpg": 6}
 
 
 def test_a_photo_that_was_replaced_or_removed_since_it_was_listed_is_named(tmp_path):

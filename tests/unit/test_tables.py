@@ -291,7 +291,19 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
             "'shed' has a truth, but its scene 'yard' is a cloud",
         ),
     ],
-    ids=["no scene", "no object", "both", "posed crs", "control crs", "object both", "alone", "masks", "prompts", "calibration", "truth"],
+    ids=[
+        "no scene",
+        "no object",
+        "both",
+        "posed crs",
+        "control crs",
+        "object both",
+        "alone",
+        "masks",
+        "prompts",
+        "calibration",
+        "truth",
+    ],
 )
 def test_a_bad_row_with_a_cloud_is_one_sentence(cloud_project, rows, sentence):
     with pytest.raises(StageError, match=sentence):

@@ -1,6 +1,7 @@
 """A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from scenefuse.sfm.given.bundler import read_bundler
 from scenefuse.sfm.given.metashape import metashape_place, read_metashape
 from scenefuse.sfm.given.opensfm import find_opensfm, opensfm_place, read_opensfm
 from scenefuse.sfm.given.place import Place
+from scenefuse.sfm.given.upright import possible_turns
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.photos import SHAPE_TOLERANCE
 from scenefuse.sfm.posed_photos import PosedPhoto, find_posed_photos
@@ -23,14 +25,20 @@ SAME_LENS = 1e-6
 
 
 def triangulated(
-    cameras: Path, folder: Path, database: Path, work: Path, options: pycolmap.IncrementalPipelineOptions
+    cameras: Path,
+    folder: Path,
+    orientations: Mapping[str, int],
+    database: Path,
+    work: Path,
+    options: pycolmap.IncrementalPipelineOptions,
 ) -> pycolmap.Reconstruction:
     """The model of given cameras: poses and lenses as they are, points from the photos' own matches.
 
     Args:
         cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
             Metashape's XML; Bundler's .out with its list.
-        folder: of the photos.
+        folder: of the photos, upright.
+        orientations: EXIF orientation of the photos that were turned for that, by name.
         database: COLMAP database with verified matches.
         work: folder for files in between; it is removed again.
         options: COLMAP's, of triangulation.
@@ -40,6 +48,31 @@ def triangulated(
             camera in the database but not here; cameras that do not fit the photos.
     """
     posed = _by_name(read_given(cameras, folder), cameras)
+    with pycolmap.Database.open(database) as opened:
+        own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
+        sizes = {Path(image.name).name: own[image.camera_id] for image in opened.read_all_images()}
+    turned = {Path(name).name: orientation for name, orientation in orientations.items()}
+    ways = possible_turns(posed, turned, sizes)
+    models = [_model(way, cameras, folder, database, work, options) for way in ways]
+    found = max(models, key=lambda model: model.num_points3D())
+    points = [found.images[i].num_points3D for i in found.reg_image_ids()]
+    if not points or np.median(points) < MIN_POINTS:
+        raise StageError(
+            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
+            " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
+        )
+    return found
+
+
+def _model(
+    posed: Mapping[str, PosedPhoto],
+    cameras: Path,
+    folder: Path,
+    database: Path,
+    work: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
+    """`triangulated` for cameras by the names of their photos; it may have no points."""
     with scratch_directory(work) as scratch:
         calibrated = scratch / "database.db"
         shutil.copyfile(database, calibrated)
@@ -66,14 +99,7 @@ def triangulated(
                 frame.set_cam_from_world(model.images[number].camera_id, pose)
                 model.register_frame(frame.frame_id)
         (scratch / "points").mkdir()
-        found = cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
-    points = [found.images[i].num_points3D for i in found.reg_image_ids()]
-    if not points or np.median(points) < MIN_POINTS:
-        raise StageError(
-            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
-            " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
-        )
-    return found
+        return cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
 
 
 def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
