@@ -54,6 +54,8 @@ def init(
         StageError: the folder is a file or holds a project, a path is neither photos nor a cloud, or two names are the
             same.
     """
+    if set("{}") & set(str(folder.resolve())):
+        raise StageError(f"{folder.resolve()} has braces, which Snakemake takes for wildcards; give another folder")
     names = [_name(path) for path in objects]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -52,6 +52,8 @@ def read_columns(path: Path) -> Columns:
         StageError: the ending is not known, or the file is missing, damaged, without positions or without points.
     """
     reader = READERS.get(path.suffix.lower())
+    if path.is_dir():
+        raise StageError(f"{path} is a folder; give the path of a cloud ({', '.join(READERS)})")
     if reader is None:
         raise StageError(
             f"{path}: '{path.suffix}' is no known ending of a cloud or mesh; convert it to one of {', '.join(READERS)}"
@@ -128,6 +130,10 @@ def check_projected(path: Path) -> None:
 
     wkt = las_crs(path)
     crs = None if wkt is None else pyproj.CRS.from_wkt(wkt)
+    if crs is not None and crs.is_geocentric:
+        raise StageError(
+            f"{path} is in geocentric coordinates ({crs.name}), with z along the earth's axis; project it first"
+        )
     if crs is not None and crs.is_geographic:
         raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
 

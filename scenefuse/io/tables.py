@@ -26,7 +26,8 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
     lines = [line for line in io.StringIO(read_text(path), newline=None) if not line.startswith("#")]
     header, *cells = [row for row in csv.reader(lines, delimiter="\t") if row] or [[]]
     if key not in header:
-        raise StageError(f"{path} has no column '{key}'; its first line names: {', '.join(header) or 'nothing'}")
+        tabs = "; separate columns by tabs" if len(header) == 1 and re.search("[;, ]", header[0]) else ""
+        raise StageError(f"{path} has no column '{key}'; its first line names: {', '.join(header) or 'nothing'}{tabs}")
     twice = next((name for name in header if header.count(name) > 1), None)
     if twice is not None:
         raise StageError(f"{path} has two columns '{twice}'; remove one")

@@ -11,6 +11,7 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from scenefuse.io.photo_files import frame_name
 from scenefuse.stage import StageError
 from scenefuse.workspace import posed_images, read_model
 
@@ -82,8 +83,10 @@ def _read_colmap(model: Path, images: Path) -> list[PosedPhoto]:
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         camera = reconstruction.cameras[image.camera_id]
-        name = "_".join(Path(image.name).parts)
-        photos.append(PosedPhoto(name, images / image.name, camera, pose, None, False))
+        name = frame_name(image.name)
+        # Frames lie in one folder.
+        file = images / (image.name if (images / image.name).is_file() else name)
+        photos.append(PosedPhoto(name, file, camera, pose, None, False))
     missing = [photo.file for photo in photos if not photo.file.is_file()]
     if missing:
         raise StageError(

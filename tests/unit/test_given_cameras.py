@@ -168,6 +168,26 @@ def test_cameras_of_other_programs_are_taken_as_they_are(tmp_path, write):
     assert nearest.max() < 1e-3
 
 
+@pytest.mark.parametrize("flat", [False, True], ids=["scene", "frames"])
+def test_photos_of_one_name_in_two_folders_have_the_cameras_of_their_paths(tmp_path, flat):
+    with_database(tmp_path)
+    named = {view.name: f"{100 + k // 5}MEDIA/{k % 5}.jpg" for k, view in enumerate(FLIGHT.views)}
+    ours = {old: new.replace("/", "_") if flat else new for old, new in named.items()}
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        for image in database.read_all_images():
+            image.name = ours[image.name]
+            database.update_image(image)
+    for new in ours.values():
+        (tmp_path / "photos" / new).parent.mkdir(exist_ok=True)
+        (tmp_path / "photos" / new).write_bytes(b"")
+    photos = [replace(photo, name=ours[photo.name]) for photo in FLIGHT.photos()]
+    write_photos(tmp_path / "photos.json", photos, tmp_path, "photos", [])
+    (tmp_path / "given/sparse").mkdir(parents=True)
+    write_model(tmp_path / "given/sparse", [replace(view, name=named[view.name]) for view in FLIGHT.views])
+    _, model = mapped(tmp_path, tmp_path / "given")
+    np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
+
+
 def as_stored(view, quarters):
     """The view of a photo that so many clockwise quarter turns stand upright, before these."""
     for _ in range(quarters):
@@ -212,6 +232,9 @@ def test_wrong_cameras_are_named(tmp_path):
     with_database(tmp_path)
     with pytest.raises(StageError, match="do not exist"):
         mapped(tmp_path, tmp_path / "none")
+    (tmp_path / "project.psx").touch()
+    with pytest.raises(StageError, match=r"project\.psx is not read; in Metashape, export the cameras as Agisoft XML"):
+        read_given(tmp_path / "project.psx", tmp_path / "photos")
     path = nerfstudio(tmp_path)
     content = json.loads(path.read_text())
     for frame, other in zip(content["frames"], json.loads(path.read_text())["frames"][::-1]):

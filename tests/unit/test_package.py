@@ -200,6 +200,7 @@ def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, wor
     [
         ({"folder": Path("taken")}, "README.md exists already"),
         ({"folder": Path("file")}, "file exists already"),
+        ({"folder": Path("yard {2026}")}, "has braces, which Snakemake takes for wildcards"),
         ({"folder": Path("new"), "scene": Path("nowhere")}, "nowhere does not exist"),
         ({"folder": Path("new"), "scene": Path("taken"), "objects": (Path("a/x"), Path("b/x"))}, "two objects"),
         ({"folder": Path("new"), "scene": Path("taken")}, "taken holds no photos"),

@@ -260,6 +260,19 @@ def test_points_without_names_are_told_by_their_coordinates(tmp_path):
     assert point.sd_m == (0.02, 0.03) and not point.check
 
 
+@pytest.mark.parametrize("mark", ["\t", " ", ";", ",", ", ", "; "])
+@pytest.mark.parametrize("photo", ["a.jpg", "north side.JPG"])
+def test_columns_of_control_points_are_separated_in_any_way(tmp_path, mark, photo):
+    cells = [
+        ["460000", "5240000", "500", "10.5", "20", photo, "p1"],
+        ["460000", "5240000", "500", "1", "2", "b.jpg", "p1"],
+    ]
+    (tmp_path / "gcp_list.txt").write_text("EPSG:32632\n" + "".join(mark.join(row) + "\n" for row in cells))
+    (point,) = read_control(tmp_path / "gcp_list.txt").points
+    assert point.name == "p1" and [name for name, _ in point.clicks] == [photo, "b.jpg"]
+    np.testing.assert_array_equal(point.clicks[0][1], [10.5, 20])
+
+
 def a_photo(folder, name, xmp=b"", orientation=1):
     folder.mkdir(exist_ok=True)
     exif = Image.Exif()

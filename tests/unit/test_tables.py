@@ -59,13 +59,14 @@ def test_another_encoding_is_named_with_its_file(table, encoding, sentence):
     "text, sentence",
     [
         ("scene\tphotos\nyard\tclose\n", "has no column 'object'; its first line names: scene, photos"),
+        ("object;photos\nshed;close\n", "its first line names: object;photos; separate columns by tabs"),
         ("", "has no column 'object'; its first line names: nothing"),
         ("object\tobject\nshed\tshed\n", "two columns 'object'"),
         ("object\tphotos\nshed\n", "row 1: 1 columns, and the header has 2; separate them by tabs"),
         ("object\tphotos\nshed\ta\nbarn\ta\tb\n", "row 2: 3 columns, and the header has 2"),
         ("object\tphotos\nshed\ta\nshed\tb\n", "'shed' stands in two rows; names must differ"),
     ],
-    ids=["no such column", "empty", "column twice", "too few", "too many", "name twice"],
+    ids=["no such column", "semicolons", "empty", "column twice", "too few", "too many", "name twice"],
 )
 def test_a_bad_table_is_one_sentence_with_its_file(table, text, sentence):
     with pytest.raises(StageError, match=f"objects.tsv.*{sentence}"):

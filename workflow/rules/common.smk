@@ -23,6 +23,10 @@ if workflow.modifier.path_modifier.replace_prefix("results") != "results":
         "scenefuse names its files in commands and settings too, which `prefix` and `replace_prefix` of a module do not"
         " reach; leave them out"
     )
+if set("{}") & set(os.getcwd()):
+    raise WorkflowError(
+        f"Snakemake takes the braces in {os.getcwd()} for wildcards; rename the folder, or work in another one"
+    )
 ROOT = Path(str(workflow.current_basedir)).parents[1]
 if not (ROOT / "scripts").is_dir():
     ROOT = SHIPPED

@@ -1,13 +1,13 @@
 """A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from scenefuse.io.photo_files import BUNDLER
+from scenefuse.io.photo_files import BUNDLER, frame_name
 from scenefuse.sfm.given.bundler import read_bundler
 from scenefuse.sfm.given.metashape import metashape_place, read_metashape
 from scenefuse.sfm.given.opensfm import find_opensfm, opensfm_place, read_opensfm
@@ -22,6 +22,10 @@ from scenefuse.stage import StageError, scratch_directory
 MIN_POINTS = 20
 # Parameters of lenses that differ by less, relatively, are of one camera.
 SAME_LENS = 1e-6
+METASHAPE = "in Metashape, export the cameras as Agisoft XML (File, Export, Export Cameras)"
+REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) with the list of photos"
+# What to do about files of other programs that hold cameras in a form that is not read.
+EXPORTS = {".psx": METASHAPE, ".psz": METASHAPE, ".csv": REALITY, ".rcproj": REALITY}
 
 
 def triangulated(
@@ -47,12 +51,15 @@ def triangulated(
         StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
             camera in the database but not here; cameras that do not fit the photos.
     """
-    posed = _by_name(read_given(cameras, folder), cameras)
+    given = read_given(cameras, folder)
     with pycolmap.Database.open(database) as opened:
         own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
-        sizes = {Path(image.name).name: own[image.camera_id] for image in opened.read_all_images()}
-    turned = {Path(name).name: orientation for name, orientation in orientations.items()}
-    ways = possible_turns(posed, turned, sizes)
+        sizes = {image.name: own[image.camera_id] for image in opened.read_all_images()}
+    posed = _by_name(given, sizes, cameras)
+    if not posed:
+        some = ", ".join(sorted(photo.file.name for photo in given)[:3])
+        raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
+    ways = possible_turns(posed, orientations, sizes)
     models = [_model(way, cameras, folder, database, work, options) for way in ways]
     found = max(models, key=lambda model: model.num_points3D())
     points = [found.images[i].num_points3D for i in found.reg_image_ids()]
@@ -77,7 +84,7 @@ def _model(
         calibrated = scratch / "database.db"
         shutil.copyfile(database, calibrated)
         with pycolmap.Database.open(calibrated) as opened:
-            images = {image.image_id: posed.get(Path(image.name).name) for image in opened.read_all_images()}
+            images = {image.image_id: posed.get(image.name) for image in opened.read_all_images()}
             shared: dict[int, PosedPhoto] = {}
             for image in opened.read_all_images():
                 photo = images[image.image_id]
@@ -85,9 +92,6 @@ def _model(
                     own = opened.read_camera(image.camera_id)
                     _check_same(shared.setdefault(image.camera_id, photo), photo, cameras)
                     opened.update_camera(_fitted(photo, own, cameras))
-            if not shared:
-                some = ", ".join(sorted(posed)[:3])
-                raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
             cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
         model = pycolmap.Reconstruction()
         model.load(cache)
@@ -106,7 +110,10 @@ def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
     """The posed photos of any format that is read."""
     if not cameras.exists():
         raise StageError(f"the cameras {cameras} do not exist; correct the path")
-    if cameras.suffix.lower() == ".xml":
+    ending = cameras.suffix.lower()
+    if ending in EXPORTS:
+        raise StageError(f"{cameras} is not read; {EXPORTS[ending]}")
+    if ending == ".xml":
         return read_metashape(cameras, folder)
     if cameras.suffix == BUNDLER:
         return read_bundler(cameras, folder)
@@ -125,12 +132,26 @@ def place_of(cameras: Path) -> Place | None:
     return None if file is None else opensfm_place(file)
 
 
-def _by_name(photos: list[PosedPhoto], cameras: Path) -> dict[str, PosedPhoto]:
-    names = [photo.file.name for photo in photos]
-    twice = next((name for name in names if names.count(name) > 1), None)
-    if twice is not None:
-        raise StageError(f"{cameras}: two photos are called {twice}; give every photo a name of its own")
-    return dict(zip(names, photos))
+def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> dict[str, PosedPhoto]:
+    """The cameras of photos (paths below their folder): by the whole path, or by the file's name where it is the only
+    one that is called so.
+
+    Raises:
+        StageError: several cameras may be a photo's.
+    """
+    whole, alike = {photo.name: photo for photo in given}, dict[str, list[PosedPhoto]]()
+    for photo in given:
+        alike.setdefault(photo.file.name, []).append(photo)
+    found = dict[str, PosedPhoto]()
+    for name in names:
+        same = [whole[frame_name(name)]] if frame_name(name) in whole else alike.get(Path(name).name, [])
+        if len(same) > 1:
+            raise StageError(
+                f"{cameras}: {len(same)} photos are called {Path(name).name}; give every photo a name of its own"
+            )
+        if same:
+            found[name] = same[0]
+    return found
 
 
 def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:

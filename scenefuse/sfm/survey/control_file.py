@@ -8,6 +8,7 @@ import numpy as np
 import pyproj
 
 from scenefuse.io.crs import read_crs, to_wgs84
+from scenefuse.io.photo_files import SUFFIXES
 from scenefuse.io.tables import comma_advice, read_lines
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
@@ -18,6 +19,8 @@ CHECK = "CHK-"
 SD_M = (0.02, 0.03)
 # Coordinates, standard deviations, photo and pixel.
 Row = tuple[Array, tuple[float, float], str, Array]
+# Columns up to the photo's name.
+LEAST_CELLS = 6
 LAYOUT = "x y z pixel_x pixel_y photo [name [horizontal sd [vertical sd]]]"
 
 
@@ -59,8 +62,8 @@ def read_control(path: Path) -> ControlFile:
     """Read a gcp_list.txt: the CRS in the first line, then one click a line, `x y z pixel_x pixel_y photo name`.
 
     Points without a name are told by their coordinates; z may be NaN. Numbers in the eighth and ninth column are
-    standard deviations in metres, horizontal and vertical. Points named CHK-... are check points. Separated by tabs, a
-    photo's name may hold spaces. Lines that begin with # are ignored.
+    standard deviations in metres, horizontal and vertical. Points named CHK-... are check points. Columns are separated
+    by tabs, semicolons, commas or blanks. Lines that begin with # are ignored.
 
     Raises:
         StageError: no such file, no CRS, a line that is not well formed, a name with two positions, a photo clicked
@@ -70,14 +73,26 @@ def read_control(path: Path) -> ControlFile:
     crs = read_crs(lines[0][1] if lines else "", str(path))
     rows: dict[str, list[Row]] = {}
     for number, line in lines[1:]:
-        cells = [cell.strip() for cell in line.split("\t")] if "\t" in line.strip() else line.split()
-        name, row = _row(cells, f"{path}, line {number}")
+        name, row = _row(_cells(line.strip()), f"{path}, line {number}")
         rows.setdefault(name, []).append(row)
     if not rows:
         raise StageError(f"{path} holds no points below its first line; write lines {LAYOUT}")
     positions = to_wgs84(crs, np.array([clicks[0][0] for clicks in rows.values()]), str(path))
     points = [_point(name, clicks, place, path) for (name, clicks), place in zip(rows.items(), positions)]
     return ControlFile(path, crs, points)
+
+
+def _cells(line: str) -> list[str]:
+    """The columns of a line; between blanks, a photo's name that holds some ends where a photo's ending does."""
+    blank = len(line.split()) >= LEAST_CELLS and not line.split()[0].endswith((",", ";"))
+    marks = "\t" if blank else "\t;,"
+    mark = next((mark for mark in marks if line.count(mark) >= LEAST_CELLS - 1), None)
+    cells = [cell.strip() for cell in line.split(mark)]
+    if mark is None:
+        ends = (k for k, cell in enumerate(cells) if k >= LEAST_CELLS - 1 and Path(cell).suffix.lower() in SUFFIXES)
+        last = next(ends, LEAST_CELLS - 1)
+        cells[LEAST_CELLS - 1 : last + 1] = [" ".join(cells[LEAST_CELLS - 1 : last + 1])]
+    return cells
 
 
 def unknown_photo(path: Path, point: str, photo: str, names: Collection[str]) -> StageError:
