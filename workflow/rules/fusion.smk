@@ -34,7 +34,7 @@ rule fuse_object:
         "../../envs/registration.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=by_size(5000, cloud=10),
+        mem_mb=by_size(4000, cloud=10, crop=10),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=settings("fusion"),
