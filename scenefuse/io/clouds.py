@@ -16,6 +16,7 @@ from scipy.spatial import cKDTree
 from scenefuse.io.formats import COLOR, LAS_DIMENSIONS, NORMAL, POSITION, Columns, bytes_of, read_columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
+from scenefuse.version import VERSION
 
 LAS_DESCRIPTIONS = {
     "source": "0 scene, n the n-th object",
@@ -305,6 +306,7 @@ class LasLayout:
         import pyproj
 
         header = laspy.LasHeader(point_format=7, version="1.4")
+        header.generating_software = f"scenefuse {VERSION}"
         low, high = box
         if crs is not None:
             step, offset = _step_of(path, np.maximum(np.abs(low), np.abs(high))), np.floor(origin)

@@ -13,6 +13,7 @@ from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.job_records import JobRecords
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3
+from scenefuse.version import VERSION
 
 SETTINGS = FusionSettings(mode="fill")
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
@@ -135,6 +136,7 @@ def test_the_copc_file_holds_the_same_points_with_their_sources(tmp_path):
     las = laspy.read(tmp_path / "completed.copc.laz")
     order, other = (np.lexsort(np.round(points, 6).T) for points in (las.xyz, whole.points))
     assert np.allclose(las.xyz[order], whole.points[other], atol=1e-6)
+    assert las.header.generating_software.startswith(f"scenefuse {VERSION}")
     assert np.array_equal(las["source"][order], whole.fields["source"][other]) and whole.fields["source"].max() == 1
 
 
