@@ -12,7 +12,7 @@ from scenefuse.io.photo_files import VIDEO_SUFFIXES, photo_files
 from scenefuse.io.settings import ROOT, schema_of
 from scenefuse.stage import StageError
 
-SCENES = ("scene", "photos", "cameras", "cloud")
+SCENES = ("scene", "photos", "cameras", "cloud", "crs")
 OBJECTS = ("object", "scene", "photos", "cameras", "cloud", "prompts", "fiducials")
 SETTINGS = """\
 # Settings that differ from the shipped ones; `scenefuse run` reads this file. All of them, with their shipped values:
