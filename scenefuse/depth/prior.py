@@ -36,8 +36,21 @@ class DepthPrior:
     order: NDArray[np.float32] | None = None
 
 
+@dataclass(frozen=True)
+class Unconfirmed:
+    """What takes all depths of the earlier stage, and not only those that photos do not contradict and views confirm.
+
+    Attributes:
+        order: their order.
+        depths: the depths themselves, with full confidence.
+    """
+
+    order: bool = False
+    depths: bool = False
+
+
 def read_prior(
-    folder: Path, views: Views, settings: RefinementSettings, agreement: float, order_of_all: bool = False
+    folder: Path, views: Views, settings: RefinementSettings, agreement: float, of_all: Unconfirmed = Unconfirmed()
 ) -> DepthPrior:
     """Read a stage's depth maps, move them to where photos match, and keep what photos do not contradict and two other
     maps confirm.
@@ -49,7 +62,7 @@ def read_prior(
         views: photos, masks and cameras at the NeRF's size.
         settings: of the refinement by photos.
         agreement: largest difference of depth that agrees, share of the object's diagonal.
-        order_of_all: whether the order of all depths is learned, and not of the confident ones only.
+        of_all: what takes all depths.
     """
     training = np.flatnonzero(~views.held_out)
     seen = views.select(training)
@@ -61,12 +74,14 @@ def read_prior(
     depths = np.where(matched.inconsistent, 0, matched.depths)
     confidence = np.where(matched.moved, 1, np.nan_to_num(certain).clip(0, 1)) * _confirmed(seen, depths, agreement)
     depths = np.where(confidence > 0, depths, 0)
+    if of_all.depths:
+        depths, confidence, refined = everything, (everything > 0).astype(np.float32), 0.0
     shape = views.masks.shape
     whole = tuple(np.zeros(shape, np.float32) for _ in range(3))
     for place, of_training in zip(whole, (depths, confidence, everything)):
         place[training] = of_training
     share = float((confidence > 0).sum() / max(int(seen.masks.sum()), 1))
-    return DepthPrior(whole[0], whole[1], refined, share, whole[2] if order_of_all else None)
+    return DepthPrior(whole[0], whole[1], refined, share, whole[2] if of_all.order else None)
 
 
 def _scaled_maps(folder: Path, views: Views) -> NDArray[np.float32]:

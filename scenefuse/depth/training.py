@@ -32,7 +32,7 @@ MAX_GRADIENT = 1.0
 SOURCES_PER_STEP = 3
 # Weight of equation (5) as in Monodepth2; the other losses have 1.
 SMOOTHNESS_WEIGHT = 1e-3
-# Relative depth errors count in full from here, and no more beyond: only an outlier can be so far off.
+# Relative depth errors count in full from here, and no more beyond.
 SMALL_ERROR, LARGE_ERROR = 0.005, 0.1
 # Share of a half-size pixel that is object, for it to count.
 SHARE_OF_PIXEL = 0.75
@@ -92,12 +92,15 @@ class Supervision:
         first: (V, 1, H, W) first disparity.
         target: (V, 1, H, W) depth to learn, or None.
         target_weight: (V, 1, H, W) weight of each target pixel, 0 where there is none; None without a target.
+        large_error: relative errors against the target count no more beyond: only an outlier can be so far off, where
+            the depth is nearly right from the beginning.
     """
 
     inputs: Tensor
     first: Tensor
     target: Tensor | None = None
     target_weight: Tensor | None = None
+    large_error: float = LARGE_ERROR
 
 
 def prepare_torch(seed: int) -> torch.device:
@@ -291,7 +294,7 @@ def error_against_target(depth: Tensor, supervision: Supervision, chosen: Tensor
         return depth.new_zeros(())
     relative = depth / supervision.target[chosen].clamp_min(near) - 1.0
     weight = supervision.target_weight[chosen]
-    return (_huber(relative) * weight).sum() / weight.sum().clamp_min(1.0)
+    return (_huber(relative, supervision.large_error) * weight).sum() / weight.sum().clamp_min(1.0)
 
 
 def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
@@ -300,9 +303,9 @@ def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
     return (_huber(relative) * weights).sum() / weights.sum().clamp_min(1.0)
 
 
-def _huber(relative: Tensor) -> Tensor:
-    """Absolute error, rounded below SMALL_ERROR and flat above LARGE_ERROR."""
-    size = relative.abs().clamp_max(LARGE_ERROR)
+def _huber(relative: Tensor, large: float = LARGE_ERROR) -> Tensor:
+    """Absolute error, rounded below SMALL_ERROR and flat above `large`."""
+    size = relative.abs().clamp_max(large)
     return torch.where(size < SMALL_ERROR, size**2 / (2 * SMALL_ERROR), size - SMALL_ERROR / 2)
 
 

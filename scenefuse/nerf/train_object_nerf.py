@@ -13,7 +13,7 @@ from torch import Tensor
 
 from scenefuse.checkpoints import State, key_of
 from scenefuse.cores import use_threads
-from scenefuse.depth.prior import DepthPrior, read_prior
+from scenefuse.depth.prior import DepthPrior, Unconfirmed, read_prior
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.sparse_depths import sparse_depths
 from scenefuse.mvs.views import Views, load_views
@@ -193,8 +193,8 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
     volume = find_volume(seen, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
     prior = None
     if inputs.prior is not None:
-        all_ranked = settings.recipe.order_of_all
-        prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement, all_ranked)
+        of_all = Unconfirmed(settings.recipe.order_of_all, settings.recipe.prior_of_all)
+        prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement, of_all)
     photos = photo_tensors(views, volume.nerf_from_object, prior, exact=settings.recipe.mask_band_px == 0)
     photos = replace(photos, hidden=torch.from_numpy(hidden_pixels(volume, outlines)))
     return _Given(views, trained, volume, prior, photos, earlier)

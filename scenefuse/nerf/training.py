@@ -88,7 +88,9 @@ class NerfRecipe:
     """The paper's adaptive grid: steps of fine levels are up to 1 + this times as long at edges (method N9)."""
     order_of_all: bool = False
     """Whether the ranking loss takes all depths of the earlier stage, and not only those of the prior that photos and
-    views confirm: where the absolute loss has them too, there is nothing left to rank (method N3)."""
+    views confirm: where the absolute loss has the same, there is little left to rank (method N3)."""
+    prior_of_all: bool = False
+    """Whether the absolute loss takes all depths of the earlier stage as well, as the paper does (method N4)."""
     prior_share: float = PRIOR_SHARE
     """Where a prior expects the surface, at most this share of a ray's samples lies near it."""
     turned_share: float = 0.25

@@ -3,6 +3,7 @@
 Lengths are in the networks' own unit, about the distance of the camera to the object: a video says nothing of scale.
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,9 +116,12 @@ def new_monocular_networks(device: torch.device) -> Networks:
 
 
 def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Tensor | None = None) -> Supervision:
-    """What the networks see, colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights."""
+    """What the networks see, colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights.
+
+    Nothing says that these networks' depth is nearly right: every error counts in full.
+    """
     one = disparity_from_depth(torch.ones_like(frames.masks), NEAR, FAR)
-    return Supervision(frames.images * 2.0 - 1.0, one, target, weight)
+    return Supervision(frames.images * 2.0 - 1.0, one, target, weight, large_error=math.inf)
 
 
 def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Supervision, recipe: Recipe) -> Objective:

@@ -23,6 +23,7 @@ NERF = NerfRecipe(
     edge_boost=0.0,
     edge_rate=1.0,
     order_of_all=True,
+    prior_of_all=True,
     prior_share=0.0,
     turned_share=0.0,
     appearance=False,

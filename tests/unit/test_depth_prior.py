@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from support.textured_plane import plane_views, speckled, wrong_depths
 
-from scenefuse.depth.prior import read_prior
+from scenefuse.depth.prior import Unconfirmed, read_prior
 from scenefuse.io.maps import write_depth
 from scenefuse.mvs.photo_refinement import RefinementSettings
 
@@ -36,6 +36,17 @@ def test_photos_sharpen_the_prior_and_make_it_sure(plane, tmp_path):
     assert known.sum() > 0.5 * (truth[~views.held_out] > 0).sum() and errors[1] < 0.2 * errors[0]
     assert prior.refined_share > 0.5 and np.median(prior.confidence[known]) == 1
     assert not prior.depths[views.held_out].any()
+
+
+def test_all_depths_are_taken_as_they_are_where_nothing_has_to_confirm_them(plane, tmp_path):
+    views, truth = plane
+    wrong = wrong_depths(truth) * np.linspace(0.5, 1.5, len(truth), dtype=np.float32)[:, None, None]
+    _write(tmp_path, views, wrong)
+    assert read_prior(tmp_path, views, AS_IT_IS, 0.01).confident_share < 0.1
+    prior = read_prior(tmp_path, views, AS_IT_IS, 0.01, Unconfirmed(depths=True))
+    there = views.masks & (truth > 0) & ~views.held_out[:, None, None]
+    assert np.array_equal(prior.depths[there], wrong[there]) and (prior.confidence[there] == 1).all()
+    assert prior.order is None and not prior.depths[views.held_out].any()
 
 
 def test_held_out_photos_and_their_maps_change_nothing(plane, tmp_path):
