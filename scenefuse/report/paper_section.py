@@ -43,7 +43,8 @@ def _notes(rows: list[dict[str, str]]) -> list[str]:
         if row["note"] != "-":
             said.setdefault((row["object"], row["note"]), []).append(row)
     own = {name: [row for row in rows if row["object"] == name] for name, _ in said}
-    return [f"{name}{_where(of, own[name])}: {note}" for (name, note), of in said.items()]
+    made = dict.fromkeys(f"{row['object']}, {HERE}: {row['preset']}" for row in rows if row.get("preset", "-") != "-")
+    return [*made, *(f"{name}{_where(of, own[name])}: {note}" for (name, note), of in said.items())]
 
 
 def _where(of: list[dict[str, str]], rows: list[dict[str, str]]) -> str:

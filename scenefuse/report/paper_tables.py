@@ -36,19 +36,31 @@ class Measure:
     group: str
 
 
-_FITNESS = "share of the crop's points with a point of the object within tau; higher is better (R10, R11)"
-_RMSE = "RMS distance to the crop of the object's points that lie within tau of it; lower is better (R10, R11)"
+_FITNESS = (
+    "share of the crop's points with a point of the object within tau, which is metrics.agreement.tau_fraction of the"
+    " crop's diagonal; higher is better (R10, R11)"
+)
+_RMSE = (
+    "RMS distance to the crop of the object's points (not the crop's, as in fitness) that lie within tau of it; lower"
+    " is better (R10, R11)"
+)
 _RMSE_SHARE = "inlier_rmse over the diagonal of the crop, so that objects of any size compare; lower is better (R11)"
 _NORMALS = (
     "mean |n . n_nearest| between the object's points that lie within tau of the crop and the crop's nearest to them;"
     " higher is better, 0.5 is of unrelated normals (G1)"
 )
 _VARIATION = (
-    "mean over the added points of the smallest eigenvalue of their neighbours' covariance over the sum of all three;"
-    " 0 to 1/3, lower is better (G2)"
+    "mean over the added points of the smallest eigenvalue of the covariance of their neighbours (within"
+    " metrics.variation_spacings of the crop's spacings) over the sum of all three; 0 to 1/3, lower is better (G2)"
 )
-_NUE = "standard deviation of the density of the completed cloud over that of the incomplete one; near 1 is better (G4)"
-_PRIMITIVES = "share of the added points that lie on planes, spheres or cylinders; higher is better (G5)"
+_DENSITY = "density (k over the area of the circle to the k-th neighbour, k = metrics.density_neighbours)"
+_NUE = f"standard deviation of the {_DENSITY} of the completed cloud over that of the crop; near 1 is better (G3, G4)"
+_NUE_INVARIANT = "as nue, each standard deviation over its mean: what is denser everywhere has the same (G4)"
+_PRIMITIVES = (
+    "share of the added points that lie within metrics.primitive_fraction of the crop's diagonal on planes, spheres or"
+    " cylinders, at most metrics.primitive_most, of metrics.primitive_support of the points at least; higher is better"
+    " (G5)"
+)
 REGISTRATION = (
     Measure("fitness", "Fitness", _FITNESS, "registration"),
     Measure("inlier_rmse", "Inlier RMSE", _RMSE, "registration"),
@@ -58,6 +70,7 @@ REGISTRATION = (
 COMPLETION = (
     Measure("surface_variation", "Geometric Smoothness", _VARIATION, "completion"),
     Measure("nue", "Distribution Uniformity", _NUE, "completion"),
+    Measure("nue_density_invariant", "not in the paper", _NUE_INVARIANT, "completion"),
     Measure("primitive_fitting_score", "Structural Plausibility", _PRIMITIVES, "completion"),
 )
 _TABLES = {2: (REGISTRATION, VARIANTS[:1]), 3: (COMPLETION, VARIANTS[:1]), 4: (REGISTRATION, VARIANTS[1:])}
@@ -74,11 +87,13 @@ class Column:
     Attributes:
         cells: value and unit by measure and variant; what does not exist is not in it.
         notes: by variant, what has to be said of it.
+        told: how a run of the paper's recipe was made.
         measured: whether it is measured here, so that a cell that is missing needs a reason.
     """
 
     cells: dict[tuple[str, str], tuple[float, str]] = field(default_factory=dict)
     notes: dict[str, str] = field(default_factory=dict)
+    told: str = ""
     measured: bool = True
 
 
@@ -89,7 +104,20 @@ def column_of(item: Collected) -> Column:
         status = status_of(item, variant)
         if status not in ("registered", "ungated"):
             notes[variant] = ", ".join(filter(None, (status, reason_of(item, variant))))
-    return Column(_cells({v: _measured(item.variants.get(v, {})) for v in VARIANTS}), notes)
+    return Column(_cells({v: _measured(item.variants.get(v, {})) for v in VARIANTS}), notes, _told(item))
+
+
+def _told(item: Collected) -> str:
+    """Of a run of the paper's recipe: whose poses it went on with, how many rays it drew, how much prior it had."""
+    fields = item.stages
+    source = find(fields, "stage1.pose_source")
+    said = {"chain": "poses are the pose network's, chained", "sfm": "poses are SfM's"}.get(str(source), "")
+    drawn, papers, prior = (
+        find(fields, f"stage2.{name}") for name in ("rays_per_epoch", "rays_per_epoch_paper", "prior_confident_share")
+    )
+    if drawn is not None and papers is not None:
+        said += f"; {drawn} rays an epoch of stages 2 and 4, where every pixel of the object once is {papers}"
+    return said + (f"; stage 2 has a depth for {100 * prior:.0f} % of the masks" if said and prior is not None else "")
 
 
 def without(reason: str) -> Column:
@@ -131,7 +159,8 @@ def _cells(found: Mapping[str, Fields]) -> dict[tuple[str, str], tuple[float, st
 
 
 def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]:
-    """The rows of an object: a cell for each column, and a note on those that are empty or no accepted pose's.
+    """The rows of an object: a cell for each column, how the preset's run was made (`preset`), and a note on those that
+    are empty or no accepted pose's.
 
     A row has one unit, this run's where it has one; what a column has in another unit is left out and said.
 
@@ -156,5 +185,5 @@ def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]
             elif value is None and column.measured:
                 why = why or _NOTHING[measure.group]
             notes += [f"{heading}: {why}"] if why else []
-        rows.append(row | {"note": "; ".join(notes) or None})
+        rows.append(row | {"preset": columns[HERE].told or None, "note": "; ".join(notes) or None})
     return rows
