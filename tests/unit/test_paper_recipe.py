@@ -35,6 +35,9 @@ from scenefuse.paper.monocular import (
 )
 from scenefuse.paper.refine_as_paper import refine_as_paper
 from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
+from scenefuse.sfm import matches
+from scenefuse.sfm.bundle import adjustment
+from scenefuse.sfm.bundle.lens import KNOWN
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3, rotation_between
 from scenefuse.workspace import View, read_workspace
@@ -48,14 +51,33 @@ def test_the_constants_are_the_papers():
     assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
     assert (nerf.images_per_batch, depth.batch_photos) == (24, 24)
     assert (recipe.FIELD.levels, recipe.FIELD.log2_table, recipe.FIELD.width) == (16, 19, 64)
-    assert nerf.edge_rate > 0 and recipe.LOSSES.rank_weight > 0 and recipe.LOSSES.depth_weight > 0
+    assert (
+        nerf.order_of_all
+        and nerf.prior_of_all
+        and nerf.edge_rate > 0
+        and recipe.LOSSES.rank_weight > 0
+        and recipe.LOSSES.depth_weight > 0
+    )
     assert nerf.prior_share == 0 and not nerf.appearance and recipe.LOSSES.distortion_weight == 0
     preset = read_settings(ROOT / "config/paper.yaml")
     assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == recipe.EPOCHS == 60
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
     assert preset["object"]["recipe"] == "paper" and preset["object"]["stage1"]["pose_source"] == "chain"
+    crop = preset["registration"]["crop"]
+    box = {"mode": "fiducials", "shape": "box", "margin": 0, "remove_ground": False}
+    assert crop | box == crop and preset["fusion"]["mode"] == "append"
+    assert preset["registration"]["variants"] == ["full", "no_scale", "no_crop"]
+    assert preset["object"]["masks"]["method"] == "sam2"
     later = yaml.safe_load((ROOT / "config/paper_from_sfm.yaml").read_text())["object"]["stage1"]
     assert later == {"epochs": preset["object"]["stage1"]["epochs"], "pose_source": "sfm"}
+
+
+def test_the_constants_of_sfm_are_the_papers():
+    own = read_settings(ROOT / "config/paper.yaml")["scene"]
+    assert (own["matches"]["max_ratio"], matches.MAX_DISTANCE, own["matches"]["guided_matching"]) == (0.7, 0.7, True)
+    options = adjustment.adjustment_options(KNOWN.freedom, adjustment.TOLERANCE).ceres.solver_options
+    assert (options.max_num_iterations, options.max_linear_solver_iterations) == (100, 200)
+    assert options.function_tolerance == options.gradient_tolerance == options.parameter_tolerance == 0
 
 
 def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_on_a_cpu():
