@@ -86,7 +86,7 @@ def readable(path: Path) -> Iterator[None]:
         kind = path.suffix.removeprefix(".").upper()
         why = (str(error) or type(error).__name__).splitlines()[0]
         raise StageError(
-            f"{path} is not a readable {kind} cloud: damaged or cut short ({why}); copy or export it again"
+            f"{path} is not a readable {kind} cloud ({why}); copy it again, for it may be cut short, or export it again"
         ) from None
 
 
