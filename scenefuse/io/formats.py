@@ -447,7 +447,7 @@ def _text(path: Path) -> Columns:
     if names and len(names) in (rows.shape[1], rows.shape[1] + 1) and above:
         print(f"{path.name}: '{head[above - 1].strip()[:60]}' names no columns x, y, z; the first three are these")
     columns, start = dict(zip(POSITION, rows.T)), 3
-    if rows.shape[1] % 3 == 1 and rows.shape[1] > 4:
+    if rows.shape[1] % 3 == 1 and rows.shape[1] >= (4 if path.suffix.lower() == ".pts" else 7):
         start = _colors_at(path, rows)
         columns |= {"intensity": rows[:, 3]} if start == 4 else {}
     for first in range(start, rows.shape[1] - 2, 3):

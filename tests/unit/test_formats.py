@@ -148,6 +148,7 @@ def test_las_of_eight_bit_colours_is_not_darkened(tmp_path):
         ("csv", "exported by hand\nnx;ny;nz;x;y;z\n", "np", ";"),
         ("txt", "//X Y Z R G B Nx Ny Nz\n", "pcn", " "),
         ("pts", "40\n", "pic", " "),
+        ("pts", "40\n", "pi", " "),
         ("xyz", "\n# a comment\n\n", "pc", "   "),
     ],
 )
@@ -160,6 +161,7 @@ def test_text_of_any_layout(tmp_path, cloud, ending, above, columns, mark):
     assert np.array_equal(found.points, cloud.points)
     assert (found.colors is not None) == ("c" in columns) and (found.normals is not None) == ("n" in columns)
     assert found.colors is None or np.array_equal(found.colors, cloud.colors)
+    assert ("intensity" in found.fields) == ("i" in columns)
     assert found.normals is None or np.array_equal(found.normals, cloud.normals)
 
 
