@@ -5,40 +5,24 @@ Columns have the names that PLY uses (x, y, z, nx, ny, nz, red, green, blue); al
 the precision of the file. Libraries are loaded when a file needs them.
 """
 
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.columns import COLOR, POSITION, Columns, common_name
 from scenefuse.io.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
+from scenefuse.io.text_clouds import TEXTS, text_parts
 from scenefuse.io.tiles.ply_header import read_header
 from scenefuse.stage import StageError
 
-Columns = dict[str, NDArray[Any]]
-
-POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
 LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
 # Classes of LAS that are no surface: low and high noise.
 NOISE = (7, 18)
-# What other programs call the same columns, in lower case and without spaces, dots and underscores.
-OTHER_NAMES = {
-    **dict(zip(("normalx", "normaly", "normalz"), NORMAL)),
-    **dict(zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), COLOR * 3)),
-}
-
-TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
-# What surveyors call the columns of text, in lower case.
-EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
-NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
-ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
-# By how much the better of two places for the colours among a text's columns has to be.
-CLEARLY = 0.1
 # Points of a LAS file that are looked at for what they say beside positions and colours.
 LOOKED_AT = 1_000_000
 # Narrower than this share of its height, a cloud at coordinates like longitude and latitude is in degrees.
@@ -92,7 +76,7 @@ def readable(path: Path) -> Iterator[None]:
 
 def checked(path: Path, columns: Columns) -> Columns:
     """Columns by their common names; StageError where there are no positions."""
-    columns = {_common_name(name): values for name, values in columns.items()}
+    columns = {common_name(name): values for name, values in columns.items()}
     if not set(POSITION) <= set(columns):
         raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
     return columns
@@ -185,11 +169,6 @@ def las_dimensions(path: Path) -> list[str]:
     return [name for name in names if name in differing or (name == "classification" and values[name].any())]
 
 
-def _common_name(name: str) -> str:
-    plain = re.sub(r"[\s._]", "", name.lower())
-    return OTHER_NAMES.get(plain, plain if plain in (*POSITION, *NORMAL, *COLOR) else name)
-
-
 def _ply(path: Path) -> Columns:
     from plyfile import PlyData
 
@@ -202,7 +181,7 @@ def _ply(path: Path) -> Columns:
     corners = next((name for name in ("vertex_indices", "vertex_index") if name in face.dtype.names), None)
     if corners is None or not set(POSITION) <= set(columns):
         return columns
-    named = {_common_name(name): values for name, values in columns.items()}
+    named = {common_name(name): values for name, values in columns.items()}
     vertices = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
     colors = None
     if set(COLOR) <= set(named):
@@ -408,149 +387,12 @@ def _lzf(packed: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
     return target
 
 
-def _text(path: Path) -> Columns:
-    """Rows of numbers, separated by blanks, commas or semicolons, below any number of other lines.
-
-    A line above the rows that names the columns (`//X Y Z R G B`, `Point,Northing,Easting,Elevation`) is believed.
-    Without one, the first three columns are x, y, z and each three that follow are normals if they have unit length,
-    else colours, if they can be; an intensity may stand before or behind these. A first column that names or numbers
-    the points is left out, and so is what follows: that is printed.
-    """
-    with open(path, encoding="utf-8-sig") as file:
-        head = list(islice(file, 50))
-    if not "".join(head).strip():
-        return {name: np.empty(0) for name in POSITION}
-    above, named = _first_row(path, head)
-    separator = _separator(head[above])
-    # A name counts as a number, so that rows of another length are still an error.
-    first_cell: Any = {0: lambda name: 0.0} if named else None
-    rows = np.loadtxt(
-        path, skiprows=above, delimiter=separator, ndmin=2, encoding="utf-8-sig", converters=first_cell,
-        comments=None if named else "#",
-    )  # fmt: skip
-    titles = head[above - 1].strip(" \t\r\n/#").split(separator) if above else []
-    names = [title.strip().strip("\"'") for title in titles]
-    if len(names) == rows.shape[1]:
-        if set(POSITION) <= {_common_name(name) for name in names}:
-            return dict(zip(names, rows.T))
-        axes = [[name for name in names if name.lower() in known] for known in (EASTING, NORTHING, ELEVATION)]
-        if all(len(found) == 1 for found in axes):
-            own = {found[0]: axis for axis, found in zip(POSITION, axes)}
-            print(f"{path.name}: {', '.join(f'{axis} is {name}' for name, axis in own.items())}", flush=True)
-            return {own.get(name, name): values for name, values in zip(names, rows.T) if not named or name != names[0]}
-    degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
-    if degrees is not None:
-        raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
-    if named or _numbers_points(rows):
-        rows = rows[:, 1:]
-        print(f"{path.name}: its first column names or numbers the points and is left out", flush=True)
-    if names and len(names) in (rows.shape[1], rows.shape[1] + 1) and above:
-        print(f"{path.name}: '{head[above - 1].strip()[:60]}' names no columns x, y, z; the first three are these")
-    columns, start = dict(zip(POSITION, rows.T)), 3
-    if rows.shape[1] % 3 == 1 and rows.shape[1] >= (4 if path.suffix.lower() == ".pts" else 7):
-        start = _colors_at(path, rows)
-        columns |= {"intensity": rows[:, 3]} if start == 4 else {}
-    for first in range(start, rows.shape[1] - 2, 3):
-        three = rows[:, first : first + 3]
-        unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
-        kind = NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR
-        if kind[0] in columns or (kind == COLOR and not _may_be_colors(three)):
-            break
-        columns |= dict(zip(kind, three.T))
-    if further := rows.shape[1] - len(columns):
-        print(f"{path.name}: {further} of its columns have no names and are left out", flush=True)
-    return columns
-
-
-def _may_be_colors(three: NDArray[np.float64]) -> bool:
-    """Whether (N, 3) lie in a range of colours; coordinates, times and directions mostly do not."""
-    three = three[np.isfinite(three).all(1)]
-    return bool(three.min(initial=0) >= 0 and three.max(initial=0) <= 65535)
-
-
-def _colors_at(path: Path, rows: NDArray[np.float64]) -> int:
-    """Where the colours begin among (N, C) columns of which one is an intensity: 3, or 4 where it stands before them.
-
-    The file does not say. Colours are alike, red and blue most like green; where both places are possible, and neither
-    is clearly the better one, they are at none: C.
-    """
-    if path.suffix.lower() == ".pts":
-        return 4
-    finite = rows[np.isfinite(rows).all(1)]
-    places = [first for first in (3, 4) if _may_be_colors(finite[:, first : first + 3])]
-    whole = [first for first in places if (finite[:, first : first + 3] == np.rint(finite[:, first : first + 3])).all()]
-    places = whole if len(whole) == 1 else places
-    lengths = {first: np.linalg.norm(finite[:, first : first + 3], axis=1) for first in (3, 4)}
-    unit = [first for first, length in lengths.items() if (np.abs(length - 1) < 0.02).all()]
-    if len(unit) == 1 or len(places) == 1:
-        return (unit or places)[0]
-    varying = len(places) == 2 and len(finite) > 1 and (np.ptp(finite[:, 3:7], axis=0) > 0).all()
-    alike = np.array(np.corrcoef(finite[:, 3:7].T)) if varying else np.zeros((4, 4))
-    behind, before = min(alike[0, 1], alike[1, 2]), min(alike[1, 2], alike[2, 3])
-    if abs(before - behind) > CLEARLY:
-        first = 4 if before > behind else 3
-        said = f"columns {first + 1} to {first + 3} are taken for red, green and blue"
-    else:
-        first, said = rows.shape[1], "which columns are colours cannot be told, and none are read"
-    print(f"{path.name}: {said}; name the columns in a first line (x y z intensity r g b) if this is wrong", flush=True)
-    return first
-
-
-def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
-    """Where the rows begin among the first lines, and whether a name stands before the numbers of all of them.
-
-    Raises:
-        ValueError: there are none.
-        StageError: decimals have commas.
-    """
-    last = next(line.strip() for line in reversed(head) if line.strip())
-    commas = len(re.findall(r"(?<![\d.,])-?\d+,\d+(?![\d.,])", last))
-    if commas >= 3 or (commas and (";" in last or "\t" in last)):
-        raise StageError(f"{path} has commas as decimal points: '{last[:60]}'; export it with points")
-    numbers = next((k for k, line in enumerate(head) if len(_numbers(line)) >= 3), None)
-    if numbers is not None:
-        return numbers, False
-    counts = [len(_numbers(line, True)) for line in head]
-    usual = max((count for count in counts if count >= 3), key=counts.count, default=None)
-    if usual is None:
-        raise ValueError("none of its first lines holds three numbers")
-    first = counts.index(usual)
-    if any(count != usual for count, line in zip(counts[first:], head[first:]) if line.strip()):
-        raise ValueError("its rows have different numbers of columns")
-    return first, True
-
-
-def _numbers_points(rows: NDArray[np.float64]) -> bool:
-    """Whether the first of (N, C) columns numbers the points: one after the other, or whole numbers, each once, before
-    coordinates that are not whole where x, y, z and colours or normals would be a column fewer or more."""
-    first, columns = rows[:, 0], rows.shape[1]
-    if columns <= 3 or len(rows) <= 3:
-        return False
-    if (first == first[0] + np.arange(len(first))).all():
-        return True
-    whole = (rows[:, :4] == np.rint(rows[:, :4])).all(0)
-    once = len(np.unique(first)) == len(first)
-    return bool(columns % 3 == 1 and whole[0] and not whole[1:].any() and once)
-
-
-def _separator(line: str) -> str | None:
-    return next((mark for mark in ";," if mark in line), None)
-
-
-def _numbers(line: str, named: bool = False) -> list[float]:
-    """The numbers of a line of numbers, with a name before them or not; none of any other."""
-    cells = line.split(_separator(line))
-    try:
-        return [float(cell) for cell in cells[int(named) :]]
-    except ValueError:
-        return []
-
-
 def part_reader(path: Path) -> Callable[[Path, int], Iterator[Columns]] | None:
     """What reads so many points of a file at a time; None where it has to be read whole."""
     ending = path.suffix.lower()
     if ending != ".ply":
-        return {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts}.get(ending)
+        in_parts = {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts, **dict.fromkeys(TEXTS, text_parts)}
+        return in_parts.get(ending)
     elements = (read_header(path) or ([], 0))[0]
     plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
     return _ply_parts if plain and not any(element.name == "face" for element in elements) else None
@@ -564,5 +406,5 @@ READERS = {
     ".laz": _las,
     ".e57": _e57,
     ".pcd": _pcd,
-    **dict.fromkeys(TEXTS, _text),
+    **dict.fromkeys(TEXTS, lambda path: _joined(text_parts(path))),
 }

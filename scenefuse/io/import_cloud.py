@@ -18,16 +18,9 @@ from scenefuse.io.clouds import (
     spacing,
     write_cloud,
 )
-from scenefuse.io.formats import (
-    COLOR,
-    LAS_DIMENSIONS,
-    NOISE,
-    POSITION,
-    Columns,
-    check_not_degrees,
-    las_crs,
-    las_dimensions,
-)
+from scenefuse.io.columns import COLOR, POSITION, Columns
+from scenefuse.io.formats import LAS_DIMENSIONS, NOISE, check_not_degrees, las_crs, las_dimensions
+from scenefuse.io.text_clouds import text_notes
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
 from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled
@@ -257,7 +250,7 @@ def write_placed(
 def import_report(source: Path, own: Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
     """What was taken over, and what became of the rest; printed too."""
     notes = [f"{count} {why} were left out" for why, count in own.left_out.items() if count]
-    notes += precision_note(source, own.sample, step)
+    notes += [*text_notes(source), *precision_note(source, own.sample, step)]
     if own.unit_normals is False:
         notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
     if own.unused:

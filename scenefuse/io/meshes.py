@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.io.columns import Columns
+
 Array = NDArray[np.float64]
-Columns = dict[str, NDArray[Any]]
 
 # Points drawn from a mesh; one with more vertices gives as many as it has.
 MESH_POINTS = 500_000

@@ -237,12 +237,12 @@ def _taken(
     """The same from given cameras."""
     work, place = sparse.with_name(f"{sparse.name}-given"), place_of(cameras)
     options = _mapper_options(len(names), True, seed)
-    model = triangulated(cameras, folder, orientations, database, work, options)
+    model, turned = triangulated(cameras, folder, orientations, database, work, options)
     _check_registered([model], names, settings.min_registered_share)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
     print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
-    notes = [f"cameras are those of {cameras.name}, held"]
+    notes = [f"cameras are those of {cameras.name}, held", *turned]
     on_earth = {} if place is None else place.report()
     return model, summary | on_earth | {"models_left_out": quantity([], ""), "notes": quantity(notes, "")}
 

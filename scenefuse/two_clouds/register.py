@@ -11,6 +11,7 @@ import tyro
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, at_nothing, precision_note, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.io.formats import check_not_degrees, las_crs, las_noise
+from scenefuse.io.text_clouds import text_notes
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
@@ -154,7 +155,7 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     cloud, whole = read_cloud(object), read_cloud(scene)
     for path, points in ((object, cloud.points), (scene, whole.points)):
         check_not_degrees(path, points)
-    notes = _notes(object, scene)
+    notes = [*text_notes(object), *text_notes(scene), *_notes(object, scene)]
     crs = las_crs(scene)
     if crs is not None:
         from scenefuse.io.crs import check_place

@@ -11,6 +11,7 @@ from support.cloud_files import UTM, write_e57
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import bytes_of, las_crs
+from scenefuse.io.text_clouds import text_notes, text_parts
 from scenefuse.stage import StageError
 
 
@@ -166,24 +167,24 @@ def test_text_of_any_layout(tmp_path, cloud, ending, above, columns, mark):
 
 
 @pytest.mark.parametrize(("order", "where"), [("pic", "5 to 7"), ("pci", "4 to 6")])
-def test_an_intensity_before_or_behind_the_colours_is_told_from_them(tmp_path, capsys, order, where):
+def test_an_intensity_before_or_behind_the_colours_is_told_from_them(tmp_path, order, where):
     rng = np.random.default_rng(0)
     points, grey = rng.uniform(0, 9, (500, 3)), rng.uniform(30, 220, (500, 1))
     colors = np.rint(grey + rng.normal(0, 10, (500, 3))).clip(0, 255)
     parts = {"p": points, "c": colors, "i": np.rint(rng.uniform(0, 255, (500, 1)))}
     np.savetxt(tmp_path / "a.txt", np.hstack([parts[part] for part in order]), fmt="%.3f")
     assert np.array_equal(read_cloud(tmp_path / "a.txt").colors, colors)
-    assert f"columns {where} are taken for red, green and blue" in capsys.readouterr().out
+    assert f"columns {where} are taken for red, green and blue" in "".join(text_notes(tmp_path / "a.txt"))
 
 
-def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path, capsys):
+def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path):
     rng = np.random.default_rng(0)
     np.savetxt(tmp_path / "a.txt", np.hstack([rng.uniform(0, 9, (500, 3)), rng.integers(0, 255, (500, 4))]), fmt="%.3f")
     assert read_cloud(tmp_path / "a.txt").colors is None
-    assert "which columns are colours cannot be told" in capsys.readouterr().out
+    assert "which columns are colours cannot be told" in "".join(text_notes(tmp_path / "a.txt"))
     np.savetxt(tmp_path / "b.txt", np.hstack([rng.uniform(0, 9, (500, 3)), rng.normal(0, 99, (500, 3))]), fmt="%.3f")
     assert read_cloud(tmp_path / "b.txt").colors is None
-    assert "3 of its columns have no names and are left out" in capsys.readouterr().out
+    assert "3 of its columns have no names and are left out" in "".join(text_notes(tmp_path / "b.txt"))
 
 
 @pytest.mark.parametrize(
@@ -195,18 +196,20 @@ def test_where_colours_cannot_be_told_from_other_columns_there_are_none(tmp_path
         ("E N H", "{x} {y} {z}"),
     ],
 )
-def test_columns_by_their_surveyors_names(tmp_path, capsys, header, row):
+def test_columns_by_their_surveyors_names(tmp_path, header, row):
     points = np.random.default_rng(0).uniform(100, 900, (20, 3)).round(3)
     lines = [row.format(k=k, x=x, y=y, z=z) for k, (x, y, z) in enumerate(points.tolist(), 1)]
     (tmp_path / "a.csv").write_text("\n".join([header, *lines]))
     assert np.array_equal(read_cloud(tmp_path / "a.csv").points, points)
-    assert "y is " in capsys.readouterr().out
+    assert "y is " in "".join(text_notes(tmp_path / "a.csv"))
 
 
-def test_a_header_that_is_not_understood_is_named(tmp_path, capsys):
+def test_a_header_that_is_not_understood_is_named(tmp_path):
     (tmp_path / "a.csv").write_text("left,right,up\n1,2,3\n4,5,6\n")
     assert read_cloud(tmp_path / "a.csv").points.tolist() == [[1, 2, 3], [4, 5, 6]]
-    assert "'left,right,up' names no columns x, y, z; the first three are these" in capsys.readouterr().out
+    assert "'left,right,up' names no columns x, y, z; the first three are these" in "".join(
+        text_notes(tmp_path / "a.csv")
+    )
 
 
 def test_rows_that_are_not_finite_are_dropped_and_counted(tmp_path, capsys, cloud):
@@ -261,7 +264,7 @@ def test_a_column_that_counts_the_rows_is_no_coordinate(tmp_path):
     np.testing.assert_allclose(read_cloud(tmp_path / "grid.xyz").points[:, 0], np.arange(20) % 10)
 
 
-def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_path, capsys):
+def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_path):
     points = np.random.default_rng(0).uniform(-5, 5, (20, 3)).round(3)
     numbers = np.random.default_rng(1).permutation(100)[:20]
     np.savetxt(tmp_path / "thinned.txt", np.column_stack([numbers, points]), fmt="%.3f")
@@ -269,10 +272,10 @@ def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_pat
     (tmp_path / "named.txt").write_text("Survey of 1 2 2026\n" + "\n".join(rows))
     for name in ("thinned.txt", "named.txt"):
         np.testing.assert_allclose(read_cloud(tmp_path / name).points, points)
-        assert f"{name}: its first column names or numbers the points" in capsys.readouterr().out
+        assert f"{name}: its first column names or numbers the points" in "".join(text_notes(tmp_path / name))
     np.savetxt(tmp_path / "more.xyz", np.column_stack([points, numbers]), fmt="%.3f")
     np.testing.assert_allclose(read_cloud(tmp_path / "more.xyz").points, points)
-    assert "1 of its columns have no names" in capsys.readouterr().out
+    assert "1 of its columns have no names" in "".join(text_notes(tmp_path / "more.xyz"))
 
 
 def test_whole_coordinates_are_no_numbers_of_points(tmp_path):
@@ -311,3 +314,17 @@ def test_a_table_in_degrees_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("Longitude,Latitude,Height\n8.1,47.2,400\n8.2,47.1,401\n8.3,47.3,402\n")
     with pytest.raises(StageError, match=r"is in degrees \(column Longitude\)"):
         read_cloud(tmp_path / "a.csv")
+
+
+def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, monkeypatch):
+    monkeypatch.setattr("scenefuse.io.text_clouds.HEAD", 10)
+    monkeypatch.setattr("scenefuse.io.text_clouds.LOOKED_AT", 5)
+    points = np.random.default_rng(0).uniform(-5, 5, (25, 3)).round(3)
+    np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f", header="x y z\n")
+    parts = list(text_parts(tmp_path / "a.xyz", 10))
+    assert [len(part["x"]) for part in parts] == [10, 10, 5]
+    np.testing.assert_allclose(np.concatenate([np.column_stack(list(part.values())) for part in parts]), points)
+    lines = (tmp_path / "a.xyz").read_text().splitlines()
+    (tmp_path / "b.xyz").write_text("\n".join([*lines[:-1], "1 2"]) + "\n")
+    with pytest.raises(ValueError, match=r"row 5.*rows counted from line 23"):
+        list(text_parts(tmp_path / "b.xyz", 10))

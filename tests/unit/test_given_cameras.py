@@ -210,6 +210,11 @@ def test_cameras_of_photos_as_stored_are_turned_with_what_exif_turns(tmp_path, o
     report, model = mapped(tmp_path, tmp_path / "given")
     np.testing.assert_allclose(camera_poses(model)[2], FLIGHT.centres, atol=1e-6)
     assert value(report, "points") > 150 and value(report, "mean_reprojection_error_px") < 0.01
+    said = value(report, "notes")[1]
+    if quarters % 2:
+        assert said == f"the cameras of {len(turned)} photos were turned, as EXIF rotates these photos"
+    else:
+        assert "does not say whether its cameras are for them as they are stored: they are taken as stored" in said
 
 
 def test_a_turned_lens_bends_as_before():

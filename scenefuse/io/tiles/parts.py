@@ -3,7 +3,8 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from scenefuse.io.formats import Columns, check_projected, checked, part_reader, read_columns, readable
+from scenefuse.io.columns import Columns
+from scenefuse.io.formats import check_projected, checked, part_reader, read_columns, readable
 from scenefuse.io.tiles.tiled_cloud import AT_ONCE
 
 ColumnParts = Callable[[], Iterator[Columns]]
@@ -12,7 +13,7 @@ ColumnParts = Callable[[], Iterator[Columns]]
 def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
     """The columns of a cloud file, as `read_columns` has them, AT_ONCE rows at a time each time this is called.
 
-    LAS, LAZ (COPC too), E57 and binary PLY are read anew each time; PCD, text and meshes once, and held. Here colours
+    LAS, LAZ (COPC too), E57, text and binary PLY are read anew each time; PCD and meshes once, and held. Here colours
     of a LAS file may all be black.
 
     Args:

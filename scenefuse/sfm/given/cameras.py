@@ -35,8 +35,9 @@ def triangulated(
     database: Path,
     work: Path,
     options: pycolmap.IncrementalPipelineOptions,
-) -> pycolmap.Reconstruction:
-    """The model of given cameras: poses and lenses as they are, points from the photos' own matches.
+) -> tuple[pycolmap.Reconstruction, list[str]]:
+    """The model of given cameras: poses and lenses as they are, points from the photos' own matches; and what was
+    decided about photos that EXIF rotates, a sentence each.
 
     Args:
         cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
@@ -61,14 +62,23 @@ def triangulated(
         raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
     ways = possible_turns(posed, orientations, sizes)
     models = [_model(way, cameras, folder, database, work, options) for way in ways]
-    found = max(models, key=lambda model: model.num_points3D())
+    met = [model.num_points3D() for model in models]
+    best = int(np.argmax(met))
+    found, turned = models[best], sum(ways[best][name] is not posed[name] for name in posed)
     points = [found.images[i].num_points3D for i in found.reg_image_ids()]
     if not points or np.median(points) < MIN_POINTS:
         raise StageError(
             f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
             " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
         )
-    return found
+    notes = [f"the cameras of {turned} photos were turned, as EXIF rotates these photos"] if turned else []
+    if len(ways) > 1:
+        notes = [
+            f"EXIF rotates photos, and {cameras.name} does not say whether its cameras are for them as they are stored:"
+            f" they are taken as {('upright', 'stored')[best]}, whose matches meet in {met[best]} points, and not as"
+            f" {('stored', 'upright')[best]}, with {met[1 - best]}"
+        ]
+    return found, notes
 
 
 def _model(
