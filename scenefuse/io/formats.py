@@ -21,8 +21,8 @@ from scenefuse.stage import StageError
 
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
 LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
-# Classes of LAS that are no surface: low and high noise.
-NOISE = (7, 18)
+# Classes of LAS that are no surface: low and high noise; the flag of points that whoever edited the cloud took out.
+NOISE, WITHHELD = (7, 18), "withheld"
 # Points of a LAS file that are looked at for what they say beside positions and colours.
 LOOKED_AT = 1_000_000
 # Narrower than this share of its height, a cloud at coordinates like longitude and latitude is in degrees.
@@ -144,7 +144,7 @@ def las_noise(path: Path) -> NDArray[np.bool_] | None:
 
     with readable(path), laspy.open(path) as file:
         parts = [
-            np.isin(np.asarray(part.classification), NOISE) | (np.asarray(part.withheld) != 0)
+            np.isin(np.asarray(part.classification), NOISE) | (np.asarray(part[WITHHELD]) != 0)
             for part in file.chunk_iterator(LOOKED_AT)
         ]
     noise = np.concatenate(parts) if parts else np.zeros(0, bool)
@@ -209,14 +209,15 @@ def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
 
 def _las(path: Path) -> Columns:
     """Positions, colours (unless all are black, which means none), and extra dimensions of one number."""
-    columns = {name: values for name, values in _joined(_las_parts(path, -1)).items() if name not in LAS_DIMENSIONS}
+    own = {*LAS_DIMENSIONS, WITHHELD}
+    columns = {name: values for name, values in _joined(_las_parts(path, -1)).items() if name not in own}
     if set(COLOR) <= set(columns) and not any(columns[name].any() for name in COLOR):
         columns = {name: values for name, values in columns.items() if name not in COLOR}
     return columns
 
 
 def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
-    """The same, so many points at a time, with classes and intensities, and black colours too."""
+    """The same, so many points at a time, with classes and intensities, what is withheld, and black colours too."""
     import laspy
 
     with laspy.open(path) as file:
@@ -226,6 +227,7 @@ def _las_parts(path: Path, at_once: int) -> Iterator[Columns]:
             count += len(points)
             extra = {name: np.asarray(points[name]) for name in form.extra_dimension_names}
             own = {name: np.asarray(points[name]).astype(kind) for name, kind in LAS_DIMENSIONS.items()}
+            own[WITHHELD] = np.asarray(points[WITHHELD]) != 0
             yield (
                 {name: np.asarray(points[name]) for name in named}
                 | own

@@ -19,7 +19,7 @@ from scenefuse.io.clouds import (
     write_cloud,
 )
 from scenefuse.io.columns import COLOR, POSITION, Columns
-from scenefuse.io.formats import LAS_DIMENSIONS, NOISE, check_not_degrees, las_crs, las_dimensions
+from scenefuse.io.formats import LAS_DIMENSIONS, NOISE, WITHHELD, check_not_degrees, las_crs, las_dimensions
 from scenefuse.io.text_clouds import text_notes
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
 from scenefuse.io.tiles.tiled_cloud import open_cloud
@@ -188,7 +188,7 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     if count == 0:
         what = "point with a finite position" if any(left_out.values()) else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
-    unused = (unused | set(las_dimensions(source))) - known.intersection(keep)
+    unused = (unused | set(las_dimensions(source))) - known.intersection(keep) - {WITHHELD}
     different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
     if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
         raise StageError(
@@ -210,6 +210,8 @@ def _usable(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
     if is_las:
         columns, noise = chosen_rows(columns, ~np.isin(columns["classification"], NOISE))
         without[f"points of the classes {NOISE[0]} and {NOISE[1]} (noise)"] = noise
+        columns, without["withheld points"] = chosen_rows(columns, ~columns[WITHHELD])
+        columns = {name: values for name, values in columns.items() if name != WITHHELD}
     return columns, without
 
 

@@ -187,11 +187,15 @@ def test_classes_and_intensities_of_a_laz_are_kept_for_a_scene_and_named_for_an_
 def test_noise_of_a_laz_and_points_at_nothing_are_left_out_and_counted(tmp_path, cloud):
     las = laspy.read(write_as(tmp_path / "a.laz", cloud))
     las.classification[:30], las.classification[30:50] = 7, 18
-    las.z[:50] = 4000.0
+    las.withheld[50:60] = 1
+    las.z[:60] = 4000.0
     las.write(tmp_path / "noisy.laz")
     found, report, _ = imported_scene(tmp_path, tmp_path / "noisy.laz")
-    assert len(found) == 450 and value(report, "diagonal") < 100
-    assert value(report, "notes") == ["50 points of the classes 7 and 18 (noise) were left out"]
+    assert len(found) == 440 and value(report, "diagonal") < 100
+    assert value(report, "notes")[:2] == [
+        "50 points of the classes 7 and 18 (noise) were left out",
+        "10 withheld points were left out",
+    ]
     points = cloud.points.copy()
     points[:4] = 0
     write_cloud(tmp_path / "zero.ply", Cloud(points))
