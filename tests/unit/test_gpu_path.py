@@ -1,18 +1,24 @@
 """The code for a GPU keeps its tensors together; where there is no GPU, on one that is pretended."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 from support.pretend_gpu import OnGpu, PretendGpu, to_pretended
+from support.sideways_video import sideways_video
 from support.textured_plane import plane_views
 
+from scenefuse.depth.training import Recipe, optimise, predict
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
+from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
+from scenefuse.paper.recipe import NERF
 
 
 @pytest.fixture
@@ -38,11 +44,12 @@ def test_the_pretended_gpu_notices_what_was_left_behind(gpu):
             mistake()
 
 
-def test_training_and_rendering_on_a_gpu(gpu, tmp_path):
+@pytest.mark.parametrize("recipe", [NerfRecipe(), NERF], ids=["scenefuse", "paper"])
+def test_training_and_rendering_on_a_gpu(gpu, tmp_path, recipe):
     views = sphere_views(6, 40)
     cube, hull = sphere_volume(views, 32)
     photos = photos_of(views, cube, prior=1.0)
-    recipe = NerfRecipe(images_per_batch=3, rays_per_image=16, pose_learning_rate=1e-4)
+    recipe = replace(recipe, images_per_batch=3, rays_per_image=16, pose_learning_rate=1e-4)
     nerf = new_nerf(FieldSettings(log2_table=12), torch.from_numpy(hull), len(photos), 0, "cuda")
     schedule = Schedule(epochs=1, rays_per_epoch=48 * 20)
     training = Training(photos, schedule, recipe, LossWeights(), warm=False, seed=0)
@@ -59,3 +66,16 @@ def test_depths_are_refined_by_photos_on_a_gpu(gpu):
         views, views.object_from_cam, truth.astype(np.float32), RefinementSettings(match_reach_px=4.0)
     )
     assert refined.depths.shape == truth.shape
+
+
+def test_the_papers_networks_train_on_a_gpu(gpu, tmp_path):
+    cuda = torch.device("cuda")
+    frames, length = frames_of(sideways_video(6), cuda), Recipe(1, 1, 24, 0.0)
+    target, weight = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
+    networks = new_monocular_networks(cuda)
+    for supervision in (supervision_of(frames), supervision_of(frames, target, weight)):
+        losses = optimise(
+            networks, frames, monocular_losses(networks, frames, supervision, length), length, tmp_path / "state.pt", 0
+        )
+        assert np.isfinite(losses[-1]["photometric"])
+        assert bool((predict(networks.depth, frames, supervision) > 0).all())
