@@ -9,10 +9,11 @@ from support.photographed_plane import BLANK, photographs
 
 from scenefuse.masks.clicked.carry import carry
 from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.clicked.parts import with_parts
 from scenefuse.masks.clicked.stereo_points import with_stereo_points
 from scenefuse.masks.clicked.votes import known_points, voter_of
 from scenefuse.mvs.visual_hull import mask_iou
-from scenefuse.workspace import Workspace
+from scenefuse.workspace import View, Workspace
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 
@@ -91,3 +92,38 @@ def test_a_part_without_features_is_carried_by_stereo_though_the_network_is_sure
     assert mask_iou(carried.masks[1], disc(few.views[1])) < 0.8
     carried = carry(ask, with_stereo_points(few), told, 2)
     assert all(mask_iou(m, disc(v)) > 0.99 for m, v in zip(carried.masks, few.views))
+
+
+@pytest.mark.parametrize(("like", "added"), [("mask", True), ("surroundings", False)])
+def test_a_part_that_looks_like_what_is_around_it_is_added_only_if_it_was_clicked(like, added):
+    rng = np.random.default_rng(0)
+    mask, part = np.zeros((120, 160), dtype=bool), np.zeros((120, 160), dtype=bool)
+    mask[40:80, 30:80] = True
+    part[50:70, 80:100] = True
+    colors = {"mask": (150, 80, 60), "surroundings": (120, 160, 220)}
+    image = np.where((mask | (part if like == "mask" else False))[..., None], colors["mask"], colors["surroundings"])
+    image = (image + rng.integers(-20, 20, image.shape)).astype(np.uint8)
+    view = View("a.jpg", np.eye(3), np.eye(4), 160, 120, image)
+
+    def ask(*_):
+        return [part], np.array([0.9])
+
+    on = np.column_stack([rng.uniform(82, 98, 6), rng.uniform(52, 68, 6)])
+    of_mask, none = np.column_stack([rng.uniform(32, 78, 20), rng.uniform(42, 78, 20)]), np.zeros((0, 2))
+    carried = with_parts(ask, view, mask, (none, np.concatenate([of_mask, on])), (none, none), none, 2.0)
+    assert (carried == (mask | part if added else mask)).all()
+    clicked = with_parts(ask, view, mask, (on, of_mask), (none, none), none, 2.0)
+    assert (clicked == mask | part).all()
+
+
+def test_a_part_that_goes_far_beyond_the_points_next_to_an_outline_is_not_added():
+    mask, part, none = np.zeros((120, 160), dtype=bool), np.zeros((120, 160), dtype=bool), np.zeros((0, 2))
+    mask[40:80, 30:80] = True
+    part[45:75, 80:130] = True
+    view = View("a.jpg", np.eye(3), np.eye(4), 160, 120, np.full((120, 160, 3), 100, np.uint8))
+    rng = np.random.default_rng(0)
+    for farthest, added in ((90, False), (125, True)):
+        on = np.column_stack([np.linspace(82, farthest, 12), rng.uniform(56, 64, 12)])
+        known = np.concatenate([np.column_stack([rng.uniform(32, 78, 20), rng.uniform(42, 78, 20)]), on])
+        found = with_parts(lambda *_: ([part], np.array([0.9])), view, mask, (none, known), (none, none), none, 2.0)
+        assert (found == (mask | part if added else mask)).all()

@@ -240,6 +240,7 @@ def test_what_a_mask_takes_in_far_behind_the_object_prompts_no_other_photo():
 
 def test_a_part_that_the_objects_points_enclose_is_added(photos):
     view, inside = photos.views[0], np.array([MIDDLE])
+    view = replace(view, pixels=np.where(hat(view)[..., None], np.uint8([95, 60, 50]), view.pixels))
     at = np.argwhere(hat(view))[::20, ::-1] + 0.5
     for enclosed, whole in ((at, true_mask(view) | hat(view)), (at[:2], true_mask(view))):
         found = with_parts(ask_for_the_clearest, view, true_mask(view), (inside, NONE), (NONE, NONE), enclosed, 2)

@@ -4,12 +4,13 @@ from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.masks.clicked.votes import LEAST_QUALITY, SURE
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.masks.pixels import held, pixel_of, share_in
+from scenefuse.masks.pixels import distance_to, held, pixel_of, share_in
 from scenefuse.mvs.visual_hull import Mask
 from scenefuse.transforms import Array
 from scenefuse.workspace import View
@@ -24,6 +25,15 @@ PART_REACH = 0.1
 """Pixels outside prompt a part if they are this near it, likewise."""
 NEAR_MISS = 0.015
 """A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part."""
+NEAREST_PX = 0.03
+"""A part's colours are compared with what is this near it, likewise, or within twice its radius where that is more."""
+COLOR_BINS = 8
+"""Bins of a histogram of colours along each axis of CIELAB."""
+LEAST_OWN, LEAST_REACH = -2.0, 0.4
+"""Mean logarithm of how much likelier a part's colours are in the mask near it than around; how far the points in it
+reach from the mask, over how far it does. Of 99 parts on four objects with true masks the two rules leave out 49, of
+which 47 were at most half on the object (sky between an arm and a leg, the hill behind a roof), and keep 50, of which
+47 were more."""
 
 Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None, Array | None], tuple[list[Mask], Array]]
 """Masks (H, W) of a photo with RGB pixels and their qualities, from pixels on the object, pixels off it, each (N, 2)
@@ -44,7 +54,9 @@ def with_parts(
 
     Each group of pixels inside that the mask does not hold, near each other, prompts alone. What it gives is a part of
     the object if it holds them, few pixels known to be outside beside those known to be inside, and is no larger than
-    the mask. Pixels of points that the object's enclose, (N, 2), are asked about likewise.
+    the mask. Unless it was clicked, it must not have the colours of what is around it, nor go far beyond its points: a
+    few next to an outline may be mismatched. Pixels of points that the object's enclose, (N, 2), are asked about
+    likewise.
     """
     whole = mask
     if agrees(mask, inside, outside, tolerance_px) < PART_AGREEMENT:
@@ -64,7 +76,9 @@ def with_parts(
             part = prompted_parts(cleaned(masks[row], view.pixels), on, off)
             own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate([inside[0], perhaps]), off))
             holds = part.any() and share_in(part, on, 1.0) >= SURE
-            if quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign) and part.sum() <= mask.sum():
+            sound = quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign)
+            sound = sound and part.sum() <= mask.sum()
+            if sound and (len(group[0]) or _vouched(view.pixels, mask, part & ~mask, on)):
                 whole = whole | part
                 break
     return whole
@@ -78,6 +92,40 @@ def agrees(mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array]
     within = np.concatenate([held(mask, inside[0], tolerance_px), held(mask, inside[1], 0)])
     spared = np.concatenate([held(~mask, outside[0], tolerance_px), held(~mask, outside[1], 0)])
     return float((within.sum() + 1) / (len(within) + 1) - ((~spared).mean() if len(spared) else 0.0))
+
+
+def _vouched(image: NDArray[np.uint8], mask: Mask, part: Mask, on: Array) -> bool:
+    """Whether the colours of a part (H, W) outside a mask, and how far the pixels (N, 2) in it lie from this, speak for
+    it."""
+    if not part.any():
+        return True
+    away = distance_to(mask)
+    u, v = pixel_of(on, mask)
+    reach = np.percentile(away[v, u], 90) / np.percentile(away[part], 90)
+    return bool(reach >= LEAST_REACH and own_colors(image, mask, part) >= LEAST_OWN)
+
+
+def own_colors(image: NDArray[np.uint8], mask: Mask, part: Mask) -> float:
+    """Mean logarithm, in nats, of how much likelier the colours of a part (H, W) are in the mask near it than outside
+    both, by histograms; 0 where there is nothing to compare.
+
+    Args:
+        image: (H, W, 3) RGB.
+        mask: (H, W).
+        part: (H, W), outside the mask, not empty.
+    """
+    reach = max(NEAREST_PX * max(mask.shape), 2 * float(np.sqrt(part.sum() / np.pi)))
+    rows, columns = (np.flatnonzero(part.any(axis)) for axis in (1, 0))
+    box = tuple(slice(max(0, int(k[0] - reach)), int(k[-1] + reach) + 1) for k in (rows, columns))
+    image, mask, part = image[box], mask[box], part[box]
+    near = distance_to(part) < reach
+    inside, outside = near & mask, near & ~mask & ~part
+    if not inside.any() or not outside.any():
+        return 0.0
+    bins = cv2.cvtColor(image, cv2.COLOR_RGB2LAB).astype(np.int64) * COLOR_BINS // 256 @ [COLOR_BINS**2, COLOR_BINS, 1]
+    counts = [np.bincount(bins[where], minlength=COLOR_BINS**3) + 0.5 for where in (inside, outside)]
+    likelier = np.log(counts[0] / counts[0].sum()) - np.log(counts[1] / counts[1].sum())
+    return float(likelier[bins[part]].mean())
 
 
 def _near(pixels: Array, others: cKDTree, reach_px: float) -> Array:
