@@ -29,11 +29,11 @@ NEAREST_PX = 0.03
 """A part's colours are compared with what is this near it, likewise, or within twice its radius where that is more."""
 COLOR_BINS = 8
 """Bins of a histogram of colours along each axis of CIELAB."""
-LEAST_OWN, LEAST_REACH = -2.0, 0.4
-"""Mean logarithm of how much likelier a part's colours are in the mask near it than around; how far the points in it
-reach from the mask, over how far it does. Of 99 parts on four objects with true masks the two rules leave out 49, of
-which 47 were at most half on the object (sky between an arm and a leg, the hill behind a roof), and keep 50, of which
-47 were more."""
+CLEAR, LEAST_REACH = 2.0, 0.4
+"""Mean logarithm of how much likelier a part's colours are in the mask near it than around, or the reverse, by which
+they decide; where they do not, how far the points in a part reach from the mask, over how far it does, does. Of 99
+parts on four objects with true masks the two rules leave out 49, of which 45 were at most half on the object (sky
+between an arm and a leg, the hill behind a roof), and keep 50, of which 47 were more."""
 
 Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None, Array | None], tuple[list[Mask], Array]]
 """Masks (H, W) of a photo with RGB pixels and their qualities, from pixels on the object, pixels off it, each (N, 2)
@@ -54,9 +54,9 @@ def with_parts(
 
     Each group of pixels inside that the mask does not hold, near each other, prompts alone. What it gives is a part of
     the object if it holds them, few pixels known to be outside beside those known to be inside, and is no larger than
-    the mask. Unless it was clicked, it must not have the colours of what is around it, nor go far beyond its points: a
-    few next to an outline may be mismatched. Pixels of points that the object's enclose, (N, 2), are asked about
-    likewise.
+    the mask. Unless it was clicked, its colours have to be the mask's, not those around it, or where this is not clear
+    its points must reach into it: a few next to an outline may be mismatched. Pixels of points that the object's
+    enclose, (N, 2), are asked about likewise.
     """
     whole = mask
     if agrees(mask, inside, outside, tolerance_px) < PART_AGREEMENT:
@@ -99,10 +99,12 @@ def _vouched(image: NDArray[np.uint8], mask: Mask, part: Mask, on: Array) -> boo
     it."""
     if not part.any():
         return True
+    own = own_colors(image, mask, part)
+    if abs(own) >= CLEAR:
+        return own > 0
     away = distance_to(mask)
     u, v = pixel_of(on, mask)
-    reach = np.percentile(away[v, u], 90) / np.percentile(away[part], 90)
-    return bool(reach >= LEAST_REACH and own_colors(image, mask, part) >= LEAST_OWN)
+    return bool(np.percentile(away[v, u], 90) >= LEAST_REACH * np.percentile(away[part], 90))
 
 
 def own_colors(image: NDArray[np.uint8], mask: Mask, part: Mask) -> float:
