@@ -1,6 +1,7 @@
 """The masks that the workflow made, as overlays of the original photos, and which of them a person has accepted."""
 
 import json
+from itertools import chain
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,7 @@ class CarriedMasks:
     Attributes:
         agreement: IoU with the visual hull's outline, by photo.
         dropped: why a photo was left out, by photo.
+        notes: which clicks were left out and why, and what else the stage noted, a sentence each.
     """
 
     def __init__(self, results: Path, accepted: Path) -> None:
@@ -38,11 +40,14 @@ class CarriedMasks:
         self._known = _read_accepted(accepted)
         self.agreement: dict[str, float] = {}
         self.dropped: dict[str, str] = {}
+        self.notes: list[str] = []
         self._cameras: tuple[dict, dict] | None = None
         report = results / "masks.json"
         if report.is_file():
             content = read_json(report)
             self.dropped = content["dropped"]
+            said = [content[key]["value"] for key in ("clicks_left_out", "notes") if key in content]
+            self.notes = list(chain.from_iterable(said))
             self.agreement = {name: entry["agreement"] for name, entry in content["per_photo"].items()}
 
     def __bool__(self) -> bool:
@@ -71,8 +76,14 @@ class CarriedMasks:
         mask = read_mask(path).astype(np.uint8) * 255
         return np.asarray(cv2.remap(mask, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)) > 127
 
+    def has_mask(self, photo: str) -> bool:
+        """Whether there is a mask of a photo to look at."""
+        return bool(self._digest(photo))
+
     def accept(self, photo: str) -> None:
-        """Note that a person has looked at a photo's mask, and that it is right."""
+        """Note that a person has looked at a photo's mask, and that it is right; nothing where there is none."""
+        if not self.has_mask(photo):
+            return
         self._known = _read_accepted(self._accepted) | {photo: self._digest(photo)}
         write_json(self._accepted, self._known)
 

@@ -5,8 +5,9 @@ import fcntl
 import hashlib
 import io
 import os
+import shutil
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +18,9 @@ from scenefuse.sfm.survey.lengths import COLUMNS, read_end_clicks
 from scenefuse.stage import StageError, atomic_file
 
 HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS, "lengths": COLUMNS}
+
+
+_BASE = "# unsaved clicks, laid over the file of SHA-256 "
 
 
 class FileChanged(Exception):
@@ -37,6 +41,7 @@ class Document:
         saved: the rows that the file held when it was last read or written.
         trouble: why the file cannot be read; it is then kept under another name when this is saved. "" where it can.
         fixed: why the file cannot be edited here; "" where it can.
+        notes: what a person should know of unsaved clicks of the last time, a sentence each.
         version: counts changes, so that every open page notices those of others.
     """
 
@@ -44,7 +49,8 @@ class Document:
         """Read the file; names of photos are spelled as in `photos`, where the file writes their umlauts otherwise."""
         self.path, self.kind = path, kind
         self._spelled = {composed(name): name for name in photos}
-        self.version = 0
+        self.version, self._drafted = 0, ""
+        self.notes: list[str] = []
         self.read()
         self._restore()
 
@@ -113,35 +119,52 @@ class Document:
                 raise FileChanged(self._what_changed())
             message = f"{len(self.rows)} rows saved in {self.path}"
             if self.trouble:
-                message += f"; the unreadable file is kept as {_set_aside(self.path).name}"
+                message += f"; the unreadable file is kept as {_kept(self.path).name}"
             lines = ["\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
             _write(self.path, "\n".join([*self._comments, *lines]) + "\n")
             self._digest = digest(self.path)
         self.saved, self.trouble = self.rows, ""
-        self._draft.unlink(missing_ok=True)
+        self.keep_draft()
         self.version += 1
         return message
 
-    def merge(self) -> None:
-        """Take what the file holds now, with the own changes laid over it, still unsaved."""
-        base, mine = self.saved, self.rows
+    def merge(self) -> str:
+        """Take what the file holds now, with the own changes laid over it, still unsaved; what happened.
+
+        Raises:
+            StageError: it holds another kind of rows.
+        """
+        base, mine, kind = self.saved, self.rows, self.kind
+        with suppress(StageError):  # which `read` notes
+            kind = self._on_disk()[0]
+        if mine and kind != self.kind:
+            raise StageError(f"{self.path} holds {kind} now, and here are {self.kind}: take one of the two")
         self.read()
         if self.trouble or self.fixed:
             self.history.change(mine)
         else:
             self.history.change(merged(base, mine, self.saved))
+        return "Both are shown now; save to write them."
 
     def keep_mine(self) -> str:
         """Save the own rows; the file as somebody else left it is kept under another name."""
-        kept = _set_aside(self.path).name if self.path.exists() else ""
+        kept = _kept(self.path).name if self.path.exists() else ""
         self._digest, self.trouble = digest(self.path), ""
         return self.save() + (f"; the other version is kept as {kept}" if kept else "")
 
     def keep_draft(self) -> Path | None:
-        """Write unsaved rows beside the file, for the next time; None where there are none."""
+        """Write unsaved rows beside the file, for the next time; None where there are none, and what this object wrote
+        there goes."""
         if not self.unsaved:
+            if self._drafted and digest(self._draft) == self._drafted:
+                self._draft.unlink(missing_ok=True)
+            self._drafted = ""
             return None
-        _write(self._draft, "\n".join(["\t".join(HEADERS[self.kind]), *map(_line, self.rows)]) + "\n")
+        lines = [f"{_BASE}{self._digest}", "\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
+        text = "\n".join(lines) + "\n"
+        if hashlib.sha256(text.encode()).hexdigest() != self._drafted:
+            _write(self._draft, text)
+            self._drafted = digest(self._draft)
         return self._draft
 
     @property
@@ -149,45 +172,59 @@ class Document:
         return self.path.with_name(f"{self.path.stem}.unsaved{self.path.suffix}")
 
     def _restore(self) -> None:
-        """Take up the unsaved rows of the last time."""
+        """Take up the unsaved rows of the last time; where the file has changed since, beside its own."""
         if not self._draft.is_file() or self.fixed:
             return
         try:
-            self.kind, rows = self._read_rows(self._draft)
+            base = next((line for line in read_text(self._draft).splitlines() if line.startswith(_BASE)), _BASE)
+            kind, rows = self._read_rows(self._draft) if _holds_rows(self._draft) else (self.kind, ())
+        except StageError as error:
+            self.notes.append(f"unsaved clicks cannot be read and are left where they are: {error}")
+            return
+        if self.saved and kind != self.kind:
+            self.notes.append(f"unsaved {kind} are left in {self._draft.name}: {self.path.name} holds {self.kind} now")
+            return
+        self._drafted = digest(self._draft)
+        if base.removeprefix(_BASE) == self._digest:
+            self.kind = kind
             self.history.change(rows)
-        except StageError:
-            self.history.change(())  # a draft without rows: everything was removed
+        elif set(rows) - set(self.saved):
+            self.kind = kind
+            self.history.change(merged((), rows, self.saved))
+            self.notes.append(f"{self.path.name} has changed since clicks were left unsaved: both are shown")
 
     def _rows(self) -> Rows:
-        if not self.path.exists():
-            return ()
-        if not self._holds_rows():
-            return ()
         try:
-            self.kind, rows = self._read_rows(self.path)
+            self.kind, rows = self._on_disk()
         except NotClicked as error:
             self.fixed = str(error)
             return ()
-        self._comments = [line for line in read_text(self.path).splitlines() if line.startswith("#")]
+        if rows:
+            self._comments = [line for line in read_text(self.path).splitlines() if line.startswith("#")]
         return rows
+
+    def _on_disk(self) -> tuple[Kind, Rows]:
+        """What the file holds."""
+        return self._read_rows(self.path) if self.path.exists() and _holds_rows(self.path) else (self.kind, ())
 
     def _read_rows(self, path: Path) -> tuple[Kind, Rows]:
         kind, rows = _read(path, self.kind)
         return kind, tuple(replace(row, photo=self._spelled.get(composed(row.photo), row.photo)) for row in rows)
 
-    def _holds_rows(self) -> bool:
-        """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
-        try:
-            rows = read_cells(self.path)
-        except StageError:
-            return True
-        return len(rows) > 1 or (len(rows) == 1 and rows[0][1] not in HEADERS.values())
-
     def _what_changed(self) -> str:
         try:
-            return f"{self.path} was changed by someone else: {difference(self.saved, self._rows())}"
+            return f"{self.path} was changed by someone else: {difference(self.saved, self._on_disk()[1])}"
         except StageError as error:
             return f"{self.path} was changed by someone else, and is no longer readable: {error}"
+
+
+def _holds_rows(path: Path) -> bool:
+    """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
+    try:
+        rows = read_cells(path)
+    except StageError:
+        return True
+    return len(rows) > 1 or (len(rows) == 1 and rows[0][1] not in HEADERS.values())
 
 
 def digest(path: Path) -> str:
@@ -232,12 +269,12 @@ def _write(path: Path, text: str) -> None:
         raise StageError(f"{path} cannot be written ({error.strerror}); check its folder's permissions") from None
 
 
-def _set_aside(path: Path) -> Path:
-    """Rename a file to the first free name beside it."""
+def _kept(path: Path) -> Path:
+    """A copy of a file under the first free name beside it."""
     number = 1
     while (other := path.with_name(f"{path.stem}.kept-{number}{path.suffix}")).exists():
         number += 1
-    os.rename(path, other)
+    shutil.copy2(path, other)
     return other
 
 

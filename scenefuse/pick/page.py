@@ -8,7 +8,7 @@ from typing import Any
 from nicegui import ui
 
 from scenefuse.pick.clicks import Kind, Rows, with_box, with_end, with_label, with_length, with_point, without_nearest
-from scenefuse.pick.document import FileChanged
+from scenefuse.pick.document import Document, FileChanged
 from scenefuse.pick.overlays import CARRIED, CLICKED, overlay
 from scenefuse.pick.photo_map import PhotoMap
 from scenefuse.pick.photo_strip import PhotoStrip
@@ -240,12 +240,12 @@ class Page:
     def accept(self) -> None:
         """The workflow's mask of this photo is right; go to the next that nobody has accepted."""
         carried = self.session.carried
-        if self.board_number or self.picture is None or self.picture.name not in carried.agreement:
+        if self.board_number or self.picture is None or not carried.has_mask(self.picture.name):
             return
         carried.accept(self.picture.name)
         self.strip.refresh()
         following = (self.strip.at(self.picture, k) for k in range(1, len(self.strip.order)))
-        left = [p for p in following if p.name in carried.agreement and not carried.is_accepted(p.name)]
+        left = [p for p in following if carried.has_mask(p.name) and not carried.is_accepted(p.name)]
         if left:
             self.open_photo(left[0])
         else:
@@ -278,11 +278,14 @@ class Page:
             actions[name]()
 
     def save(self) -> None:
-        """Save the table that is clicked now."""
-        try:
-            self.attempt(self.board.document.save)
-        except FileChanged as error:
-            self.ask_about_changes(str(error))
+        """Save the table that is clicked now, and all others that have unsaved clicks."""
+        documents = [board.document for board in self.session.boards]
+        for document in documents:
+            if document is self.board.document or document.unsaved:
+                try:
+                    self.attempt(document.save)
+                except FileChanged as error:
+                    self.ask_about_changes(document, str(error))
         self.refresh()
 
     def attempt(self, save: Callable[[], str]) -> None:
@@ -292,17 +295,15 @@ class Page:
         except StageError as error:
             self.say(str(error), "negative")
 
-    def ask_about_changes(self, message: str) -> None:
+    def ask_about_changes(self, document: Document, message: str) -> None:
         """The file is not what was read: whose clicks count?"""
-        document = self.board.document
         if self.dialog is not None and self.dialog.value:
             return
 
         def decide(how: str) -> None:
             self.dialog.close()
             if how == "both":
-                document.merge()
-                self.say("Both are shown now; save to write them.")
+                self.attempt(document.merge)
             elif how == "theirs":
                 document.read()
             else:
@@ -333,6 +334,7 @@ class Page:
 
     def watch_file(self) -> None:
         """Take up what an editor or the workflow wrote. Where there are unsaved clicks, too, saving asks."""
+        self.session.keep_drafts()
         self.session.read_results()
         if self.seen_results != self.session.results_state:
             self.seen_results = self.session.results_state
@@ -359,8 +361,13 @@ class Page:
             self._draw_points()
         self._show_masks(picture)
         self.strip.count(Counter(row.photo for row in document.rows))
-        self.state.set_text("● not saved" if document.unsaved else "saved" if document.path.exists() else "no file yet")
-        self.state.classes(replace="text-sm " + ("text-red-700" if document.unsaved else "text-gray-600"))
+        unsaved = [board.source.title for board in self.session.boards if board.document.unsaved]
+        if unsaved:
+            text = "● not saved" + (f": {', '.join(unsaved)}" if len(self.session.boards) > 1 else "")
+        else:
+            text = "saved" if document.path.exists() else "no file yet"
+        self.state.set_text(text)
+        self.state.classes(replace="text-sm " + ("text-red-700" if unsaved else "text-gray-600"))
         self.side.fill()
 
     def _draw_points(self) -> None:
@@ -403,7 +410,11 @@ class Page:
             mask = None
             print(error, flush=True)
         if mask is not None and wanted == self.carried_shown:
-            self.map.lay("carried", f"/overlay/{self.session.overlay(overlay(mask, CARRIED))}")
+            self.map.lay("carried", self._address(overlay(mask, CARRIED)))
+
+    def _address(self, picture: bytes) -> str:
+        """Where the browser gets an overlay; of this session, for it may keep those of another at the same port."""
+        return f"/overlay/{self.session.overlay(picture)}?v={self.session.key}"
 
     async def _segment(self, picture: Picture, asked: Any) -> None:
         """Make the mask of a photo's clicks, unless others have come in the meantime."""
@@ -414,7 +425,7 @@ class Page:
                     return
                 mask, notes = await asyncio.to_thread(self.session.segmenter.mask, picture, asked[1:])
             note = " ".join(f"{sentence[0].upper()}{sentence[1:]}." for sentence in notes)
-            address = f"/overlay/{self.session.overlay(overlay(mask, CLICKED))}"
+            address = self._address(overlay(mask, CLICKED))
         except StageError as error:
             note = str(error)
         if asked == self.mask_asked:

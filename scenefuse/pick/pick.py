@@ -8,6 +8,7 @@ from pathlib import Path
 
 import tyro
 
+from scenefuse.command_line import OWN_SETTINGS
 from scenefuse.pick.session import Session
 from scenefuse.stage import StageError
 
@@ -23,13 +24,15 @@ def pick(
 
     Args:
         object: name of the object, as in the table of objects.
-        configfile: settings, as given to snakemake; the shipped ones where it is left out.
+        configfile: settings, as given to snakemake; config/config.yaml where it is left out.
         port: of the page on this machine; 0 takes a free one.
         no_browser: print the address only.
 
     Raises:
         StageError: settings, tables or photos are wrong, or the page's packages are not installed.
     """
+    if configfile is None and OWN_SETTINGS.is_file() and not Path("Snakefile").is_file():
+        configfile = OWN_SETTINGS  # as `scenefuse run` does
     session = Session(object, configfile)
     try:
         from nicegui import app, ui
@@ -38,7 +41,7 @@ def pick(
         from scenefuse.pick.server import HOST, Guard, add_pictures
     except ImportError as error:
         raise StageError(f"the page needs NiceGUI ({error}): pip install -r envs/requirements.txt") from None
-    port, token = port or _free_port(HOST), secrets.token_urlsafe(16)
+    port, token = _free_port(HOST, port), secrets.token_urlsafe(16)
     address = f"http://{HOST}:{port}/?token={token}"
     app.add_middleware(Guard, token=token, port=port)
     add_pictures(app, session)
@@ -69,7 +72,15 @@ def pick(
     )
 
 
-def _free_port(host: str) -> int:
+def _free_port(host: str, wanted: int) -> int:
+    """A port that nothing listens at, the wanted one if it is not 0."""
     with socket.socket() as probe:
-        probe.bind((host, 0))
+        # As the server does: a port that another one has just left is free.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, wanted))
+        except (OSError, OverflowError) as error:
+            raise StageError(
+                f"--port {wanted} cannot be used ({error}); give another, or none for a free one"
+            ) from None
         return probe.getsockname()[1]

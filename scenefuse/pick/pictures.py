@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
+from PIL.TiffImagePlugin import TiffImageFile
 
 from scenefuse.sfm.frames import sharpness
 from scenefuse.stage import StageError, atomic_file
@@ -76,9 +77,12 @@ def upright_size(path: Path) -> tuple[int, int]:
         StageError: it is no readable picture.
     """
     try:
-        with Image.open(path) as image:
+        with open(path, "rb") as file, Image.open(file) as image:
             turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
-            return (image.height, image.width) if turned else image.size
+            # Pillow 13 gives the size of a TIFF as it will be when turned; its tags have it as stored.
+            tags = image.tag_v2 if isinstance(image, TiffImageFile) else None
+            width, height = image.size if tags is None else (int(tags[256]), int(tags[257]))
+            return (height, width) if turned else (width, height)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
 
@@ -91,10 +95,11 @@ def read_upright(path: Path, least_px: int | None = None) -> Pixels:
         least_px: the longer side may be smaller than the photo's, but not than this: a JPEG is then decoded faster.
     """
     try:
-        with Image.open(path) as file:
+        # By handle: opened by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
+        with open(path, "rb") as file, Image.open(file) as stored:
             if least_px is not None:
-                file.draft("RGB", (least_px, least_px))
-            image = ImageOps.exif_transpose(file)
+                stored.draft("RGB", (least_px, least_px))
+            image = ImageOps.exif_transpose(stored)
             # Sixteen-bit grey is not scaled by Pillow's conversion.
             if image.mode.startswith("I;16"):
                 image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
@@ -172,7 +177,16 @@ class Thumbnails:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._known = {path.stem.split("_")[0]: path for path in folder.glob("*_*.jpg")}
+        self._failed: set[Path] = set()
         self._lock = threading.Lock()
+
+    def fail(self, picture: Picture) -> None:
+        """Note that a photo cannot be read."""
+        self._failed.add(picture.path)
+
+    def failed(self, picture: Picture) -> bool:
+        """Whether it could not be read."""
+        return picture.path in self._failed
 
     def get(self, picture: Picture) -> tuple[Path, float]:
         """The file of a photo's thumbnail, and how sharp the photo is (variance of the Laplacian).

@@ -54,14 +54,15 @@ class Segmenter:
         trouble: why it is not what the settings ask for, or why there is nothing; "" where all is well.
     """
 
-    def __init__(self, settings: Mapping[str, Any], side_px: int) -> None:
+    def __init__(self, settings: Mapping[str, Any], side_px: int, photo_px: int) -> None:
         """Nothing is loaded yet.
 
         Args:
             settings: `object.masks`.
             side_px: longer side of the photos that masks are made in.
+            photo_px: longest side of an undistorted photo in the workflow.
         """
-        self._settings, self._side_px = settings, side_px
+        self._settings, self._side_px, self._photo_px = settings, side_px, photo_px
         self._photos: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
         self._network: _Remembering | None = None
         self._ask: Callable[..., Any] | None = None
@@ -97,9 +98,11 @@ class Segmenter:
                     return
                 except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
+            from scenefuse.masks.prompted import CARRIED_WIDTHS
             from scenefuse.masks.segmentation import MaskSettings
 
-            self._ask, self.method = partial(ask_grabcut, MaskSettings().grabcut_width_px), "GrabCut"
+            width = CARRIED_WIDTHS * MaskSettings().grabcut_width_px
+            self._ask, self.method = partial(ask_grabcut, width), "GrabCut"
 
     def _fetch_once(self, paths: set[Path]) -> None:
         """Put the shipped weights to their place, if these are they and nothing has tried it yet, neither meanwhile.
@@ -165,7 +168,9 @@ class Segmenter:
                 clicks = _clicks_of(picture, rows, width, height)
                 view = View(picture.name, np.eye(3), np.eye(4), width, height, pixels)
                 assert self._ask is not None
-                tolerance_px = self._settings["max_click_residual_px"]
+                # As the workflow has it, in the undistorted photo.
+                size = min(self._photo_px, max(picture.width, picture.height))
+                tolerance_px = self._settings["max_click_residual_px"] * max(height, width) / size
                 mask, quality, agreement, left_out = one_photo(self._ask, view, clicks, tolerance_px)
         finally:
             self._waiting -= 1

@@ -37,7 +37,7 @@ class Board:
 
     def __init__(self, source: Source) -> None:
         self.source, self.document = source, Document(source.path, source.kind, source.pictures)
-        self.notes: list[str] = []
+        self.notes: list[str] = [*source.notes, *self.document.notes]
         self.read_cameras()
 
     def read_cameras(self) -> None:
@@ -59,6 +59,7 @@ class Session:
         configfile: as given on the command line.
         boards: its tables.
         tiles, thumbnails, segmenter, carried: see their classes.
+        result: the last file that the workflow makes of the object.
         results_state: changes with what the workflow has written.
         key: of this session, for addresses of pictures that the browser may keep.
     """
@@ -72,8 +73,11 @@ class Session:
         project = read_project(read_settings(configfile))
         self.name, self.configfile = name, configfile
         self.boards = [Board(source) for source in sources_of(project, name)]
+        last = "fused.ply" if project.objects[name].get("scene") else "object.ply"
+        self.result = Path("results/objects") / name / last
         self.tiles, self.thumbnails = Tiles(), Thumbnails(Path("results/pick/thumbnails"))
-        self.segmenter = Segmenter(project.of("object", name)["object"]["masks"], MASK_SIDE_PX)
+        own = project.of("object", name)["object"]
+        self.segmenter = Segmenter(own["masks"], MASK_SIDE_PX, own["undistort"]["max_size_px"])
         self._accepted = Path("results/pick") / f"{name}.json"
         self.results_state: tuple[float, ...] = ()
         self.read_results()
@@ -113,6 +117,15 @@ class Session:
             if draft is not None:
                 yield f"clicks that were not saved are kept in {draft}; the page takes them up again"
 
+    def keep_drafts(self) -> None:
+        """Keep what is not saved, in case that this process does not end by itself."""
+        for board in self.boards:
+            try:
+                board.document.keep_draft()
+            except StageError as error:
+                if str(error) not in board.notes:
+                    board.notes.append(str(error))
+
     def overlay(self, picture: bytes) -> int:
         """Keep a picture for the browser; the number by which it asks for it."""
         number = next(self._numbers)
@@ -147,10 +160,11 @@ class Session:
                 try:
                     self.thumbnails.get(picture)
                 except (StageError, OSError) as error:
+                    self.thumbnails.fail(picture)
                     board.notes.append(str(error))
 
 
 def thumbnails_left(session: Session, board: int) -> int:
     """Photos whose sharpness is not known yet."""
     pictures: Any = session.boards[board].source.pictures.values()
-    return sum(session.thumbnails.sharpness(p) is None for p in pictures)
+    return sum(session.thumbnails.sharpness(p) is None and not session.thumbnails.failed(p) for p in pictures)

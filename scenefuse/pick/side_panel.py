@@ -69,6 +69,8 @@ class SidePanel:
         accepted = sum(carried.is_accepted(photo) for photo in carried.agreement)
         ui.separator()
         ui.label(f"The workflow's masks (orange): {accepted} of {len(carried.agreement)} accepted").classes("text-sm")
+        for text in carried.notes[:4]:
+            ui.label(text).classes("text-xs text-orange-900")
         if name in carried.dropped:
             ui.label(f"Left out: {carried.dropped[name]}. Add clicks here.").classes("text-xs text-red-700")
         elif name in carried.agreement:
@@ -124,7 +126,7 @@ class SidePanel:
     async def plan(self) -> None:
         """Ask the workflow what it will run."""
         self._planned.set_text("Asking the workflow; some seconds ...")
-        words = command(self._page.session.configfile, f"results/objects/{self._page.session.name}/fused.ply")
+        words = command(self._page.session.configfile, str(self._page.session.result))
         rules, trouble = await asyncio.to_thread(planned_rules, words)
         jobs = ", ".join(f"{rule}{f' ({count})' if count > 1 else ''}" for rule, count in rules.items())
         self._planned.set_text(trouble or f"Will run: {jobs or 'nothing'}.")

@@ -62,6 +62,7 @@ class Source:
     result: Path
     of: Literal["scenes", "objects"] = "objects"
     least_inside: int = 1
+    notes: tuple[str, ...] = ()
 
     @property
     def sizes(self) -> Sizes:
@@ -93,7 +94,10 @@ def _in_the_object_s_photos(project: Project, name: str) -> Iterator[Source]:
     models: tuple[Path, ...] = (results / "sparse",)
     path, listed = _table(project, "objects", name, "prompts")
     made = results / "masks.png"
-    yield Source("prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed, made)
+    notes = (f"the column masks is filled ({row['masks']}): these count, and no clicks",) if row.get("masks") else ()
+    yield Source(
+        "prompts", "The object", OF_OBJECT, path, "labels", pictures, models, listed or bool(notes), made, notes=notes
+    )
     if row.get("lengths") or not row.get("scene"):
         path, listed = _table(project, "objects", name, "lengths")
         made = results / "sparse.json"

@@ -672,18 +672,33 @@ def test_labels_are_not_fiducials(tmp_path):
         locate(tmp_path / "prompts.tsv", tmp_path, 5)
 
 
-def test_a_click_is_undistorted(tmp_path, photos):
+def bent_model(folder, view, k):
+    """A COLMAP model of one photo whose lens bends."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", FOCAL, WIDTH, HEIGHT)
-    camera.params = [FOCAL, WIDTH / 2, HEIGHT / 2, 0.2]
+    camera.params = [FOCAL, WIDTH / 2, HEIGHT / 2, k]
     model.add_camera_with_trivial_rig(camera)
-    image = pycolmap.Image(name="f00.png", camera_id=1, image_id=1)
-    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(photos.views[0].cam_from_world[:3]))
-    (tmp_path / "bent").mkdir()
-    model.write(tmp_path / "bent")
+    image = pycolmap.Image(name=view.name, camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(view.cam_from_world[:3]))
+    folder.mkdir()
+    model.write(folder)
+    return model
+
+
+def test_a_click_is_undistorted(tmp_path, photos):
+    model = bent_model(tmp_path / "bent", photos.views[0], 0.2)
     seen = model.images[1].project_point(np.array([0, 0.5, 0.5]))
     labels = read(tmp_path, [("inside", "f00.png", *seen)])
     found, _ = clicks_per_photo(labels, tmp_path / "bent", photos.views, {})
     straight = photos.views[0].project(np.array([[0, 0.5, 0.5]]))[0]
     assert np.linalg.norm(seen - straight[0]) > 0.05
     np.testing.assert_allclose(found[0].pixels, straight, atol=1e-6)
+
+
+def test_a_click_where_the_undistorted_photo_has_no_pixels_is_left_out_but_counts_in_the_scene(tmp_path, photos):
+    bent_model(tmp_path / "bent", photos.views[0], -0.2)
+    labels = read(tmp_path, [("inside", "f00.png", 60, 45), ("outside", "f00.png", 2, 2)])
+    found, left_out = clicks_per_photo(labels, tmp_path / "bent", photos.views, {})
+    assert len(found[0].pixels) == 1 and "whose edge is cut away there" in left_out[0]
+    found, left_out = clicks_per_photo(labels, tmp_path / "bent", photos.views, None)
+    assert (found[0].pixels[1] < 0).all() and not left_out

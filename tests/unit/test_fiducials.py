@@ -233,6 +233,19 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
         StageError, match=r"in 4\.jpg, but only 3 of the 5 photos are used .* max_frames to 5 and frame_s"
     ):
         check_marks(path, photos, photos[::2])
+
+
+@pytest.mark.parametrize(
+    ("rows", "sentence"),
+    [
+        ("outside\t3.jpg\t1\t2\n", "holds only clicks outside the object"),
+        ("inside\t3.jpg\t1\t2\nbox\t3.jpg\t5\t6\n", r"a box needs two lines, .*; in 3\.jpg there are 1"),
+    ],
+)
+def test_clicks_that_say_nothing_are_named_before_anything_runs(tmp_path, rows, sentence):
+    (tmp_path / "f.tsv").write_text(LABELS + rows)
+    with pytest.raises(StageError, match=sentence):
+        check_marks(tmp_path / "f.tsv")
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
     check_marks(path, photos)
     path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")

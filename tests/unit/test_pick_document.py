@@ -196,3 +196,57 @@ def test_a_file_that_cannot_be_written_is_named(tmp_path):
     with pytest.raises((StageError, FileChanged), match="prompts.tsv"):
         document.save()
     assert document.unsaved
+
+
+def test_a_file_that_was_written_after_the_draft_is_shown_with_it(path):
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    document = Document(path, "labels")
+    document.change((FOOT, HEAD))
+    document.keep_draft()
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\ninside\tc.jpg\t5\t6\n")
+    again = Document(path, "labels")
+    assert set(again.rows) == {FOOT, Click("inside", "c.jpg", 5, 6), HEAD} and "both are shown" in again.notes[0]
+
+
+def test_a_draft_without_rows_means_that_all_were_removed(path):
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    document = Document(path, "labels")
+    document.change(())
+    document.keep_draft()
+    assert Document(path, "labels").rows == () and Document(path, "labels").unsaved
+
+
+def test_a_draft_that_cannot_be_read_changes_nothing_and_stays(path):
+    path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
+    (path.parent / "prompts.unsaved.tsv").write_text("mangled\n")
+    document = Document(path, "labels")
+    assert document.rows == (FOOT,) and not document.unsaved and "left where they are" in document.notes[0]
+    document.change((FOOT, HEAD))
+    document.save()
+    assert names(path) == ["prompts.tsv", "prompts.unsaved.tsv"]
+
+
+def test_of_two_pages_one_does_not_remove_the_draft_of_the_other(path):
+    first, second = Document(path, "labels"), Document(path, "labels")
+    first.change((HEAD,))
+    first.keep_draft()
+    second.change((FOOT,))
+    second.save()
+    again = Document(path, "labels")
+    assert set(again.rows) == {HEAD, FOOT} and again.unsaved
+
+
+def test_clicks_of_another_kind_are_not_laid_over_and_keeping_the_own_ones_keeps_their_kind(path):
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    points = "point\tphoto\tx_px\ty_px\nroof\ta b.jpg\t3\t4\n"
+    for text in (points, "point\tx\ty\tz\nroof\t1\t2\t3\n"):
+        path.write_text(text)
+        with pytest.raises(FileChanged):
+            document.save()
+    path.write_text(points)
+    with pytest.raises(StageError, match="holds points now, and here are labels"):
+        document.merge()
+    assert document.rows == (HEAD,)
+    document.keep_mine()
+    assert Document(path, "labels").rows == (HEAD,) and (path.parent / "prompts.kept-1.tsv").read_text() == points

@@ -61,10 +61,11 @@ def test_places_and_pixels_are_each_other_s_inverse_and_tiles_lie_where_they_bel
     assert np.allclose(picture.place(world / 2 / scale, world / 2 / scale), (0, 0))
 
 
+@pytest.mark.parametrize("ending", ["jpg", "tif"])
 @pytest.mark.parametrize(("orientation", "turned"), [(1, 0), (3, 2), (6, 3), (8, 1)])
-def test_rotated_photos_stand_upright_and_sizes_are_as_people_see_them(tmp_path, orientation, turned):
+def test_rotated_photos_stand_upright_and_sizes_are_as_people_see_them(tmp_path, orientation, turned, ending):
     pixels = stripes(90, 40)
-    picture = saved(tmp_path / "a.jpg", pixels, orientation)
+    picture = saved(tmp_path / f"a.{ending}", pixels, orientation)
     upright = read_upright(picture.path)
     assert (picture.height, picture.width) == upright.shape[:2]
     assert np.abs(upright.astype(int) - np.rot90(pixels, turned)).mean() < 4

@@ -11,7 +11,7 @@ from scenefuse.pick.clicks import Click, spoken
 from scenefuse.pick.next_run import as_text, command
 from scenefuse.pick.pictures import Picture
 from scenefuse.pick.segmenter import Segmenter
-from scenefuse.pick.session import Session
+from scenefuse.pick.session import Session, thumbnails_left
 from scenefuse.stage import StageError, write_json
 
 GRABCUT = {"method": "grabcut", "max_click_residual_px": 4}
@@ -35,6 +35,27 @@ def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
     assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "clicks.tsv")
     assert list(first.source.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.source.pictures) == 3
     assert first.source.sizes["0.jpg"] == (64, 48) and first.source.listed and first.cameras is None
+
+
+def test_masks_of_one_s_own_are_said_to_count_in_the_place_of_clicks(yard):
+    yard.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\tmy masks\t\n"
+    assert any("the column masks is filled (my masks)" in note for note in opened(yard).boards[0].notes)
+
+
+def test_a_photo_without_a_mask_cannot_be_accepted_and_clicks_left_out_are_said(yard):
+    report = {"dropped": {"0.jpg": "too small"}, "per_photo": {"0.jpg": {"area": 0.0, "agreement": 0.1}}}
+    report |= {"clicks_left_out": {"value": ["the click inside is off"]}, "notes": {"value": []}}
+    write_json(yard.path / "results/objects/shed/masks.json", report)
+    carried = opened(yard).carried
+    carried.accept("0.jpg")
+    assert not carried.is_accepted("0.jpg") and carried.notes == ["the click inside is off"]
+
+
+def test_a_photo_that_cannot_be_read_does_not_keep_the_others_waiting(yard):
+    session = opened(yard)
+    (yard.path / "close/2.jpg").write_bytes(b"cut")
+    session._make_thumbnails()
+    assert thumbnails_left(session, 0) == 0 and any("2.jpg" in note for note in session.boards[0].notes)
 
 
 def test_without_cells_tables_lie_beside_the_table_of_objects_and_it_is_said(yard):
@@ -141,23 +162,23 @@ def test_clicks_give_the_mask_of_their_photo(ball):
     picture, mask = ball
     rows = tuple(Click("inside", "ball.png", 2 * x, 2 * y) for x, y in ((250, 120), (200, 220), (300, 220)))
     rows += (Click("outside", "ball.png", 1100, 700), Click("inside", "other.png", 3, 3))
-    found, notes = Segmenter(GRABCUT, 600).mask(picture, rows)
+    found, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, rows)
     assert found.shape == mask.shape and mask_iou(found, mask) > 0.95 and notes == []
 
 
 def test_a_box_gives_a_mask_and_a_click_that_contradicts_it_is_counted(ball):
     picture, mask = ball
     box = (Click("box", "ball.png", 280, 140), Click("box", "ball.png", 720, 580))
-    found, notes = Segmenter(GRABCUT, 600).mask(picture, box)
+    found, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, box)
     assert mask_iou(found, mask) > 0.95 and notes == []
     rows = (*box, Click("inside", "ball.png", 1100, 700))
-    _, notes = Segmenter(GRABCUT, 600).mask(picture, rows)
+    _, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, rows)
     assert any("1 click lies on the wrong side" in note for note in notes)
 
 
 def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path):
     paths = {"sam2_encoder": str(tmp_path / "no.ort"), "sam2_decoder": "no.onnx", "sam2_checkpoint": None}
-    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 600)
+    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 600, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "no.ort do not exist" in segmenter.trouble
 
@@ -166,7 +187,7 @@ def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_s
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
     settings = {"method": "auto", "sam2_encoder": ENCODER, "sam2_decoder": DECODER, "sam2_checkpoint": None}
-    segmenter = Segmenter(GRABCUT | settings, 600)
+    segmenter = Segmenter(GRABCUT | settings, 600, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "No such file" in segmenter.trouble
     assert not list((tmp_path / "results/weights").iterdir())

@@ -85,7 +85,8 @@ def clicks_per_photo(
             where these are not known, and photos have the size of their cameras.
 
     Returns:
-        The clicks, and a sentence for each that is left out since its photo has no camera.
+        The clicks, and a sentence for each that is left out since its photo has no camera, or none there once its lens
+        distortion is removed.
 
     Raises:
         StageError: a photo that does not exist, a click outside its photo, a box that is not two corners, no click
@@ -103,7 +104,10 @@ def clicks_per_photo(
         if photo in images and photo in rows:
             view, size = views[rows[photo]], (listed or {}).get(photo)
             undistorted = _undistorted(f"{labels.path}: {click}", label, pixel, images[photo], view, size)
-            found.setdefault(rows[photo], []).append((label, undistorted))
+            if listed is not None and ((undistorted < 0) | (undistorted > [view.width, view.height])).any():
+                left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
+            else:
+                found.setdefault(rows[photo], []).append((label, undistorted))
         elif listed is None or photo in listed:
             left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
         else:
@@ -119,8 +123,8 @@ def clicks_per_photo(
 def _undistorted(
     click: str, label: str, pixel: Array, image: pycolmap.Image, view: View, size: tuple[int, int] | None
 ) -> Array:
-    """A click (2,) in pixels of the undistorted photo; a corner of a box is moved into it. StageError where it lies
-    outside, or is cut away."""
+    """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge; a corner of a box is moved into it.
+    StageError where it lies outside the original."""
     camera = image.camera
     assert camera is not None
     width, height = size or (camera.width, camera.height)
@@ -129,14 +133,7 @@ def _undistorted(
     ray = camera.cam_from_img(pixel * [camera.width / width, camera.height / height])
     undistorted: Array = (view.intrinsics @ [*np.asarray(ray).ravel(), 1.0])[:2]
     edge = np.array([view.width, view.height]) - 1e-3
-    if label == "box":
-        return np.clip(undistorted, 0, edge)
-    if (undistorted < 0).any() or (undistorted > edge).any():
-        raise StageError(
-            f"{click} in {image.name} is cut away with the photo's edge when its lens distortion is removed; click"
-            " farther from the edge"
-        )
-    return undistorted
+    return np.clip(undistorted, 0, edge) if label == "box" else undistorted
 
 
 def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array]]) -> PhotoClicks:

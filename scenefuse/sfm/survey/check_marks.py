@@ -1,6 +1,7 @@
 """What can be said of clicks on an object before any photo is matched. The workflow asks it whenever it plans: nothing
 here takes long to import."""
 
+from collections import Counter
 from pathlib import Path
 
 from scenefuse.io.tables import composed
@@ -17,9 +18,18 @@ def check_marks(path: Path, photos: list[str] | None = None, used: list[str] | N
         used: those of them that will be used; None for all.
 
     Raises:
-        StageError: what `read_points` says; a click in a photo that does not exist, or will not be used.
+        StageError: what `read_points` says; nothing inside; half a box; a click in a photo that does not exist, or will
+            not be used.
     """
     marked = read_points(path)
+    if isinstance(marked, Labels):
+        if not {"inside", "box"}.intersection(marked.labels):
+            raise StageError(f"{path} holds only clicks outside the object; add a few inside it, or a box around it")
+        boxes = Counter(photo for label, photo in zip(marked.labels, marked.photos) if label == "box")
+        if odd := [photo for photo, corners in boxes.items() if corners != 2]:
+            raise StageError(
+                f"{path}: a box needs two lines, two opposite corners; in {odd[0]} there are {boxes[odd[0]]}"
+            )
     if photos is None or isinstance(marked, ScenePoints):
         return
     known, taken = set(map(composed, photos)), set(map(composed, photos if used is None else used))
