@@ -233,6 +233,11 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
         StageError, match=r"in 4\.jpg, but only 3 of the 5 photos are used .* max_frames to 5 and frame_s"
     ):
         check_marks(path, photos, photos[::2])
+    path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
+    check_marks(path, photos)
+    path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
+    with pytest.raises(StageError, match=r"a is in 9\.jpg"):
+        check_marks(path, photos)
 
 
 @pytest.mark.parametrize(
@@ -246,11 +251,6 @@ def test_clicks_that_say_nothing_are_named_before_anything_runs(tmp_path, rows, 
     (tmp_path / "f.tsv").write_text(LABELS + rows)
     with pytest.raises(StageError, match=sentence):
         check_marks(tmp_path / "f.tsv")
-    path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
-    check_marks(path, photos)
-    path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
-    with pytest.raises(StageError, match=r"a is in 9\.jpg"):
-        check_marks(path, photos)
 
 
 def test_missing_file(tmp_path):
