@@ -55,6 +55,8 @@ def _pick() -> None:
     from scenefuse.stage import run
 
     _need_project("--configfile", "-h", "--help")
+    if _takes_own_settings() and not Path("Snakefile").is_file():
+        sys.argv += ["--configfile", str(OWN_SETTINGS)]
     run(pick)
 
 
@@ -75,17 +77,20 @@ def _need_project(*elsewhere: str) -> None:
         sys.exit(f"error: {where}; run this in a project that scenefuse init FOLDER made, or give --configfile")
 
 
+def _takes_own_settings() -> bool:
+    """Whether the project has settings of its own, and no others are given."""
+    return OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in sys.argv[1:])
+
+
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
     from scenefuse.io.settings import ROOT
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")
-    words = sys.argv[1:]
     # Options of Snakemake that say where the project is, or that none is needed.
     _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
-    if OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in words):
-        words = ["--configfile", str(OWN_SETTINGS), *words]
+    words = [*(["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []), *sys.argv[1:]]
     # As `python -m snakemake`, but its help and its complaints name the command that was typed.
     start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
     command = [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from scenefuse.io.columns import COLOR, NORMAL, POSITION, Columns
 from scenefuse.io.formats import LAS_DIMENSIONS, bytes_of, read_columns
+from scenefuse.io.readers.columns import COLOR, NORMAL, POSITION, Columns
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 from scenefuse.version import VERSION

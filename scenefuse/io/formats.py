@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.columns import COLOR, POSITION, Columns, common_name
-from scenefuse.io.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
-from scenefuse.io.text_clouds import TEXTS, text_parts
+from scenefuse.io.readers.columns import COLOR, POSITION, Columns, common_name
+from scenefuse.io.readers.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
+from scenefuse.io.readers.text import TEXTS, text_parts
 from scenefuse.io.tiles.ply_header import read_header
 from scenefuse.stage import StageError
 

@@ -18,9 +18,9 @@ from scenefuse.io.clouds import (
     spacing,
     write_cloud,
 )
-from scenefuse.io.columns import COLOR, POSITION, Columns
 from scenefuse.io.formats import LAS_DIMENSIONS, NOISE, WITHHELD, check_not_degrees, las_crs, las_dimensions
-from scenefuse.io.text_clouds import text_notes
+from scenefuse.io.readers.columns import COLOR, POSITION, Columns
+from scenefuse.io.readers.text import text_notes
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
 from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled

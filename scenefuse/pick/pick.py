@@ -8,7 +8,6 @@ from pathlib import Path
 
 import tyro
 
-from scenefuse.command_line import OWN_SETTINGS
 from scenefuse.pick.session import Session
 from scenefuse.stage import StageError
 
@@ -24,15 +23,14 @@ def pick(
 
     Args:
         object: name of the object, as in the table of objects.
-        configfile: settings, as given to snakemake; config/config.yaml where it is left out.
+        configfile: settings, as given to snakemake; where it is left out, the shipped ones, or with the command
+            `scenefuse pick` the project's config/config.yaml.
         port: of the page on this machine; 0 takes a free one.
         no_browser: print the address only.
 
     Raises:
         StageError: settings, tables or photos are wrong, or the page's packages are not installed.
     """
-    if configfile is None and OWN_SETTINGS.is_file() and not Path("Snakefile").is_file():
-        configfile = OWN_SETTINGS  # as `scenefuse run` does
     session = Session(object, configfile)
     try:
         from nicegui import app, ui

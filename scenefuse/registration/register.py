@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from scenefuse.io.clouds import Cloud, read_cloud
+from scenefuse.io.readers.text import TEXTS
 from scenefuse.io.settings import build, read_settings
-from scenefuse.io.text_clouds import TEXTS
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_cloud import CropSettings

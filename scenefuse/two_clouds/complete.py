@@ -15,9 +15,9 @@ from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import FusionSettings, fuse_clouds
 from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, write_cloud
-from scenefuse.io.columns import COLOR
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import unit_and_name
+from scenefuse.io.readers.columns import COLOR
 from scenefuse.io.settings import build, read_settings
 from scenefuse.stage import StageError, atomic_file, quantity, write_json
 from scenefuse.transforms import Sim3

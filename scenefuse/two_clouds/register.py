@@ -11,7 +11,7 @@ import tyro
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud, at_nothing, precision_note, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.io.formats import check_not_degrees, las_crs, las_noise
-from scenefuse.io.text_clouds import text_notes
+from scenefuse.io.readers.text import text_notes
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,

@@ -9,7 +9,7 @@ from plyfile import PlyData, PlyElement
 from support.cloud_files import UTM
 
 from scenefuse.io.clouds import read_cloud
-from scenefuse.io.meshes import MESH_POINTS
+from scenefuse.io.readers.meshes import MESH_POINTS
 from scenefuse.stage import StageError
 
 # A roof: a large face that looks west and up, a small one that looks east.

@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from scenefuse.io.columns import Columns
 from scenefuse.io.formats import check_projected, checked, part_reader, read_columns, readable
+from scenefuse.io.readers.columns import Columns
 from scenefuse.io.tiles.tiled_cloud import AT_ONCE
 
 ColumnParts = Callable[[], Iterator[Columns]]

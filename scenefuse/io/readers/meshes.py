@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.columns import Columns
+from scenefuse.io.readers.columns import Columns
 
 Array = NDArray[np.float64]
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.columns import COLOR, NORMAL, POSITION, Columns, common_name
+from scenefuse.io.readers.columns import COLOR, NORMAL, POSITION, Columns, common_name
 from scenefuse.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
