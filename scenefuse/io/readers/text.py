@@ -22,6 +22,8 @@ ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe"
 CLEARLY = 0.1
 # Lines in which the first row is looked for, and rows by which it is told what their columns are.
 HEAD, LOOKED_AT = 50, 100_000
+# Lines that are taken at once where nobody says how many: as text they take twice the memory of their numbers.
+AT_ONCE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -101,8 +103,8 @@ def text_notes(path: Path) -> list[str]:
     return text_layout(path).notes if path.suffix.lower() in TEXTS else []
 
 
-def text_parts(path: Path, at_once: int = -1) -> Iterator[Columns]:
-    """The columns of a file of text (`text_layout`), so many rows at a time; all at once for -1.
+def text_parts(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
+    """The columns of a file of text (`text_layout`), so many rows at a time.
 
     Raises:
         ValueError: a row that is none, or is of another length.
@@ -111,7 +113,7 @@ def text_parts(path: Path, at_once: int = -1) -> Iterator[Columns]:
     with open(path, encoding="utf-8-sig") as file:
         lines = islice(file, layout.above, None)
         first = layout.above + 1
-        while some := list(islice(lines, at_once if at_once > 0 else None)):
+        while some := list(islice(lines, at_once)):
             if "".join(some).strip():
                 try:
                     rows = layout.rows(some)
