@@ -163,6 +163,8 @@ class Document:
         lines = [f"{_BASE}{self._digest}", "\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
         text = "\n".join(lines) + "\n"
         if hashlib.sha256(text.encode()).hexdigest() != self._drafted:
+            if self._draft.exists() and digest(self._draft) != self._drafted:
+                _kept(self._draft)  # it is another page's, or could not be read
             _write(self._draft, text)
             self._drafted = digest(self._draft)
         return self._draft

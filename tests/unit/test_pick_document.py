@@ -224,6 +224,9 @@ def test_a_draft_that_cannot_be_read_changes_nothing_and_stays(path):
     document.change((FOOT, HEAD))
     document.save()
     assert names(path) == ["prompts.tsv", "prompts.unsaved.tsv"]
+    document.change((FOOT,))
+    document.keep_draft()
+    assert (path.parent / "prompts.unsaved.kept-1.tsv").read_text() == "mangled\n"
 
 
 def test_of_two_pages_one_does_not_remove_the_draft_of_the_other(path):
