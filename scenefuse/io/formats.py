@@ -136,21 +136,6 @@ def check_not_degrees(path: Path, points: NDArray[np.float64]) -> None:
         )
 
 
-def las_noise(path: Path) -> NDArray[np.bool_] | None:
-    """(N,) which points of a LAS or LAZ file are classed as noise or withheld; None where none is, and for others."""
-    if path.suffix.lower() not in (".las", ".laz"):
-        return None
-    import laspy
-
-    with readable(path), laspy.open(path) as file:
-        parts = [
-            np.isin(np.asarray(part.classification), NOISE) | (np.asarray(part[WITHHELD]) != 0)
-            for part in file.chunk_iterator(LOOKED_AT)
-        ]
-    noise = np.concatenate(parts) if parts else np.zeros(0, bool)
-    return noise if noise.any() else None
-
-
 def las_dimensions(path: Path) -> list[str]:
     """What a LAS or LAZ file says of its points beside position, colour and extra dimensions, as far as it differs
     among the first million or is a class: names of the format; empty for any other file."""

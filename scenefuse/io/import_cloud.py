@@ -171,7 +171,7 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     count, left_out, every, sample = 0, dict[str, int](), 1, np.zeros((0, 3))
     unit_normals, most_color, unused, kept = None, None, set[str](), set[str]()
     for columns in parts():
-        columns, without = _usable(columns, bool(known))
+        columns, without = surface_rows(columns, bool(known))
         left_out = {why: left_out.get(why, 0) + rows for why, rows in without.items()}
         part = cloud_of(columns)
         sample = np.concatenate([sample, part.points[-count % every :: every]])
@@ -201,8 +201,9 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     return Survey(count, left_out, sample, unit_normals, most_color, bool(known), *names)
 
 
-def _usable(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
-    """The rows that are points of a surface, and why others were left out -> how many."""
+def surface_rows(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
+    """The rows that are points of a surface, without the column `withheld`, and why others were left out -> how
+    many."""
     without = dict[str, int]()
     columns, without["rows without a finite position"] = finite_rows(columns)
     points = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
@@ -218,7 +219,7 @@ def _usable(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
 def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
     """The file's points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
     for columns in parts():
-        cloud = cloud_of(_usable(columns, own.is_las)[0], own.most_color)
+        cloud = cloud_of(surface_rows(columns, own.is_las)[0], own.most_color)
         normals = None
         if own.unit_normals and cloud.normals is not None:
             normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)

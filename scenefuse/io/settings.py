@@ -59,13 +59,14 @@ def with_defaults(content: Mapping[str, Any], schema: Mapping[str, Any]) -> dict
     }
 
 
-def read_settings(mine: Path | None) -> dict[str, Any]:
-    """The shipped settings with those of a file laid over them, all checked.
+def read_settings(*mine: Path | None) -> dict[str, Any]:
+    """The shipped settings with those of files laid over them, one after the other; all checked.
 
     Raises:
-        StageError: the file is missing, is no YAML, or holds a key or value that the schema does not allow.
+        StageError: a file is missing, is no YAML, or holds a key or value that the schema does not allow.
     """
-    return with_defaults({} if mine is None else read_differences(mine), schema_of("config"))
+    own = [read_differences(file) for file in mine if file is not None]
+    return with_defaults(functools.reduce(merge, own, {}), schema_of("config"))
 
 
 def read_differences(mine: Path) -> dict[str, Any]:

@@ -11,13 +11,13 @@ from scenefuse.io.settings import ROOT
 TIME_LIMIT_S = 300
 
 
-def command(configfile: Path | None, target: str) -> list[str]:
+def command(configfiles: tuple[Path, ...], target: str) -> list[str]:
     """The command line that makes a target, as a person types it in the working directory."""
     words = ["snakemake"]
     if not Path("Snakefile").is_file():
         words += ["--snakefile", str(ROOT / "Snakefile")]
-    if configfile is not None:
-        words += ["--configfile", str(configfile)]
+    if configfiles:
+        words += ["--configfile", *map(str, configfiles)]
     return [*words, "--cores", "2", target]
 
 

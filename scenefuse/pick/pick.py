@@ -13,18 +13,18 @@ from scenefuse.stage import StageError
 
 
 def pick(
-    *, object: str, configfile: Path | None = None, port: int = 0, no_browser: tyro.conf.UseCounterAction[int] = 0
+    *, object: str, configfile: tuple[Path, ...] = (), port: int = 0, no_browser: tyro.conf.UseCounterAction[int] = 0
 ) -> None:
     """Click what an object is in its photos, and points in its scene's, in a page of this machine's browser.
 
     The page writes the tables that the workflow reads: columns `prompts` and `fiducials` of the table of objects, and
-    `lengths` of the table of scenes. Run it in the working directory of the workflow, with the same settings file;
-    Ctrl-C ends it.
+    `lengths` of the table of scenes. Run it in the working directory of the workflow, with the same settings
+    files; Ctrl-C ends it.
 
     Args:
         object: name of the object, as in the table of objects.
-        configfile: settings, as given to snakemake; where it is left out, the shipped ones, or with the command
-            `scenefuse pick` the project's config/config.yaml.
+        configfile: settings, one file or several, as given to snakemake; where it is left out, the shipped ones, or
+            with the command `scenefuse pick` the project's config/config.yaml.
         port: of the page on this machine; 0 takes a free one.
         no_browser: print the address only.
 

@@ -56,7 +56,7 @@ class Session:
 
     Attributes:
         name: of the object.
-        configfile: as given on the command line.
+        configfiles: as given on the command line.
         boards: its tables.
         tiles, thumbnails, segmenter, carried: see their classes.
         result: the last file that the workflow makes of the object.
@@ -64,14 +64,14 @@ class Session:
         key: of this session, for addresses of pictures that the browser may keep.
     """
 
-    def __init__(self, name: str, configfile: Path | None) -> None:
+    def __init__(self, name: str, configfiles: tuple[Path, ...]) -> None:
         """Read the project, the tables and the photos' headers.
 
         Raises:
             StageError: settings, tables or photos are wrong.
         """
-        project = read_project(read_settings(configfile))
-        self.name, self.configfile = name, configfile
+        project = read_project(read_settings(*configfiles))
+        self.name, self.configfiles = name, configfiles
         self.boards = [Board(source) for source in sources_of(project, name)]
         last = "fused.ply" if project.objects[name].get("scene") else "object.ply"
         self.result = Path("results/objects") / name / last

@@ -118,7 +118,7 @@ class SidePanel:
             source = board.source
             text = f"Write {document.path} into the column {source.column} of the table of {source.of}."
             ui.label(text).classes("text-xs text-orange-900")
-        words = command(self._page.session.configfile, str(board.source.result))
+        words = command(self._page.session.configfiles, str(board.source.result))
         ui.label(as_text(words)).classes("code w-full").mark("command")
         ui.button("What will run?", icon="playlist_play", on_click=self.plan).props("dense outline padding='2px 10px'")
         self._planned = ui.label().classes("text-xs")
@@ -126,7 +126,7 @@ class SidePanel:
     async def plan(self) -> None:
         """Ask the workflow what it will run."""
         self._planned.set_text("Asking the workflow; some seconds ...")
-        words = command(self._page.session.configfile, str(self._page.session.result))
+        words = command(self._page.session.configfiles, str(self._page.session.result))
         rules, trouble = await asyncio.to_thread(planned_rules, words)
         jobs = ", ".join(f"{rule}{f' ({count})' if count > 1 else ''}" for rule, count in rules.items())
         self._planned.set_text(trouble or f"Will run: {jobs or 'nothing'}.")

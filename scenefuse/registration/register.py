@@ -12,7 +12,7 @@ from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
 from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
 from scenefuse.registration.crop.crop_cloud import CropSettings
-from scenefuse.registration.crop.crop_scene import MIN_POINTS, crop_marked
+from scenefuse.registration.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.registration.decision import FineSettings, tilt_deg
 from scenefuse.registration.fine import pose_quantities
 from scenefuse.registration.icp import ScaleRange
@@ -175,34 +175,46 @@ def _check_points(cloud: Cloud, name: str) -> None:
     check_extent(cloud, name)
 
 
+def search_box(settings: CropSettings, fiducials: Path | None = None, box: Array | None = None) -> tuple[Array, Array]:
+    """Corners (3,) of the part of a scene that `cut_scene` with the same arguments depends on."""
+    if box is not None:
+        return box[:3], box[3:]
+    if fiducials is None:
+        return np.full(3, -np.inf), np.full(3, np.inf)
+    return around_marks(_fiducials(fiducials)[1], settings)
+
+
 def cut_scene(
     scene: Cloud,
     settings: CropSettings,
     up_in_scene: Array | None = None,
     fiducials: Path | None = None,
     box: Array | None = None,
+    total: int | None = None,
 ) -> tuple[Cloud, str]:
     """The part of a scene in which the object is looked for, and what it is in words.
 
     Args:
-        scene: the whole scene.
+        scene: the whole scene, or what of it lies in `search_box`.
         settings: of the crop.
         up_in_scene: opposite to gravity; without it, no ground is removed around fiducials.
         fiducials: file of at least four points on the object in the scene's coordinates: tab-separated with the header
             `point x y z` (TSV), or any cloud file.
         box: (6,) least x, y, z and greatest x, y, z.
+        total: points of the whole scene, where this is a part.
 
     Raises:
         StageError: bad fiducials, or an empty box.
     """
+    total = len(scene) if total is None else total
     if box is not None:
         inside = (scene.points >= box[:3]) & (scene.points <= box[3:])
         part = scene[np.flatnonzero(inside.all(1))]
         if not len(part):
             raise StageError("no scene point lies in the crop box; give least x y z, then greatest x y z")
-        return part, f"the crop box, {len(part)} of {len(scene)} points"
+        return part, f"the crop box, {len(part)} of {total} points"
     if fiducials is None:
-        return scene, f"the whole scene, {len(scene)} points, as if it showed little but the object"
+        return scene, f"the whole scene, {total} points, as if it showed little but the object"
     names, marks = _fiducials(fiducials)
     if up_in_scene is None:
         settings, up_in_scene = replace(settings, remove_ground=False), np.array([0.0, 0.0, 1.0])
@@ -210,7 +222,7 @@ def cut_scene(
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
     ground = "the ground removed" if cut.on_ground.any() else "no ground removed"
-    said = "; ".join([f"around {len(marks)} fiducials, {cut.keep.sum()} of {len(scene)} points, {ground}", *cut.notes])
+    said = "; ".join([f"around {len(marks)} fiducials, {cut.keep.sum()} of {total} points, {ground}", *cut.notes])
     return scene[cut.keep], said
 
 

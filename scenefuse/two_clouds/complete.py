@@ -2,7 +2,7 @@
 
 import copy
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,17 +10,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, together, with_source
+from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, with_source
 from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
-from scenefuse.fusion.modes import FusionSettings, fuse_clouds
-from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, write_cloud
+from scenefuse.fusion.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
+from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, records_of, spacing
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import unit_and_name
 from scenefuse.io.readers.columns import COLOR
 from scenefuse.io.settings import build, read_settings
+from scenefuse.io.tiles.tiled_cloud import Rows
+from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.stage import StageError, atomic_file, quantity, write_json
 from scenefuse.transforms import Sim3
+from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.version import VERSION
 
 CHUNK = 1_000_000
@@ -34,9 +37,11 @@ class Completed:
     """A scene with an object in it.
 
     Attributes:
-        kept: (N,) of the scene's points that stay.
-        scene: these points, with `source` and the fields of evidence (method F4), not checked unless they were before.
-        added: the object's points that come in, in the scene's coordinates, likewise.
+        near: the scene's points around the object, before.
+        kept: (N,) of these that stay.
+        gone: (R,) rising: rows of the scene's file that are taken away.
+        added: the object's points that come in, in the scene's coordinates, with `source` and the fields of evidence
+            (method F4), not checked.
         source: their `source`; 1, or the next number of a scene that was completed before.
         fill_distance: distance within which both show the same place.
         mode: `fill`, or the mode for comparison that the settings name.
@@ -44,8 +49,9 @@ class Completed:
         seconds: that it took.
     """
 
+    near: Cloud
     kept: NDArray[np.bool_]
-    scene: Cloud
+    gone: Rows
     added: Cloud
     source: int
     fill_distance: float
@@ -53,65 +59,68 @@ class Completed:
     notes: list[str]
     seconds: float
 
-    @property
-    def cloud(self) -> Cloud:
-        """All points."""
-        return together(self.scene, self.added)
-
 
 def fusion_settings(config: Path | None) -> FusionSettings:
     """The shipped settings of the fusion with those of a YAML file laid over them."""
     return build(FusionSettings, read_settings(config)["fusion"])
 
 
-def complete(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, settings: FusionSettings) -> Completed:
+def complete(
+    obj: Cloud, scene: CloudFile, scene_from_object: Sim3, settings: FusionSettings, around: float = 0.0
+) -> Completed:
     """Add a registered object to a scene as the workflow does where neither has photos (method F1).
 
     Args:
         obj: the object in its own frame.
-        scene: the whole scene.
-        part: the scene's points among which the object was found; its spacing says what is new.
+        scene: the scene's file; the spacing of its part, in which the object was found, says what is new.
         scene_from_object: the registration.
         settings: of the fusion; `evidence` needs photos and becomes `fill`, which a note says.
+        around: how far around the object the scene is read at least.
     """
     start = time.perf_counter()
     settings, notes = possible(settings, False, False)
-    if scene.normals is not None:
+    if scene.like.normals is not None:
         obj = with_normals(obj)
-    fusion = fuse_clouds(obj, scene, part, scene_from_object, settings)
-    again = set(scene.fields) >= OWN
-    source = int(scene.fields["source"].max()) + 1 if again else FROM_OBJECT
+    moved, reach = scene_from_object.apply(obj.points), max(NEAR_SPACINGS * spacing(scene.part.points), around)
+    rows, near = scene.near(moved.min(0) - reach, moved.max(0) + reach)
+    fusion = fuse_clouds(obj, near, scene.part if scene.every == 1 else near, scene_from_object, settings)
+    source = scene.last + 1 if _again(near) else FROM_OBJECT
     added = with_source(unchecked(fusion.added), source)
-    if scene.colors is not None and obj.colors is None:
+    if near.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
-    left_out = sorted({*scene.fields, *obj.fields} - (OWN if again else set()))
+    left_out = sorted({*near.fields, *obj.fields} - (OWN if _again(near) else set()))
     if left_out:
         notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
-    kept = with_source(unchecked(scene[fusion.kept]), FROM_SCENE)
-    if again:
-        known = {name: scene.fields[name][fusion.kept].astype(of.dtype) for name, of in kept.fields.items()}
-        kept = replace(kept, fields=known)
-    seconds = time.perf_counter() - start
-    return Completed(fusion.kept, kept, added, source, fusion.fill_distance, settings.mode, notes, seconds)
+    gone, seconds = rows[~fusion.kept], time.perf_counter() - start
+    return Completed(near, fusion.kept, gone, added, source, fusion.fill_distance, settings.mode, notes, seconds)
 
 
-def write_completed(out: Path, done: Completed, object: Path, scene: Path) -> list[Path]:
-    """Write completed.ply, completed.laz where the scene is LAS or LAZ, and completed.json; returns their paths."""
-    notes, crs, written = list(done.notes), las_crs(scene), [out / "completed.ply"]
-    write_cloud(written[0], done.cloud)
-    if scene.suffix.lower() in (".las", ".laz"):
+def _again(scene: Cloud) -> bool:
+    """Whether a scene was completed before."""
+    return set(scene.fields) >= OWN
+
+
+def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) -> list[Path]:
+    """Write completed.ply, completed.laz where the scene is LAS or LAZ, and completed.json; returns their paths.
+
+    The scene is read and written in parts.
+    """
+    notes, crs, written = list(done.notes), las_crs(scene.path), [out / "completed.ply"]
+    _write_ply(written[0], done, scene)
+    if scene.path.suffix.lower() in (".las", ".laz"):
         written.append(out / "completed.laz")
         notes += append_to_las(written[1], scene, done)
     for note in notes:
         print(f"note       {note}", flush=True)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
-    earlier = {str(number): f"{number} in {scene.name}" for number in range(FROM_OBJECT, done.source)}
+    earlier = {str(number): f"{number} in {scene.path.name}" for number in range(FROM_OBJECT, done.source)}
+    kept = scene.total - len(done.gone)
     content = {
         "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
-        "points": quantity(len(done.scene) + len(done.added), "points"),
-        "scene_points": quantity(len(done.scene), "points"),
-        "removed_points": quantity(int((~done.kept).sum()), "points"),
+        "points": quantity(kept + len(done.added), "points"),
+        "scene_points": quantity(kept, "points"),
+        "removed_points": quantity(len(done.gone), "points"),
         "added_points": quantity({object.stem: len(done.added)}, "points"),
         "mode": quantity(done.mode, ""),
         "fill_distance": quantity(done.fill_distance, unit),
@@ -124,7 +133,36 @@ def write_completed(out: Path, done: Completed, object: Path, scene: Path) -> li
     return [*written, out / "completed.json"]
 
 
-def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
+def _write_ply(path: Path, done: Completed, scene: CloudFile) -> None:
+    """The scene's points that stay, then those that came in, with the columns that the scene has."""
+    like = with_fields(scene.like)
+    added = replace(
+        done.added,
+        normals=None if like.normals is None else done.added.normals,
+        colors=None if like.colors is None else done.added.colors,
+        fields={name: done.added.fields[name] for name in like.fields},
+    )
+    count = scene.total - len(done.gone) + len(added)
+    with reserved(path, records_of(like, path).dtype, count) as (file, _):
+        for rows, cloud in scene.parts():
+            file.write(records_of(with_fields(cloud[_stay(rows, done)]), path).tobytes())
+        file.write(records_of(added, path).tobytes())
+
+
+def with_fields(cloud: Cloud) -> Cloud:
+    """Points of the scene with `source` and the fields of evidence: those that they have, or not checked ones."""
+    kept = with_source(unchecked(cloud), FROM_SCENE)
+    if not _again(cloud):
+        return kept
+    return replace(kept, fields={name: cloud.fields[name].astype(of.dtype) for name, of in kept.fields.items()})
+
+
+def _stay(rows: Rows, done: Completed) -> NDArray[np.bool_]:
+    """(N,) which of some rows of the scene's file are not taken away."""
+    return ~np.isin(rows, done.gone)
+
+
+def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
     """Copy a LAS or LAZ file with all that its points have, and append what was added.
 
     Coordinates keep the file's own steps, and its CRS stays. The fields of `Completed` become extra dimensions. Added
@@ -139,7 +177,7 @@ def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
     """
     import laspy
 
-    with laspy.open(scene) as reader:
+    with laspy.open(scene.path) as reader:
         header = copy.deepcopy(reader.header)
         # An index of the points (COPC) is not one of more points.
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
@@ -151,17 +189,21 @@ def append_to_las(path: Path, scene: Path, done: Completed) -> list[str]:
         described = {name: LAS_DESCRIPTIONS.get(name, "") for name in types}
         header.add_extra_dims([laspy.ExtraBytesParams(names[n], kind, described[n]) for n, kind in types.items()])
         with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
-            brightest = 0
-            for chunk, fields in _kept_chunks(reader, done):
+            brightest, first = 0, 0
+            for chunk in reader.chunk_iterator(CHUNK):
+                stay = _stay(np.arange(first, first + len(chunk)), done)
+                first, chunk = first + len(chunk), chunk[stay]
                 part = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
                 for name in chunk.array.dtype.names:
                     part.array[name] = chunk.array[name]
                 if "red" in own:
                     brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
-                _fill_in(part, {names[name]: values for name, values in fields.items()})
+                if not again:
+                    unknown = with_source(unchecked(Cloud(np.zeros((len(chunk), 3)))), FROM_SCENE).fields
+                    _fill_in(part, {names[name]: values for name, values in unknown.items()})
                 writer.write_points(part)
             colors = 1 if 0 < brightest <= 255 else 257
-            writer.write_points(_added_record(header, done, names, colors, scene))
+            writer.write_points(_added_record(header, done, names, colors, scene.path))
             if further:
                 writer.write_evlrs(further)
     return [f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other]
@@ -174,16 +216,6 @@ def _free(name: str, taken: set[str]) -> str:
 
 def _but_copc(records: Iterable[Any]) -> list[Any]:
     return [record for record in records if record.user_id != "copc"]
-
-
-def _kept_chunks(reader: Any, done: Completed) -> Iterator[tuple[Any, dict[str, NDArray[Any]]]]:
-    """Parts of a LAS file without the points that were taken away, and their fields."""
-    first, placed = 0, 0
-    for chunk in reader.chunk_iterator(CHUNK):
-        part = chunk[done.kept[first : first + len(chunk)]]
-        rows = slice(placed, placed + len(part))
-        yield part, {name: values[rows] for name, values in done.scene.fields.items()}
-        first, placed = first + len(chunk), placed + len(part)
 
 
 def _added_record(header: Any, done: Completed, names: dict[str, str], colors: int, scene: Path) -> Any:

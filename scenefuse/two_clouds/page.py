@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.io.clouds import Cloud
+from scenefuse.fusion.changes import together
 from scenefuse.report.page import document, embedded
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view.view_file import View
@@ -14,10 +14,10 @@ from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 from scenefuse.stage import atomic_file, value
 from scenefuse.transforms import Array, Sim3, rotation_between
-from scenefuse.two_clouds.complete import Completed
+from scenefuse.two_clouds.complete import Completed, with_fields
 
 VIEW_POINTS = 300_000
-REACH = 0.35
+VIEW_REACH = 0.35
 """How far around the object the view shows the scene, over the object's diagonal."""
 AZIMUTH_DEG, ELEVATION_DEG = -60.0, 20.0
 UP = np.array([0.0, 0.0, 1.0])
@@ -39,16 +39,13 @@ ROWS = {
 """Quantities of transform.json that the page lists."""
 
 
-def write_page(
-    page: Path, content: dict[str, Any], picture: Path, scene: Cloud, done: Completed | None, up: Array | None
-) -> None:
+def write_page(page: Path, content: dict[str, Any], picture: Path, done: Completed | None, up: Array | None) -> None:
     """Write one HTML file that needs no other and no network.
 
     Args:
         page: output.
         content: of transform.json.
         picture: of the alignment; left out where no pose was found.
-        scene: the scene before.
         done: the scene completed; None where the pose was refused.
         up: (3,) unit up direction in the scene; z where it is not known.
     """
@@ -60,7 +57,8 @@ def write_page(
     if done is None:
         parts.append("<p>The pose was refused, so there is no completed scene.</p>")
     else:
-        parts += [_told(done), view_section("scene", title, view_of(names[0], scene, done, up))]
+        scene_points = inputs["scene_points"] - len(done.gone)
+        parts += [_told(done, scene_points), view_section("scene", title, view_of(names[0], done, up))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
@@ -72,17 +70,17 @@ def write_page(
         temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
 
 
-def view_of(name: str, scene: Cloud, done: Completed, up: Array | None) -> View:
+def view_of(name: str, done: Completed, up: Array | None) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
     level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
-    added = done.added if len(done.added) else done.scene
+    added = done.added if len(done.added) else done.near
     corners = np.percentile(added.points, [0.5, 99.5], axis=0)
     middle = np.floor(corners.mean(0))
     level = level @ Sim3(1.0, np.eye(3), -middle)
-    reach = (0.5 + REACH) * float(np.linalg.norm(corners[1] - corners[0]))
+    reach = (0.5 + VIEW_REACH) * float(np.linalg.norm(corners[1] - corners[0]))
     before, after = (
         cloud[within(cloud.points, middle - reach, middle + reach, margin=0.0)].transformed(level)
-        for cloud in (scene, done.cloud)
+        for cloud in (done.near, together(with_fields(done.near[done.kept]), done.added))
     )
     low, high = np.percentile(added.transformed(level).points, [0.5, 99.5], axis=0)
     points = merge(before, after)
@@ -94,11 +92,11 @@ def view_of(name: str, scene: Cloud, done: Completed, up: Array | None) -> View:
     return View(thinned, sources, "scene units", low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
 
 
-def _told(done: Completed) -> str:
+def _told(done: Completed, scene_points: int) -> str:
     """What became of the scene, in a paragraph."""
-    removed = int((~done.kept).sum())
+    removed = len(done.gone)
     said = [
-        f"{len(done.added):,} points of the object were added to {len(done.scene):,} of the scene"
+        f"{len(done.added):,} points of the object were added to {scene_points:,} of the scene"
         + (f", {removed:,} of which were taken away" if removed else "; none was taken away")
         + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
         *done.notes,

@@ -9,9 +9,8 @@ import numpy as np
 import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
-from scenefuse.io.clouds import Cloud, at_nothing, precision_note, read_cloud, spacing, write_cloud, write_laz
-from scenefuse.io.formats import check_not_degrees, las_crs, las_noise
-from scenefuse.io.readers.text import text_notes
+from scenefuse.io.clouds import Cloud, write_cloud, write_laz
+from scenefuse.io.formats import las_crs
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
@@ -21,12 +20,14 @@ from scenefuse.registration.register import (
     evidence_of,
     register_clouds,
     report,
+    search_box,
     summary,
 )
 from scenefuse.stage import StageError, atomic_file, quantity, write_json
 from scenefuse.transforms import Array, Sim3
+from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
-from scenefuse.two_clouds.page import write_page
+from scenefuse.two_clouds.page import VIEW_REACH, write_page
 from scenefuse.version import VERSION
 
 REGISTERED, UNREGISTERED = 0, 3
@@ -35,6 +36,8 @@ NOTHING = Known()
 LARGEST = 10.0
 # And has to be at least so many times as large as its points are apart.
 SMALLEST = 10.0
+# Points of the part of a scene in which an object is searched: of many more, some are left out.
+SEARCHED = 1 << 22
 OUTPUTS = (
     *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
     *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
@@ -48,16 +51,14 @@ class Given:
 
     Attributes:
         object: the object's cloud, in its file's coordinates.
-        scene: the whole scene's, likewise.
-        part: the scene's points among which the object is looked for.
+        scene: the scene's file, and of its points those among which the object is looked for.
         searched: what that part is, in words.
         notes: what a user should know of the files.
         ups: unit up directions in the object's and the scene's coordinates; None where one is not known.
     """
 
     object: Cloud
-    scene: Cloud
-    part: Cloud
+    scene: CloudFile
     searched: str
     notes: list[str]
     ups: tuple[Array, Array] | None
@@ -103,9 +104,9 @@ def register(
         print(f"note       {note}", flush=True)
     if scales is not None:
         _check_size(scales, given)
-    found = register_clouds(given.object, given.part, settings, seed, ups=given.ups, scales=scales)
-    evidence = evidence_of(given.object, given.part, given.ups)
-    points = {"object_points": len(given.object), "scene_points": len(given.scene)}
+    found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales)
+    evidence = evidence_of(given.object, given.scene.part, given.ups)
+    points = {"object_points": len(given.object), "scene_points": given.scene.total}
     content = report(found, given.ups) | {
         "evidence": quantity(evidence, ""),
         "searched": quantity(given.searched, ""),
@@ -152,35 +153,18 @@ def _clear(out: Path, inputs: list[Path]) -> None:
 
 def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Known) -> Given:
     up_object, up_scene = known.ups()
-    cloud, whole = read_cloud(object), read_cloud(scene)
-    for path, points in ((object, cloud.points), (scene, whole.points)):
-        check_not_degrees(path, points)
-    notes = [*text_notes(object), *text_notes(scene), *_notes(object, scene)]
-    crs = las_crs(scene)
-    if crs is not None:
-        from scenefuse.io.crs import check_place
-
-        check_place(crs, whole.points, scene)
     box = None if known.crop_box is None else np.array(known.crop_box)
-    cloud, surface = _surface(object, cloud, notes), _surface(scene, whole, notes)
-    if scene.suffix.lower() not in (".las", ".laz"):  # which are copied row by row
-        whole = surface
-    part, searched = cut_scene(surface, settings.crop, up_scene, known.fiducials, box)
+    cloud = CloudFile.of(object)
+    marked = search_box(settings.crop, known.fiducials, box)
+    whole = CloudFile.of(scene, marked, SEARCHED)
+    notes = [*cloud.notes, *whole.notes, *_notes(object, scene)]
+    if whole.every > 1:
+        notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
+    # Marks around which nothing lies are far from all of the scene, which the crop says.
+    near = whole.part if len(whole.part) or box is not None else Cloud(whole.sample)
+    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.count)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
-    return Given(cloud, whole, part, searched, notes, ups)
-
-
-def _surface(path: Path, cloud: Cloud, notes: list[str]) -> Cloud:
-    """The points of a file that are of a surface; notes on the others are added."""
-    nothing, noise = at_nothing(cloud.points), las_noise(path)
-    odd = {"points at 0 0 0, far from all others,": nothing}
-    odd |= {} if noise is None else {"points classed as noise, or withheld,": noise}
-    notes += [f"{mask.sum()} {why} of {path} are not used" for why, mask in odd.items() if mask.any()]
-    used = cloud[~np.logical_or.reduce(list(odd.values()))]
-    if not len(used):
-        raise StageError(f"all points of {path} are classed as noise, or withheld; give its surface")
-    notes += precision_note(path, used.points, spacing(used.points))
-    return used
+    return Given(cloud.part, replace(whole, part=part), searched, notes, ups)
 
 
 def _notes(object: Path, scene: Path) -> list[str]:
@@ -203,7 +187,7 @@ def _write(out: Path, format: str, given: Given, found: Registration, scene: Pat
     if pose is None:
         return []
     written = [out / "picture.png"]
-    draw_alignment(written[0], given.object, given.part, pose, seed)
+    draw_alignment(written[0], given.object, given.scene.part, pose, seed)
     if found.registered:
         written += [out / "transform.txt", out / f"object_in_scene.{format}"]
         write_matrix(written[1], pose)
@@ -220,7 +204,7 @@ def write_matrix(path: Path, pose: Sim3) -> None:
 def _check_size(scales: ScaleRange, given: Given) -> None:
     """StageError where the object would be much larger than the part of the scene that shows it, or lost between its
     points."""
-    most, part, step = scales.centre * float(np.exp(scales.width)), given.part.diagonal, spacing(given.part.points)
+    most, part, step = scales.centre * float(np.exp(scales.width)), given.scene.part.diagonal, given.scene.spacing
     across = most * given.object.diagonal
     if across > LARGEST * part or across < SMALLEST * step:
         raise StageError(
@@ -245,8 +229,10 @@ def _fuse(
     inputs = content["inputs"]["value"]
     written, done = list[Path](), None
     if found.registered and found.scene_from_object is not None:
-        done = complete(given.object, given.scene, given.part, found.scene_from_object, fusion_settings(config))
-        written += write_completed(out, done, inputs["object"], inputs["scene"])
+        pose = found.scene_from_object
+        around = VIEW_REACH * given.object.transformed(pose).diagonal
+        done = complete(given.object, given.scene, pose, fusion_settings(config), around)
+        written += write_completed(out, done, inputs["object"], given.scene)
     page = out / "report.html"
-    write_page(page, content, out / "picture.png", given.scene, done, known.ups()[1])
+    write_page(page, content, out / "picture.png", done, known.ups()[1])
     return [*written, page]

@@ -1,12 +1,13 @@
-"""What one object costs in scenes of ever more points: crop, registration, fusion, completed scene; memory and seconds.
+"""What one object costs in scenes of ever more points: crop, registration, fusion, completed scene, and the command
+`scenefuse register --fuse`; memory and seconds.
 
 make bench-scale, or a part of it:
 PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --millions 1 10
 
 A planted house stands in a yard that goes on and on at the same density, so that what is near it is the same in all
-scenes. Up to --laz-millions the yard is a LAZ file that is imported as in the workflow, and laspy reads the same box of
-it, and of a COPC file; larger ones are written as the workflow indexes them. Up to --completed-millions the completed
-scene is written.
+scenes. Up to --laz-millions the yard is a LAZ file that is imported as in the workflow, the command registers in it,
+and laspy reads the same box of it, and of a COPC file; larger ones are written as the workflow indexes them. Up to
+--completed-millions the completed scene is written.
 """
 
 import resource
@@ -39,15 +40,22 @@ from scenefuse.registration.crop.crop_scene import CropInputs, around_marks, cro
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.fine import register_finely
 from scenefuse.registration.problem import Inputs
+from scenefuse.registration.register import Known
 from scenefuse.registration.scale import ScaleSettings
 from scenefuse.stage import quantity, read_json, run, value, write_json
 from scenefuse.transforms import Array, Sim3
+from scenefuse.two_clouds.register import register as register_files
 
 OBJECT_POINTS = 100_000
 PART = 1_000_000
 """Points that laspy reads together."""
+COPC_MILLIONS = 10
+"""Of a larger yard no COPC file is made for laspy: what makes it holds all of it in memory."""
 CUT = 1.05
 """The yard begins so many diagonals from the middle of the house, where its own ground ends."""
+
+UTM = np.array([500_000.0, 5_300_000.0, 0.0])
+"""Where the yard of a LAZ file lies in its CRS."""
 
 
 def planted() -> Trial:
@@ -134,7 +142,9 @@ def make_laz(path: Path, count: int) -> None:
     """The yard as a user has it."""
     yard = Yard(count)
     box = np.full(3, -yard.across * yard.side), np.full(3, yard.across * yard.side)
-    with laz_in_parts(path, Cloud(np.zeros((0, 3))), box, np.zeros(3), "EPSG:32632") as append:
+    with laz_in_parts(
+        path, Cloud(np.zeros((0, 3)), None, np.zeros((0, 3), np.uint8)), box, UTM, "EPSG:32632"
+    ) as append:
         for low, _, number in yard.tiles():
             append(yard.points(low, number))
 
@@ -196,6 +206,14 @@ def register(folder: Path) -> None:
     register_finely(inputs=inputs, scale_json=scale, coarse_json=coarse, report=fine, seed=0, settings=FineSettings())
 
 
+def command(folder: Path) -> str:
+    """`scenefuse register --fuse`, with the fiducials and the scene's up direction; the status."""
+    known = Known(up_scene=(0.0, 0.0, 1.0), fiducials=folder / "points.tsv")
+    out = folder / "out"
+    register_files(object=folder / "object.ply", scene=folder / "yard.laz", known=known, out=out, fuse=True)
+    return str(value(read_json(out / "transform.json"), "status"))
+
+
 def stages(folder: Path, completed: bool) -> dict[str, Cost]:
     """Every stage of one object in the scene of a folder."""
     scene, georeference, house = folder / "dense.ply", folder / "georeference.json", folder / "house"
@@ -226,7 +244,9 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     write_cloud(folder / "object.ply", trial.object)
-    rows = [f"p{k}\t{x:.4f}\t{y:.4f}\t{z:.4f}\n" for k, (x, y, z) in enumerate(trial.fiducials.tolist())]
+    place = UTM if laz else np.zeros(3)
+    marks = enumerate((trial.fiducials + place).tolist())
+    rows = [f"p{k}\t{x:.4f}\t{y:.4f}\t{z:.4f}\n" for k, (x, y, z) in marks]
     (folder / "points.tsv").write_text("point\tx\ty\tz\n" + "".join(rows))
     low, high = around_marks(trial.fiducials, CropSettings())
     row: dict[str, Any] = {"millions": millions}
@@ -236,18 +256,22 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
         files = {"cloud": "dense.ply", "report": "dense.json", "georeference_json": "georeference.json"}
         outputs = {name: folder / file for name, file in files.items()}
         row |= timed(import_scene_cloud, source=folder / "yard.laz", **outputs).row("index")
-        by_laspy = timed(laspy_reads, folder / "yard.laz", low, high)
+        by_laspy = timed(laspy_reads, folder / "yard.laz", low + place, high + place)
         row |= by_laspy.row("laspy") | {"laspy_points": by_laspy.result}
+        alone = timed(command, folder)
+        row |= alone.row("command") | {"command_status": alone.result}
+        shutil.rmtree(folder / "out")
         (folder / "yard.laz").unlink()
-        timed(make_copc, folder / "yard.copc.laz", count)
-        by_copc = timed(copc_reads, folder / "yard.copc.laz", low, high)
-        row |= by_copc.row("copc") | {"copc_points": by_copc.result}
-        (folder / "yard.copc.laz").unlink()
+        if millions <= COPC_MILLIONS:
+            timed(make_copc, folder / "yard.copc.laz", count)
+            by_copc = timed(copc_reads, folder / "yard.copc.laz", low, high)
+            row |= by_copc.row("copc") | {"copc_points": by_copc.result}
+            (folder / "yard.copc.laz").unlink()
         origin = np.array(value(read_json(folder / "georeference.json"), "origin_in_crs"))
     else:
         row |= timed(make_tiles, folder / "dense.ply", count).row("make")
     row["disk_gb"] = (folder / "dense.ply").stat().st_size / 1e9
-    read = timed(tiles_read, folder / "dense.ply", low - origin, high - origin)
+    read = timed(tiles_read, folder / "dense.ply", low + place - origin, high + place - origin)
     row |= read.row("near") | {"near_points": read.result}
     found = stages(folder, completed)
     for name, cost in found.items():
@@ -256,7 +280,7 @@ def one_size(work: Path, millions: float, laz: bool, completed: bool) -> dict[st
     row |= {"object_s": sum(c.seconds for c in of_object), "object_cpu_s": sum(c.cpu_seconds for c in of_object)}
     row["most_gb"] = max(cost.peak_gb for cost in found.values())
     pose = Sim3.from_matrix(np.array(value(read_json(folder / "house/fine.json"), "scene_from_object")))
-    placed = Sim3(pose.scale, pose.rotation, pose.translation + origin)
+    placed = Sim3(pose.scale, pose.rotation, pose.translation + origin - place)
     scale, turn, shift = errors(placed, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal)
     row |= {"status": value(read_json(folder / "house/fusion.json"), "status")}
     row |= {"scale_pct": scale, "turn_deg": turn, "shift": shift}

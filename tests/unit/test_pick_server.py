@@ -24,7 +24,7 @@ def session(tmp_path, monkeypatch):
     (tmp_path / "secret.jpg").write_bytes((tmp_path / "close/0.jpg").read_bytes())
     project.write()
     monkeypatch.chdir(tmp_path)
-    return Session("shed", tmp_path / "mine.yaml")
+    return Session("shed", (tmp_path / "mine.yaml",))
 
 
 @pytest.fixture

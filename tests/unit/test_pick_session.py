@@ -1,5 +1,7 @@
 """What the page opens for an object: its tables and photos, and the masks of its clicks."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -27,7 +29,7 @@ def yard(tmp_path, monkeypatch):
 
 
 def opened(project, name="shed"):
-    return Session(name, project.write())
+    return Session(name, (project.write(),))
 
 
 def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
@@ -35,6 +37,13 @@ def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
     assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "clicks.tsv")
     assert list(first.source.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.source.pictures) == 3
     assert first.source.sizes["0.jpg"] == (64, 48) and first.source.listed and first.cameras is None
+
+
+def test_of_several_settings_files_the_last_one_counts(yard):
+    first, last = yard.write(), yard.path / "last.yaml"
+    last.write_text("object: {masks: {method: auto}}")
+    assert Session("shed", (first,)).segmenter._settings["method"] == "grabcut"
+    assert Session("shed", (first, last)).segmenter._settings["method"] == "auto"
 
 
 def test_masks_of_one_s_own_are_said_to_count_in_the_place_of_clicks(yard):
@@ -195,7 +204,7 @@ def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_s
 
 def test_the_next_command_is_the_one_to_type(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = command(tmp_path / "my settings.yaml", "results/objects/shed/masks.png")
-    assert as_text(words).endswith("my settings.yaml' --cores 2 results/objects/shed/masks.png")
+    words = command((tmp_path / "my settings.yaml", Path("few.yaml")), "results/objects/shed/masks.png")
+    assert as_text(words).endswith("my settings.yaml' few.yaml --cores 2 results/objects/shed/masks.png")
     (tmp_path / "Snakefile").touch()
-    assert "--snakefile" not in command(None, "all")
+    assert "--snakefile" not in command((), "all")

@@ -20,6 +20,7 @@ from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import RegistrationSettings
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
+from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.two_clouds.complete import complete, write_completed
 from scenefuse.two_clouds.register import register
 from scenefuse.version import VERSION
@@ -63,9 +64,9 @@ def test_an_index_that_more_points_make_untrue_is_left_out_and_other_records_sta
     las = laspy.convert(las, point_format_id=7)
     las.evlrs = VLRList([laspy.VLR("copc", 1000, "", bytes(32)), laspy.VLR("surveyor", 2, "", b"Jones")])
     las.write(str(tmp_path / "yard.laz"))
-    read = read_cloud(tmp_path / "yard.laz")
-    done = complete(own(sheet(2, 8)), read, read, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), scene, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     header = laspy.read(tmp_path / "completed.laz").header
     kept = [(record.user_id, bytes(record.record_data_bytes())) for record in [*header.vlrs, *header.evlrs]]
     assert {("surveyor", b"Smith"), ("surveyor", b"Jones")} <= set(kept)
@@ -129,9 +130,9 @@ def test_the_matrix_is_written_to_the_last_digit(fused):
 def test_a_laz_keeps_all_that_its_points_have(tmp_path):
     scene, obj = in_scene(sheet(0, 4)), sheet(2, 8, (10, 20, 30))
     write_survey(tmp_path / "yard.laz", scene)
-    read = read_cloud(tmp_path / "yard.laz")
-    done = complete(own(obj), read, read, POSE, FusionSettings(mode="fill", match_colors=False))
-    written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(obj), scene, POSE, FusionSettings(mode="fill", match_colors=False))
+    written = write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in written] == ["completed.ply", "completed.laz", "completed.json"]
     before, after = laspy.read(tmp_path / "yard.laz"), laspy.read(tmp_path / "completed.laz")
     count = len(before.points)
@@ -150,9 +151,9 @@ def test_a_laz_keeps_all_that_its_points_have(tmp_path):
 def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     scene, obj = in_scene(sheet(0, 4)), sheet(2, 8)
     write_survey(tmp_path / f"yard.{ending}", scene, bright=1)
-    read = read_cloud(tmp_path / f"yard.{ending}")
-    done = complete(own(obj), read, read, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / f"yard.{ending}")
+    scene = CloudFile.of(tmp_path / f"yard.{ending}")
+    done = complete(own(obj), scene, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     after = laspy.read(tmp_path / "completed.laz")
     assert after.red.max() <= 255 and after.red[-1] > 100
 
@@ -162,8 +163,8 @@ def test_a_completed_scene_takes_further_objects_and_keeps_what_is_known(tmp_pat
     scene = tmp_path / "yard.laz"
     for number, (low, high) in enumerate([(2, 8), (6, 12), (10, 16)], 1):
         out = tmp_path / str(number)
-        read = read_cloud(scene)
-        done = complete(own(sheet(low, high)), read, read, POSE, FILL)
+        scene = CloudFile.of(scene)
+        done = complete(own(sheet(low, high)), scene, POSE, FILL)
         write_completed(out, done, tmp_path / "shed.ply", scene)
         scene = out / "completed.laz"
         if number == 1:
@@ -184,9 +185,9 @@ def test_a_scene_with_some_field_of_the_same_name_keeps_it(tmp_path):
     survey.add_extra_dim(laspy.ExtraBytesParams("source", "u1"))
     survey.source[:] = 7
     survey.write(tmp_path / "yard.laz")
-    read = read_cloud(tmp_path / "yard.laz")
-    done = complete(own(sheet(2, 8)), read, read, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), scene, POSE, FILL)
+    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     after = laspy.read(tmp_path / "completed.laz")
     assert set(after.source[: len(survey.points)].tolist()) == {7}
     assert set(after.source_after.tolist()) == {0, 1}
@@ -197,9 +198,9 @@ def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be
     scene, obj = in_scene(sheet(0, 4)), Cloud(sheet(2, 8).points)
     scene.fields["height"] = scene.points[:, 2]
     write_cloud(tmp_path / "yard.ply", scene)
-    read = read_cloud(tmp_path / "yard.ply")
-    done = complete(own(obj), read, read, POSE, FusionSettings())
-    written = write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.ply")
+    scene = CloudFile.of(tmp_path / "yard.ply")
+    done = complete(own(obj), scene, POSE, FusionSettings())
+    written = write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in written] == ["completed.ply", "completed.json"]
     notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
     for words in ("leaves out the columns height", "grey in the scene", "neither side has photos"):
@@ -212,10 +213,10 @@ def test_an_object_beyond_the_coordinates_of_a_las_file_is_one_sentence(tmp_path
     scene, far = in_scene(sheet(0, 4)), sheet(2, 8)
     far.points[-1, 0] = 4e6
     write_survey(tmp_path / "yard.laz", scene)
-    read = read_cloud(tmp_path / "yard.laz")
-    done = complete(own(far), read, read, POSE, FILL)
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(far), scene, POSE, FILL)
     with pytest.raises(StageError, match="coordinates of .*yard.laz end before the object"):
-        write_completed(tmp_path, done, tmp_path / "shed.ply", tmp_path / "yard.laz")
+        write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
     assert not (tmp_path / "completed.laz").exists()
 
 
@@ -258,7 +259,8 @@ def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_file(tmp_path
     noisy.write(tmp_path / "noisy.laz")
     files = {"object": tmp_path / "house.ply", "scene": tmp_path / "noisy.laz"}
     assert register(**files, out=tmp_path / "out", fuse=True) == 0
-    assert "40 points classed as noise, or withheld, of" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "30 points of the classes 7 and 18 (noise) of" in printed and "10 withheld points of" in printed
     written = laspy.read(tmp_path / "out/completed.laz")
     assert (np.asarray(written.classification) == 7).sum() == 30 and (np.asarray(written["source"]) == 1).any()
 
@@ -280,3 +282,73 @@ def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
     with pytest.raises(StageError, match="is an input, and a run removes what lies in --out"):
         register(object=tmp_path / "house.ply", scene=out / "completed.ply", out=out)
     assert (out / "completed.ply").is_file()
+
+
+def in_parts(monkeypatch, rows, most):
+    """Files are read so many rows at a time, and so many points of a part are held."""
+    monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.two_clouds.cloud_file.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
+
+
+@pytest.mark.parametrize("ending", ["laz", "ply", "xyz"])
+def test_a_scene_in_parts_is_completed_as_one_in_one_piece(tmp_path, monkeypatch, ending):
+    scene, path = in_scene(sheet(0, 4)), tmp_path / f"yard.{ending}"
+    if ending == "laz":
+        write_survey(path, scene)
+    elif ending == "ply":
+        write_cloud(path, scene)
+    else:
+        np.savetxt(path, np.hstack([scene.points, scene.colors]), fmt="%.3f")
+    settings = FusionSettings(mode="replace")  # which takes points away, too
+    whole = CloudFile.of(path)
+    done = complete(own(sheet(2, 8)), whole, POSE, settings)
+    write_completed(tmp_path / "whole", done, tmp_path / "shed.ply", whole)
+    in_parts(monkeypatch, 70, 1 << 22)
+    parts = CloudFile.of(path)
+    assert len(list(parts.parts())) > 5 and parts.every == 1
+    again = complete(own(sheet(2, 8)), parts, POSE, settings)
+    write_completed(tmp_path / "parts", again, tmp_path / "shed.ply", parts)
+    for one in (tmp_path / "whole").glob("completed.[pl]*"):
+        assert one.read_bytes() == (tmp_path / "parts" / one.name).read_bytes(), one.name
+    assert 0 < len(again.gone) < len(scene) and len(again.added) > 0
+    assert len(read_cloud(tmp_path / "parts/completed.ply")) == len(scene) - len(again.gone) + len(again.added)
+
+
+def test_of_a_large_part_every_so_manyth_point_is_searched_and_all_stay(tmp_path, house, monkeypatch):
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    in_parts(monkeypatch, 500, 1000)
+    write_cloud(tmp_path / "house.ply", house.object)
+    write_survey(tmp_path / "yard.laz", Cloud(house.scene.points + UTM, None, house.scene.colors))
+    files = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.laz"}
+    assert register(**files, out=tmp_path / "out", fuse=True) == 0
+    content = read_json(tmp_path / "out/transform.json")
+    assert any("one in 4 of its points is searched" in note for note in value(content, "notes"))
+    assert f"the whole scene, {len(house.scene)} points" in value(content, "searched")
+    pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
+    found, truth = (p.apply(house.object.points) for p in (pose, house.scene_from_object))
+    assert np.linalg.norm(found - truth - UTM, axis=1).max() < 0.03 * house.diagonal
+    after = read_cloud(tmp_path / "out/completed.ply")
+    assert (after.fields["source"] == 0).sum() == len(house.scene)
+    # New is what is farther from all of the scene's points than these are apart, not than those that were searched.
+    assert value(read_json(tmp_path / "out/completed.json"), "fill_distance") < 2.5 * spacing(house.scene.points)
+
+
+def test_a_crop_box_is_all_that_is_held_of_a_scene(tmp_path):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 40)))
+    low, high = UTM + [2.95, -1, -1], UTM + [4.95, 3, 1]
+    held = CloudFile.of(tmp_path / "yard.laz", (low, high))
+    assert (len(held.part), held.count, held.total) == (20 * 20, 400 * 20, 400 * 20)
+    rows, near = held.near(low - 1, high + 1)
+    assert len(near) == 40 * 20 and np.array_equal(near.points, read_cloud(tmp_path / "yard.laz").points[rows])
+
+
+@pytest.mark.parametrize("fields", [{"classification": 7}, {"withheld": 1}])
+def test_a_cloud_without_a_point_of_a_surface_is_one_sentence(tmp_path, fields):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
+    las = laspy.read(tmp_path / "yard.laz")
+    for name, number in fields.items():
+        las[name] = np.full(len(las.points), number)
+    las.write(tmp_path / "yard.laz")
+    with pytest.raises(StageError, match="holds no point of a surface .800 .*withheld|noise"):
+        CloudFile.of(tmp_path / "yard.laz")

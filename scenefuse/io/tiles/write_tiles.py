@@ -78,15 +78,18 @@ def write_tiled(path: Path, parts: Parts, count: int, sample: Array) -> None:
 
 
 @contextmanager
-def reserved(path: Path, row: np.dtype[Any], count: int, tiles: int) -> Iterator[tuple[BinaryIO, int]]:
+def reserved(path: Path, row: np.dtype[Any], count: int, tiles: int = 0) -> Iterator[tuple[BinaryIO, int]]:
     """A PLY of so many points and tiles with its header written and its space reserved, and where its points begin.
+
+    Without tiles it is a PLY like any other.
 
     It gets its name when everything is written.
 
     Raises:
         StageError: the disk has too little space.
     """
-    header = header_of([Element("vertex", count, row), Element("tile", tiles, ROW_OF_TILE)])
+    elements = [Element("vertex", count, row), Element("tile", tiles, ROW_OF_TILE)]
+    header = header_of(elements if tiles else elements[:1])
     size = len(header) + count * row.itemsize + tiles * ROW_OF_TILE.itemsize
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         file.write(header)
