@@ -68,7 +68,7 @@ def read_project(config: Mapping[str, Any]) -> Project:
         )
     for kind, rows in (("scene", scenes), ("object", objects)):
         for name, row in rows.items():
-            wrong = _cloud_problem(row) or _crs_problem(row)
+            wrong = _cloud_problem(kind, row) or _crs_problem(row)
             if wrong:
                 raise StageError(f"{settings[f'{kind}s']}: {kind} '{name}' {wrong}")
     for name, row in objects.items():
@@ -99,12 +99,13 @@ def _checked_table(name: str, kind: str) -> dict[str, Row]:
     return rows
 
 
-def _cloud_problem(row: Row) -> str:
+def _cloud_problem(kind: str, row: Row) -> str:
     """What is wrong with a row that has a cloud in the place of photos or beside them, or neither; "" where nothing."""
     if not row.get("cloud"):
         return "" if row.get("photos") else "has neither photos nor cloud; fill one of these columns"
     if row.get("photos"):
-        if row.get("cameras"):
+        # Where a scene's photos lie in its cloud, GPS or control points say.
+        if row.get("cameras") or kind == "scene":
             return ""
         return (
             "has both photos and a cloud, but no cameras, in whose coordinates the cloud would lie; fill the column"
@@ -120,9 +121,9 @@ def _crs_problem(row: Row) -> str:
     """What is wrong with a row that names a CRS; "" where nothing is."""
     if not row.get("crs"):
         return ""
-    if row.get("control"):
+    if row.get("control") and not row.get("cloud"):
         return "names a crs, and its control points name theirs, in which the results are; empty the cell crs"
-    if row.get("cloud") and row.get("photos"):
+    if row.get("cloud") and row.get("cameras"):
         return "names a crs, but its cloud lies where its cameras are; empty the cell crs"
     return ""
 

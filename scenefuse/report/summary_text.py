@@ -123,6 +123,8 @@ def _given(fields: Fields, stage: str) -> str:
     if find(fields, f"{stage}.seen_share") is not None:
         outside = find(fields, f"{stage}.outside_masks")
         cut = f"; {outside} points outside the masks were left out" if outside else ""
+        if find(fields, "georeference.laid_on_cloud_by") is not None:
+            return f"the cloud {source}, on which the photos were laid"
         return f"the cloud {source}, in the coordinates of the given cameras{cut}"
     crs = find(fields, "georeference.crs")
     return f"as a cloud, {source}, without photos" + (f"; coordinates: {_crs_name(crs)}" if crs else "")

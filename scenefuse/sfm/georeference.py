@@ -18,6 +18,7 @@ from scenefuse.sfm.photos import Photo, gps_accuracies, gps_positions, read_phot
 from scenefuse.sfm.survey.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
 from scenefuse.sfm.survey.control import Control, read_sighted
 from scenefuse.sfm.survey.lengths import read_lengths
+from scenefuse.sfm.survey.on_cloud import lay_on_cloud
 from scenefuse.sfm.survey.placement import (
     ELSEWHERE_M,
     MIN_GPS_PHOTOS,
@@ -49,6 +50,7 @@ def georegister(
     lengths: Path | None = None,
     held: bool = False,
     crs: str | None = None,
+    cloud: Path | None = None,
     georeferenced: Path,
     residuals: Path,
     report: Path,
@@ -68,6 +70,8 @@ def georegister(
         lengths: known lengths between clicked points, `lengths.tsv`; beside control points or GPS only measured.
         held: whether the model is only moved: a dense cloud is given that goes with its cameras as they are.
         crs: projected, of the results; without it the UTM zone, or what control points and given cameras are in.
+            Beside a cloud, this one's.
+        cloud: of the scene, in a CRS, on which the model is laid at last; the results are in its coordinates.
         georeferenced: output, COLMAP model.
         residuals: output, tab-separated: what is left at every surveyed point and every photo with a position.
         report: output, JSON: status, transform, origin, CRS, residuals.
@@ -75,8 +79,8 @@ def georegister(
         seed: of RANSAC.
 
     Raises:
-        StageError: what `read_sighted`, `read_lengths`, `place_by_control` and `beside_gps` say; `crs` is given and
-            nothing says where the scene lies, or it lies elsewhere.
+        StageError: what `read_sighted`, `read_lengths`, `place_by_control`, `beside_gps` and `lay_on_cloud` say; `crs`
+            is given and nothing says where the scene lies, or it lies elsewhere.
     """
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
@@ -88,7 +92,7 @@ def georegister(
         found = placed_as_given(place, model, gps)
     else:
         found = georeference(gps, surveyed, up, settings, seed, sure_up=cue == "headings")
-    if crs is not None:
+    if crs is not None and cloud is None:
         found = replace(found, frame=_in_grid(found, crs))
     sizes = {p.name: (p.width, p.height) for p in listed}
     if lengths is not None and not found.metric:
@@ -99,6 +103,9 @@ def georegister(
     adjustment: dict[str, Any] = {}
     if not held:
         adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
+    if cloud is not None:
+        found, moved = lay_on_cloud(model, found, cloud, crs)
+        adjustment["laid_on_cloud_by"] = quantity(moved.matrix, "m")
     with atomic_directory(georeferenced) as temporary:
         model.write(temporary)
     left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, sizes))

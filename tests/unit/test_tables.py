@@ -268,10 +268,6 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
         ({"scene": {"cloud": ""}}, "scenes.tsv: scene 'yard' has neither photos nor cloud"),
         ({"obj": {"cloud": ""}}, "objects.tsv: object 'shed' has neither photos nor cloud"),
         (
-            {"scene": {"photos": "flight"}},
-            "scenes.tsv: scene 'yard' has both photos and a cloud, but no cameras, .*; fill the column",
-        ),
-        (
             {"scene": {"photos": "flight", "cameras": "sparse", "crs": "EPSG:25832"}},
             "scene 'yard' names a crs, but its cloud lies where its cameras are; empty the cell crs",
         ),
@@ -295,7 +291,6 @@ def test_a_cloud_stands_beside_photos_whose_cameras_are_given(cloud_project):
     ids=[
         "no scene",
         "no object",
-        "both",
         "posed crs",
         "control crs",
         "object both",

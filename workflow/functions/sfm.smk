@@ -122,6 +122,40 @@ def crs_flag(wildcards):
     return flags(crs_of(wildcards.scene))
 
 
+def lies_on_cloud(wildcards):
+    """Whether a scene has a cloud beside photos whose cameras are not given."""
+    row = scene_row(wildcards.scene)
+    return bool(row.get("cloud") and row.get("photos") and not row.get("cameras"))
+
+
+def cloud_to_lie_on(wildcards):
+    """Input function: the cloud on which a scene's photos are laid: one beside photos without given cameras."""
+    beside = lies_on_cloud(wildcards)
+    files = own_file("scene", wildcards.scene, "cloud") if beside else []
+    for file in files:
+        if not made_here(file) and not crs_of(wildcards.scene):
+            check_names_crs(wildcards.scene, file)
+    return files
+
+
+@cache
+def check_names_crs(scene, file):
+    """Stop before hours of mapping where a cloud on which photos are to be laid names no CRS."""
+    from scenefuse.sfm.survey.on_cloud import cloud_crs
+
+    try:
+        cloud_crs(Path(file), None)
+    except StageError as error:
+        raise WorkflowError(
+            f"{config['scenes']}, scene '{scene}': {error}"
+        ) from None
+
+
+def lie_on_flag(wildcards):
+    """The same as a command-line option."""
+    return flags(dict(zip(["cloud"], cloud_to_lie_on(wildcards))))
+
+
 def survey_of(wildcards):
     """Input function: their files."""
     check_survey(wildcards.scene)

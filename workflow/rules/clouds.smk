@@ -1,6 +1,7 @@
 # Clouds and meshes of the tables, in the place of what is made from photos.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: cloud; where there are photos and cameras too, sparse/, sparse.json
+# INPUTS    config/scenes.tsv, config/objects.tsv: cloud; where there are photos and cameras too, sparse/, sparse.json,
+#           and without cameras, georeferenced/
 # OUTPUTS   results/scenes/{scene}/dense.ply, dense.json      of scenes with a cloud
 #           results/scenes/{scene}/georeference.json          of those without photos
 #           results/objects/{object}/object.ply, object.json  of objects with a cloud
@@ -76,11 +77,12 @@ rule import_object_cloud:
 
 
 rule import_posed_scene_cloud:
-    """Take a cloud in the coordinates of a scene's given cameras, and move it as georeferencing moved these (M12)."""
+    """Take a cloud in the coordinates of a scene's given cameras, and move it as georeferencing moved these (M12), or
+    one on which its photos were laid (M14)."""
     input:
         as_inputs(cloud_of("scene")),
-        sparse="results/scenes/{scene}/sparse",
-        sparse_json="results/scenes/{scene}/sparse.json",
+        sparse=model_beside_cloud,
+        sparse_json=given_cameras_json,
         georeference_json="results/scenes/{scene}/georeference.json",
     output:
         cloud="results/scenes/{scene}/dense.ply",
@@ -98,15 +100,16 @@ rule import_posed_scene_cloud:
         runtime=by_size(30, all=0.1),
     params:
         source=cloud_path("scene"),
-        place=options_of("georeference_json"),
+        place=options_of("sparse_json", "georeference_json"),
+        crs=lambda wildcards: crs_flag(wildcards) if lies_on_cloud(wildcards) else "",
         files=state_of(cloud_of("scene")),
         script=script("sfm/import_posed_cloud.py"),
         code=code("sfm/import_posed_cloud.py"),
     message:
-        "Scene {wildcards.scene}: cloud of the table, among its cameras"
+        "Scene {wildcards.scene}: cloud of the table, with its photos"
     shell:
-        "exec python {params.script} --source {params.source} --sparse {input.sparse} --sparse-json {input.sparse_json}"
-        " {params.place} --cloud {output.cloud} --report {output.report} &> {log}"
+        "exec python {params.script} --source {params.source} --sparse {input.sparse}"
+        " {params.place} {params.crs} --cloud {output.cloud} --report {output.report} &> {log}"
 
 
 use rule import_posed_scene_cloud as import_posed_object_cloud with:
@@ -131,7 +134,8 @@ use rule import_posed_scene_cloud as import_posed_object_cloud with:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         source=cloud_path("object"),
-        place=options_of("workspace", "masks"),
+        place=options_of("sparse_json", "workspace", "masks"),
+        crs="",
         files=state_of(cloud_of("object")),
         script=script("sfm/import_posed_cloud.py"),
         code=code("sfm/import_posed_cloud.py"),

@@ -254,9 +254,11 @@ use rule map_scene_photos as map_object_photos with:
 
 
 rule georegister:
-    """Bring the model into metres, east, north and up, by control points or the photos' GPS, and adjust it to them."""
+    """Bring the model into metres, east, north and up, by control points or the photos' GPS, adjust it to them, and lay it
+    on the scene's cloud."""
     input:
         as_inputs(survey_of),
+        as_inputs(cloud_to_lie_on),
         photos="results/scenes/{scene}/photos.json",
         model="results/scenes/{scene}/sparse",
         report="results/scenes/{scene}/sparse.json",
@@ -278,9 +280,12 @@ rule georegister:
     params:
         options=settings("scene.georegister"),
         survey=survey_flags,
-        held=lambda wildcards: wildcards.scene in POSED_SCENES,
+        held=lambda wildcards: not cloud_to_lie_on(wildcards)
+        and wildcards.scene in POSED_SCENES,
         crs=crs_flag,
+        cloud=lie_on_flag,
         files=state_of(survey_of),
+        scan=state_of(cloud_to_lie_on),
         seed=config["seed"],
         script=script("sfm/georegister.py"),
         code=code("sfm/georegister.py"),
@@ -288,7 +293,7 @@ rule georegister:
         "Scene {wildcards.scene}: georeferencing"
     shell:
         "exec python {params.script} --sparse {input.model} --sparse-json {input.report} --photos {input.photos} {params.survey}"
-        " --held {params.held} {params.crs} --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
+        " --held {params.held} {params.crs} {params.cloud} --georeferenced {output.model} --residuals {output.residuals} --report {output.report} --seed {params.seed} {params.options} &> {log}"
 
 
 rule estimate_scene_spread:
