@@ -71,6 +71,26 @@ def photo_files(folder: Path) -> list[Path]:
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
 
 
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo as people see it; only its header is read.
+
+    Raises:
+        StageError: it is no readable picture.
+    """
+    from PIL import Image
+    from PIL.TiffImagePlugin import TiffImageFile
+
+    try:
+        with open(path, "rb") as file, Image.open(file) as image:
+            turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
+            # Pillow 13 gives the size of a TIFF as it will be when turned; its tags have it as stored.
+            tags = image.tag_v2 if isinstance(image, TiffImageFile) else None
+            width, height = image.size if tags is None else (int(tags[256]), int(tags[257]))
+            return (height, width) if turned else (width, height)
+    except (OSError, ValueError, Image.DecompressionBombError) as error:
+        raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
+
+
 def frame_name(photo: str) -> str:
     """The name of the frame that is made of a photo, by its path in the folder of photos."""
     return photo.replace("/", "_")

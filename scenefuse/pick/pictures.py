@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageOps
-from PIL.TiffImagePlugin import TiffImageFile
 
 from scenefuse.sfm.frames import sharpness
 from scenefuse.stage import StageError, atomic_file
@@ -68,23 +67,6 @@ class Picture:
         """The pixel of a place; the inverse of `place`."""
         world = TILE_PX * 2**self.depth / self.scale
         return (longitude + 180) / 360 * world, (1 - math.asinh(math.tan(math.radians(latitude))) / math.pi) / 2 * world
-
-
-def upright_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photo as people see it; only its header is read.
-
-    Raises:
-        StageError: it is no readable picture.
-    """
-    try:
-        with open(path, "rb") as file, Image.open(file) as image:
-            turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
-            # Pillow 13 gives the size of a TIFF as it will be when turned; its tags have it as stored.
-            tags = image.tag_v2 if isinstance(image, TiffImageFile) else None
-            width, height = image.size if tags is None else (int(tags[256]), int(tags[257]))
-            return (height, width) if turned else (width, height)
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
 
 
 def read_upright(path: Path, least_px: int | None = None) -> Pixels:

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from scenefuse.io.photo_files import frame_name, thin_out
+from scenefuse.io.photo_files import frame_name, thin_out, upright_size
 from scenefuse.io.project import Project
 from scenefuse.pick.clicks import Kind, Sizes
-from scenefuse.pick.pictures import Picture, upright_size
+from scenefuse.pick.pictures import Picture
 from scenefuse.sfm.photos import photo_names
 from scenefuse.stage import StageError, read_json
 

@@ -14,8 +14,7 @@ from pathlib import Path
 from support.browser import chromium
 from support.clicking_page import LOCAL, MASK, Page, served
 
-from scenefuse.io.photo_files import photo_files
-from scenefuse.pick.pictures import upright_size
+from scenefuse.io.photo_files import photo_files, upright_size
 from scenefuse.stage import run
 
 PATIENCE_S = 900

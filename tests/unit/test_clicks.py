@@ -144,9 +144,12 @@ def test_contradictory_clicks_are_named_all_at_once_and_left_out(photos):
     wrong = clicks([MIDDLE, (70, 45), (100, 45), (60, 80)], [(50, 45)])
     carried = carry(PlantedNetwork(), photos, {3: wrong}, 2)
     assert len(carried.left_out) == 3
-    assert "click inside at (100, 45) of the undistorted f03.png is 18 px" in carried.left_out[0]
+    assert "click inside at (100, 45) in f03.png is 18 px" in carried.left_out[0]
     assert "click inside at (60, 80)" in carried.left_out[1] and "click outside at (50, 45)" in carried.left_out[2]
     assert mask_iou(carried.masks[3], true_mask(photos.views[3])) == 1
+    # As a person clicked it, before the photo was undistorted.
+    again = carry(PlantedNetwork(), photos, {3: replace(wrong, original=2 * wrong.pixels + 0.5)}, 2)
+    assert "click inside at (200.5, 90.5) in f03.png is 18 px" in again.left_out[0]
     # Within the tolerance nothing contradicts.
     assert not carry(PlantedNetwork(), photos, {3: clicks([MIDDLE, (84, 45)])}, 4).left_out
 

@@ -3,6 +3,7 @@ import unicodedata
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
 from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
 from scenefuse.sfm.survey.check_marks import check_marks
@@ -221,18 +222,30 @@ def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
 
 
 def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(tmp_path):
-    path, photos = tmp_path / "f.tsv", [f"{k}.jpg" for k in range(1, 6)]
+    path, photos = tmp_path / "f.tsv", {f"{k}.jpg": tmp_path / f"{k}.jpg" for k in range(1, 6)}
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    for file in photos.values():
+        Image.new("RGB", (40, 30)).save(file, exif=exif)  # stored on its side
     path.write_text(LABELS + "inside\t3.jpg\t1\t2\noutside\t4.jpg\t1\t2\n")
     check_marks(path, photos)
     check_marks(path)
     with pytest.raises(
         StageError, match=r"the click outside is in 4\.jpg, which is none of the 3 photos \(1\.jpg, \.\.\.\)"
     ):
-        check_marks(path, photos[:3])
+        check_marks(path, dict(list(photos.items())[:3]))
     with pytest.raises(
         StageError, match=r"in 4\.jpg, but only 3 of the 5 photos are used .* max_frames to 5 and frame_s"
     ):
-        check_marks(path, photos, photos[::2])
+        check_marks(path, photos, list(photos)[::2])
+    path.write_text(LABELS + "inside\t3.jpg\t29\t39\nbox\t4.jpg\t1\t2\nbox\t4.jpg\t35\t12\n")
+    with pytest.raises(
+        StageError, match=r"box at \(35, 12\) lies outside 4\.jpg, which has 30 x 40 pixels; correct it"
+    ):
+        check_marks(path, photos)
+    photos["3.jpg"].write_bytes(b"cut")
+    with pytest.raises(StageError, match=r"3\.jpg cannot be read as a picture"):
+        check_marks(path, photos)
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
     check_marks(path, photos)
     path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")

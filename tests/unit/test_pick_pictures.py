@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.pick.pictures import BACKGROUND, TILE_PX, Picture, Thumbnails, Tiles, read_upright, upright_size
+from scenefuse.io.photo_files import upright_size
+from scenefuse.pick.pictures import BACKGROUND, TILE_PX, Picture, Thumbnails, Tiles, read_upright
 from scenefuse.stage import StageError
 
 

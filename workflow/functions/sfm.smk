@@ -176,12 +176,13 @@ def lengths_flag(wildcards):
 
 @cache
 def names_in(folder, where):
-    """Names of the photos in a cell's folder; None where it is no folder, or a rule makes it."""
+    """The photos in a cell's folder, by name; None where it is no folder, or a rule makes it."""
     if not folder or made_here(folder) or not Path(folder).is_dir():
         return None
-    return [
-        Path(file).relative_to(folder).as_posix() for file in photos_in(folder, where)
-    ]
+    return {
+        Path(file).relative_to(folder).as_posix(): Path(file)
+        for file in photos_in(folder, where)
+    }
 
 
 @cache
@@ -194,9 +195,9 @@ def check_clicks(name, column):
         photos = names_in(row.get("photos"), f"{config['objects']}, object '{name}'")
         if photos:
             frames = PROJECT.of("object", name)["object"]["frames"]
-            photos = [frame_name(photo) for photo in photos]
+            photos = {frame_name(photo): file for photo, file in photos.items()}
             chosen = thin_out(len(photos), frames["frame_step"], frames["max_frames"])
-            used = [photos[index] for index in chosen]
+            used = [list(photos)[index] for index in chosen]
     else:
         folder = scene_row(row["scene"]).get("photos")
         photos = names_in(folder, f"{config['scenes']}, scene '{row['scene']}'")

@@ -153,8 +153,7 @@ def _make(
         x, y = pixel_of(clicks.pixels, voter.mask)
         miss = np.where(clicks.inside, distance_to(voter.mask)[y, x], distance_to(~voter.mask)[y, x])
         notes += [
-            f"the click {'inside' if clicks.inside[row] else 'outside'} at ({x[row]}, {y[row]}) of the undistorted"
-            f" {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
+            f"{clicks.named(int(row))} in {view.name} is {miss[row]:.0f} px on the wrong side of its mask's outline"
             for row in np.flatnonzero(wrong)
         ]
         keep &= ~wrong

@@ -32,12 +32,14 @@ class PhotoClicks:
         inside: (N,) True on the object, False off it.
         box: (2, 2) corners of a box around the object, upper left first; None where there is none.
         points: (N, 3) what was clicked on, in the object's frame, NaN where unknown; None before it is looked for.
+        original: (N, 2) the same pixels in the original photo, as a person knows them; None where it is the same photo.
     """
 
     pixels: Array
     inside: NDArray[np.bool_]
     box: Array | None = None
     points: Array | None = None
+    original: Array | None = None
 
     @property
     def on(self) -> Array:
@@ -68,8 +70,13 @@ class PhotoClicks:
 
     def only(self, keep: NDArray[np.bool_]) -> PhotoClicks:
         """The clicks of the rows (N,) to keep, and the box."""
-        points = None if self.points is None else self.points[keep]
-        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points)
+        points, original = (None if rows is None else rows[keep] for rows in (self.points, self.original))
+        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points, original=original)
+
+    def named(self, row: int) -> str:
+        """A click in words."""
+        x, y = (self.pixels if self.original is None else self.original)[row]
+        return f"the click {'inside' if self.inside[row] else 'outside'} at ({x:g}, {y:g})"
 
 
 def clicks_per_photo(
@@ -96,7 +103,7 @@ def clicks_per_photo(
     rows = {composed(view.name): k for k, view in enumerate(views)}
     listed = None if sizes is None else {composed(name): size for name, size in sizes.items()}
     left_out: list[str] = []
-    found: dict[int, list[tuple[str, Array]]] = {}
+    found: dict[int, list[tuple[str, Array, Array]]] = {}
     advice = f"; click in one of the {len(images)} photos with a camera ({', '.join(sorted(images)[:3])}, ...)"
     why = ", or is none of the photos" if listed is None else ""
     for label, photo, pixel in zip(labels.labels, map(composed, labels.photos), labels.pixels):
@@ -107,7 +114,7 @@ def clicks_per_photo(
             if listed is not None and ((undistorted < 0) | (undistorted > [view.width, view.height])).any():
                 left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
             else:
-                found.setdefault(rows[photo], []).append((label, undistorted))
+                found.setdefault(rows[photo], []).append((label, undistorted, pixel))
         elif listed is None or photo in listed:
             left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
         else:
@@ -136,14 +143,15 @@ def _undistorted(
     return np.clip(undistorted, 0, edge) if label == "box" else undistorted
 
 
-def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array]]) -> PhotoClicks:
-    """The clicks of one photo, its two box corners sorted."""
-    corners = np.array([pixel for label, pixel in clicks if label == "box"]).reshape(-1, 2)
+def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array, Array]]) -> PhotoClicks:
+    """The clicks of one photo: label, pixel undistorted and as clicked. Its two box corners are sorted."""
+    corners = np.array([pixel for label, pixel, _ in clicks if label == "box"]).reshape(-1, 2)
     if len(corners) not in (0, 2) or (len(corners) and (np.ptp(corners, axis=0) < 2).any()):
         raise StageError(f"{path}: a box in {photo} needs two lines, two opposite corners; there are {len(corners)}")
-    points = [(label == "inside", pixel) for label, pixel in clicks if label != "box"]
+    others = [one for one in clicks if one[0] != "box"]
     return PhotoClicks(
-        np.array([pixel for _, pixel in points]).reshape(-1, 2),
-        np.array([inside for inside, _ in points], dtype=bool),
+        np.array([pixel for _, pixel, _ in others]).reshape(-1, 2),
+        np.array([label == "inside" for label, _, _ in others], dtype=bool),
         np.stack([corners.min(0), corners.max(0)]) if len(corners) else None,
+        original=np.array([pixel for *_, pixel in others]).reshape(-1, 2),
     )
