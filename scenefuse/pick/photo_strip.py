@@ -49,16 +49,12 @@ class PhotoStrip:
         self._thumbs[picture.name] = thumb
 
     def refresh(self) -> None:
-        """Show how the workflow's masks agree, and which are accepted."""
-        carried = self._session.carried
+        """Show which photos have no camera, how the workflow's masks agree, and which are accepted."""
         for name, label in self._scores.items():
-            of_object = self._board == 0
-            score = carried.agreement.get(name) if of_object else None
-            dropped = of_object and name in carried.dropped
-            text = "left out" if dropped else "" if score is None else f"{score:.2f}"
-            label.set_text(text + (" ✓" if score is not None and carried.is_accepted(name) else ""))
+            text, bad = self._session.standing(self._board, name)
+            label.set_text(text)
             label.set_visibility(bool(text))
-            label.classes(add="bad" if dropped else "", remove="" if dropped else "bad")
+            label.classes(add="bad" if bad else "", remove="" if bad else "bad")
 
     def count(self, clicks: Mapping[str, int]) -> None:
         """Show how many clicks each photo has."""

@@ -101,6 +101,17 @@ class Session:
         self.boards[0].notes += [note] if note else []
         self.results_state = state
 
+    def standing(self, board: int, photo: str) -> tuple[str, bool]:
+        """What the workflow makes of a photo of a table, in a word or none, and whether that is bad: clicks in a photo
+        without a camera count for nothing."""
+        cameras, carried = self.boards[board].cameras, self.carried
+        if cameras is not None and photo not in cameras:
+            return "no camera", True
+        if board == 0 and photo in carried.dropped:
+            return "left out", True
+        score = carried.agreement.get(photo) if board == 0 else None
+        return ("", False) if score is None else (f"{score:.2f}" + " ✓" * carried.is_accepted(photo), False)
+
     def start(self) -> None:
         """Begin the work in the background: thumbnails, and features of the photos that come first."""
         threading.Thread(target=self._make_thumbnails).start()

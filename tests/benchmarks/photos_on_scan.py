@@ -34,6 +34,8 @@ from scenefuse.transforms import Array
 SCENE, CRS = "demo", 32632
 GEOID_M, NOISE_M, HALF_M = 47.3, 0.02, 45.0
 POINTS = {"world": 900_000, "house": 30_000, "balloon": 30_000, "sculpture": 30_000}
+CELL_M, DEEPEST_M = 0.2, 0.5
+"""What lies so far below the highest point of its cell is hidden from above."""
 STEEPEST = 0.25
 """Surfaces whose normals rise by less of their length are walls, which a scanner above does not see."""
 
@@ -53,10 +55,19 @@ def surface_of(mesh: Path, count: int, rng: np.random.Generator) -> Array:
     return np.asarray(a + one * (b - a) + two * (c - a))
 
 
+def from_above(points: Array) -> Array:
+    """Those of (N, 3) points that nothing hides from above."""
+    _, cell = np.unique(np.floor(points[:, :2] / CELL_M).astype(np.int64), axis=0, return_inverse=True)
+    highest = np.full(cell.max() + 1, -np.inf)
+    np.maximum.at(highest, cell, points[:, 2])
+    return points[points[:, 2] > highest[cell] - DEEPEST_M]
+
+
 def write_scan(path: Path, meshes: Path, seed: int) -> None:
     """A laser scan of the demo's scene."""
     rng = np.random.default_rng(seed)
     local = np.concatenate([surface_of(meshes / f"{name}.ply", count, rng) for name, count in POINTS.items()])
+    local = from_above(local)
     latitude, longitude, height = LocalFrame(*ORIGIN).inverse(local + rng.normal(0, NOISE_M, local.shape)).T
     easting, northing = pyproj.Transformer.from_crs(4326, CRS, always_xy=True).transform(longitude, latitude)
     points = np.stack([easting, northing, height - GEOID_M], axis=1)

@@ -60,6 +60,21 @@ def test_a_photo_without_a_mask_cannot_be_accepted_and_clicks_left_out_are_said(
     assert not carried.is_accepted("0.jpg") and carried.notes == ["the click inside is off"]
 
 
+def test_photos_say_what_the_workflow_makes_of_them(yard):
+    report = {"dropped": {"0.jpg": "too small"}, "per_photo": {"0.jpg": {"area": 0.0, "agreement": 0.1}}}
+    report["per_photo"] |= {"1.jpg": {"area": 0.1, "agreement": 0.93}}
+    report |= {"clicks_left_out": {"value": []}, "notes": {"value": []}}
+    write_json(yard.path / "results/objects/shed/masks.json", report)
+    session = opened(yard)
+    assert [session.standing(0, f"{k}.jpg") for k in range(3)] == [("left out", True), ("0.93", False), ("", False)]
+    (yard.path / "results/objects/shed/masks").mkdir()
+    cv2.imwrite(str(yard.path / "results/objects/shed/masks/1.png"), np.zeros((48, 64), np.uint8))
+    session.carried.accept("1.jpg")
+    assert session.standing(0, "1.jpg") == ("0.93 ✓", False) and session.standing(1, "1.jpg") == ("", False)
+    session.boards[0].cameras = {"1.jpg"}
+    assert [session.standing(0, f"{k}.jpg")[0] for k in range(3)] == ["no camera", "0.93 ✓", "no camera"]
+
+
 def test_a_photo_that_cannot_be_read_does_not_keep_the_others_waiting(yard):
     session = opened(yard)
     (yard.path / "close/2.jpg").write_bytes(b"cut")
