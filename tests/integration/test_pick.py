@@ -217,8 +217,10 @@ def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
 
 
 def masked(folder, names):
-    """Results of an object whose photos have the disc as their mask, but for one that was left out."""
-    views = [View(name, np.array([[500.0, 0, 300], [0, 500, 200], [0, 0, 1]]), np.eye(4), *SIZE) for name in names]
+    """Results of an object whose photos have the disc as their mask, but for one that was left out and some without a
+    camera."""
+    lens = np.array([[500.0, 0, 300], [0, 500, 200], [0, 0, 1]])
+    views = [View(name, lens, np.eye(4), *SIZE) for name in [*names, "3.jpg"]]
     for part in ("sparse", "undistorted/sparse", "masks"):
         (folder / part).mkdir(parents=True)
     for part in ("sparse", "undistorted/sparse"):
@@ -234,7 +236,7 @@ def test_the_workflow_s_masks_are_stepped_through_and_accepted(page, yard):
     masked(yard.path / "results/objects/shed", ["1.jpg", "2.jpg"])
     scores = "return [...document.querySelectorAll('.thumb .score')].map((e) => e.offsetParent ? e.innerText : '');"
     shown = f"return (() => {{ {scores} }})().filter((text) => text).sort().join() === given[0];"
-    page.until(shown, "0.90,0.91,left out")  # taken up while the page is open
+    page.until(shown, "0.90,0.91,left out,no camera")  # taken up while the page is open
     assert page.browser.value(f"return !document.querySelector('{MASK}');")  # its own photo has none
     page.key("n")
     page.until("return document.querySelector('.thumb.here .name').innerText === '1.jpg';")
@@ -245,11 +247,11 @@ def test_the_workflow_s_masks_are_stepped_through_and_accepted(page, yard):
     page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
     page.key("a")
     page.until("return document.querySelector('.thumb.here .name').innerText === '2.jpg';")
-    page.until(shown, "0.90 ✓,0.91,left out")
+    page.until(shown, "0.90 ✓,0.91,left out,no camera")
     page.key("a")
     page.until_text("All masks are accepted")
     page.open()
-    page.until(shown, "0.90 ✓,0.91 ✓,left out")
+    page.until(shown, "0.90 ✓,0.91 ✓,left out,no camera")
 
 
 def test_a_point_is_expected_where_the_other_photos_see_it(page, yard):
