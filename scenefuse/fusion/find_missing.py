@@ -103,8 +103,9 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
     plan = plan_stations(missing, obj, around_it, cameras, up)
     write_cloud(outputs.missing, missing.cells)
-    frame = scene_frame(read_json(inputs.georeference_json))
-    rows = photo_rows(plan, cameras, up, frame)
+    georeference = read_json(inputs.georeference_json)
+    gps_higher = float(value(georeference, "gps_shift")[2]) if "gps_shift" in georeference else 0.0
+    rows = photo_rows(plan, cameras, up, scene_frame(georeference), gps_higher)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
     if around_it is not near:
@@ -175,9 +176,10 @@ def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
 
 
 def photo_rows(
-    plan: Plan, close_ups: list[View], up: Array, frame: LocalFrame | GridFrame | None
+    plan: Plan, close_ups: list[View], up: Array, frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0
 ) -> list[dict[str, Any]]:
-    """A row for each photo; up: (3,) direction opposite to gravity, scene frame."""
+    """A row for each photo; up: (3,) direction opposite to gravity, scene frame; `gps_higher`: metres by which the
+    flight's GPS counts heights higher than the scene."""
     rows, level = [], rotation_between(up, UPWARDS)
     highest = max((float(view.centre @ up) for view in close_ups), default=0.0)
     for number, station in enumerate(plan.stations, 1):
@@ -191,7 +193,7 @@ def photo_rows(
             if frame is not None and frame.crs is not None:
                 latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
                 row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
-                row["altitude_m"] = round(altitude, 3)
+                row["altitude_m"] = round(altitude + gps_higher, 3)
             row["above_close_ups"] = float(f"{view.centre @ up - highest:.4g}")
             row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
             row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)

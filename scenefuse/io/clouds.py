@@ -207,15 +207,14 @@ def chosen_rows(columns: Columns, chosen: NDArray[np.bool_]) -> tuple[Columns, i
     return {name: values[chosen] for name, values in columns.items()}, int(np.sum(~chosen))
 
 
-def at_nothing(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """(N,) which points (N, 3) are 0 0 0 while all but strays lie far from there: scanners write so what returned
-    nothing."""
-    nothing = (points == 0).all(1)
-    if not nothing.any() or nothing.all():
-        return np.zeros(len(points), bool)
-    low, high = np.percentile(points[~nothing], [1, 99], axis=0)
+def is_nothing_at_zero(others: NDArray[np.float64]) -> bool:
+    """Whether points at 0 0 0 are none of a cloud, as all its other points (N, 3) but strays lie far from there:
+    scanners write so what returned nothing."""
+    if not len(others):
+        return False
+    low, high = np.percentile(others, [1, 99], axis=0)
     away = np.linalg.norm(np.maximum(np.maximum(low, -high), 0))
-    return nothing & (away > FAR * np.linalg.norm(high - low))
+    return bool(away > FAR * np.linalg.norm(high - low))
 
 
 def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list[str]:

@@ -9,11 +9,11 @@ import numpy as np
 
 from scenefuse.io.clouds import (
     Cloud,
-    at_nothing,
     chosen_rows,
     cloud_of,
     concatenate,
     finite_rows,
+    is_nothing_at_zero,
     precision_note,
     spacing,
     write_cloud,
@@ -37,6 +37,8 @@ STRAY_PERCENT = 1.0
 SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
+# Why points at 0 0 0 are left out.
+AT_ZERO = "points at 0 0 0, far from all others,"
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -62,7 +64,7 @@ def import_scene_cloud(
     parts = columns_in_parts(source)
     own = survey(source, parts, LAS_DIMENSIONS)
     check_not_degrees(source, own.sample)
-    crs = _crs_of(source, crs)
+    crs = crs_of(source, crs)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
@@ -82,7 +84,7 @@ def import_scene_cloud(
     write_json(georeference_json, place)
 
 
-def _crs_of(source: Path, said: str | None) -> str | None:
+def crs_of(source: Path, said: str | None) -> str | None:
     """The CRS of a file: its own, or the one that a user says, perhaps with heights that the file does not know."""
     known = las_crs(source)
     if said is None:
@@ -141,6 +143,7 @@ class Survey:
         sample: (S, 3) positions of every so manyth of them: of all up to SAMPLE.
         unit_normals: whether there are normals, all of unit length; None where there are none.
         most_color: the greatest colour; None where there are none.
+        without_zero: whether points at 0 0 0 are none; they are not among the sample in any case.
         is_las: whether the file is LAS or LAZ.
         kept: names of further columns that are taken over.
         unused: names of further columns.
@@ -151,6 +154,7 @@ class Survey:
     sample: Array
     unit_normals: bool | None
     most_color: float | None
+    without_zero: bool
     is_las: bool
     kept: tuple[str, ...]
     unused: list[str]
@@ -169,12 +173,14 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     """
     known = set(LAS_DIMENSIONS) if source.suffix.lower() in (".las", ".laz") else set()
     count, left_out, every, sample = 0, dict[str, int](), 1, np.zeros((0, 3))
-    unit_normals, most_color, unused, kept = None, None, set[str](), set[str]()
+    unit_normals, most_color, unused, kept, zeros = None, None, set[str](), set[str](), 0
     for columns in parts():
         columns, without = surface_rows(columns, bool(known))
         left_out = {why: left_out.get(why, 0) + rows for why, rows in without.items()}
         part = cloud_of(columns)
-        sample = np.concatenate([sample, part.points[-count % every :: every]])
+        at_zero = (part.points == 0).all(1)
+        zeros += int(at_zero.sum())
+        sample = np.concatenate([sample, part.points[-count % every :: every][~at_zero[-count % every :: every]]])
         while len(sample) > 2 * SAMPLE:
             sample, every = sample[::2], 2 * every
         count, unused = count + len(part), unused | (set(part.fields) - known)
@@ -185,6 +191,10 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
         if part.colors is not None:
             here = max(float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0)) for name in COLOR)
             most_color = max(here, most_color or 0.0)
+    without_zero = zeros > 0 and is_nothing_at_zero(sample)
+    if without_zero:
+        left_out[AT_ZERO], count = zeros, count - zeros
+    sample = sample if len(sample) else np.zeros((min(count, 1), 3))
     if count == 0:
         what = "point with a finite position" if any(left_out.values()) else "points"
         raise StageError(f"{source} holds no {what}; look at what wrote it")
@@ -198,16 +208,17 @@ def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Surv
     if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
         most_color = None  # Formats with colours are used for points without, which are black then.
     names = tuple(sorted(kept)), sorted(unused - {""})
-    return Survey(count, left_out, sample, unit_normals, most_color, bool(known), *names)
+    return Survey(count, left_out, sample, unit_normals, most_color, without_zero, bool(known), *names)
 
 
-def surface_rows(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int]]:
+def surface_rows(columns: Columns, is_las: bool, without_zero: bool = False) -> tuple[Columns, dict[str, int]]:
     """The rows that are points of a surface, without the column `withheld`, and why others were left out -> how
-    many."""
+    many. `without_zero` is true where points at 0 0 0 are none, which only the whole file says."""
     without = dict[str, int]()
     columns, without["rows without a finite position"] = finite_rows(columns)
-    points = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
-    columns, without["points at 0 0 0, far from all others,"] = chosen_rows(columns, ~at_nothing(points))
+    if without_zero:
+        elsewhere = np.any([columns[axis] != 0 for axis in POSITION], axis=0)
+        columns, without[AT_ZERO] = chosen_rows(columns, elsewhere)
     if is_las:
         columns, noise = chosen_rows(columns, ~np.isin(columns["classification"], NOISE))
         without[f"points of the classes {NOISE[0]} and {NOISE[1]} (noise)"] = noise
@@ -219,7 +230,7 @@ def surface_rows(columns: Columns, is_las: bool) -> tuple[Columns, dict[str, int
 def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
     """The file's points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
     for columns in parts():
-        cloud = cloud_of(surface_rows(columns, own.is_las)[0], own.most_color)
+        cloud = cloud_of(surface_rows(columns, own.is_las, own.without_zero)[0], own.most_color)
         normals = None
         if own.unit_normals and cloud.normals is not None:
             normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)

@@ -212,7 +212,7 @@ def cut_scene(
         part = scene[np.flatnonzero(inside.all(1))]
         if not len(part):
             raise StageError("no scene point lies in the crop box; give least x y z, then greatest x y z")
-        return part, f"the crop box, {len(part)} of {total} points"
+        return part, f"the crop box, {len(part)} points in a scene of {total}"
     if fiducials is None:
         return scene, f"the whole scene, {total} points, as if it showed little but the object"
     names, marks = _fiducials(fiducials)
@@ -222,7 +222,8 @@ def cut_scene(
     near = replace(scene, points=scene.points - origin)
     cut = crop_marked(near, names, marks - origin, up_in_scene, settings, fiducials)
     ground = "the ground removed" if cut.on_ground.any() else "no ground removed"
-    said = "; ".join([f"around {len(marks)} fiducials, {cut.keep.sum()} of {total} points, {ground}", *cut.notes])
+    kept = f"{cut.keep.sum()} points in a scene of {total}"
+    said = "; ".join([f"around {len(marks)} fiducials, {kept}, {ground}", *cut.notes])
     return scene[cut.keep], said
 
 

@@ -85,7 +85,7 @@ class LocalFrame:
         """
         corners = np.array([[0, 0, 0], [100, 0, 0], [0, 100, 0], [-100, 0, 0], [0, -100, 0]], dtype=np.float64)
         grid = self.in_crs(corners)
-        grid[:, 2] = self.altitude_m
+        grid[:, 2] = grid[0, 2]
         return fit_sim3(corners, grid)
 
     def _topocentric(self) -> pyproj.Transformer:

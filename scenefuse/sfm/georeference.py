@@ -104,8 +104,8 @@ def georegister(
     if not held:
         adjustment = adjust_georeferenced(model, found, LENSES[value(read_json(sparse_json), "lens")].freedom)
     if cloud is not None:
-        found, moved = lay_on_cloud(model, found, cloud, crs)
-        adjustment["laid_on_cloud_by"] = quantity(moved.matrix, "m")
+        found, laid = lay_on_cloud(model, found, cloud, crs)
+        adjustment |= laid
     with atomic_directory(georeferenced) as temporary:
         model.write(temporary)
     left = residuals_of(model, found, None if lengths is None else read_lengths(lengths, model, sizes))

@@ -14,6 +14,7 @@ from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, with_source
 from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
+from scenefuse.io.cloud_file import CloudFile
 from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, records_of, spacing
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import unit_and_name
@@ -23,7 +24,6 @@ from scenefuse.io.tiles.tiled_cloud import Rows
 from scenefuse.io.tiles.write_tiles import reserved
 from scenefuse.stage import StageError, atomic_file, quantity, write_json
 from scenefuse.transforms import Sim3
-from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.version import VERSION
 
 CHUNK = 1_000_000

@@ -9,6 +9,7 @@ import numpy as np
 import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
+from scenefuse.io.cloud_file import CloudFile
 from scenefuse.io.clouds import Cloud, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
 from scenefuse.registration.icp import ScaleRange
@@ -25,7 +26,6 @@ from scenefuse.registration.register import (
 )
 from scenefuse.stage import StageError, atomic_file, quantity, write_json
 from scenefuse.transforms import Array, Sim3
-from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
 from scenefuse.version import VERSION
@@ -157,6 +157,11 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     cloud = CloudFile.of(object)
     marked = search_box(settings.crop, known.fiducials, box)
     whole = CloudFile.of(scene, marked, SEARCHED)
+    crs = las_crs(scene)
+    if crs is not None:
+        from scenefuse.io.crs import check_place
+
+        check_place(crs, whole.sample, scene)
     notes = [*cloud.notes, *whole.notes, *_notes(object, scene)]
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")

@@ -151,12 +151,17 @@ def test_clouds_beside_photos_and_cameras_take_the_place_of_stereo_and_training(
 
 
 def test_photos_without_cameras_are_laid_on_the_scene_s_cloud_by_its_crs(yard, snakemake):
+    (yard.path / "yard.ply").write_text("ply")
     yard.scenes = "scene\tphotos\tcloud\tcrs\nyard\tflight\tyard.ply\t\n"
     yard.objects = "object\tscene\tphotos\tprompts\nshed\tyard\tclose\tclicks.tsv\n"
     refused = snakemake(yard.path, "-n", config=yard.write())
     assert refused.returncode != 0
     assert "scenes.tsv, scene 'yard': yard.ply names no CRS" in refused.stdout
-    yard.scenes = yard.scenes.replace("yard.ply\t", "yard.ply\tEPSG:25832")
+    (yard.path / "bad.laz").write_bytes(b"LASF cut")
+    yard.scenes = yard.scenes.replace("yard.ply", "bad.laz")
+    refused = snakemake(yard.path, "-n", config=yard.write())
+    assert "scenes.tsv, scene 'yard': bad.laz is not a readable LAZ cloud" in refused.stdout
+    yard.scenes = yard.scenes.replace("bad.laz\t", "yard.ply\tEPSG:25832")
     plan = snakemake(yard.path, "-n", "-p", config=yard.write())
     assert plan.returncode == 0, plan.stdout[-3000:]
     rules = planned(plan.stdout)
@@ -164,7 +169,7 @@ def test_photos_without_cameras_are_laid_on_the_scene_s_cloud_by_its_crs(yard, s
     placing = next(line for line in plan.stdout.splitlines() if "sfm/georegister.py" in line)
     assert "--held False --crs EPSG:25832 --cloud yard.ply" in placing
     taking = next(line for line in plan.stdout.splitlines() if "sfm/import_posed_cloud.py" in line)
-    assert "--sparse results/scenes/yard/georeferenced --georeference-json" in taking and "--crs EPSG:25832" in taking
+    assert "--source yard.ply --georeference-json" in taking and "--crs EPSG:25832" in taking
 
 
 def test_an_object_s_cloud_beside_photos_without_cameras_stops_before_anything_runs(yard, snakemake):

@@ -9,6 +9,8 @@ import pytest
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.registration.crop.crop_cloud import CropSettings
+from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.sfm.geodesy import scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.given.cloud import import_posed_cloud
@@ -20,9 +22,9 @@ BESIDE = np.array([2.5, -1.5, 47.0])
 """How far the photos' GPS is off in east, north and height, which counts from the ellipsoid."""
 
 
-def field(count=60000, upside_down=False):
+def field(count=60000, upside_down=False, low=(-50, -35), high=(50, 35)):
     """The hilly field under the flight as a laser scanner has it: easting, northing and height in UTM."""
-    x, y = np.random.default_rng(1).uniform([-50, -35], [50, 35], (count, 2)).T
+    x, y = np.random.default_rng(1).uniform(low, high, (count, 2)).T
     height = 3 * np.sin(x / 15) + 2 * np.cos(y / 11)
     latitude, longitude, height = FRAME.inverse(np.stack([x, y, -height if upside_down else height], axis=1)).T
     easting, northing = pyproj.Transformer.from_crs(4326, 32632, always_xy=True).transform(longitude, latitude)
@@ -66,7 +68,6 @@ def laid(folder, cloud, **more):
     )
     import_posed_cloud(
         source=cloud,
-        sparse=folder / "georeferenced",
         georeference_json=folder / "georeference.json",
         crs=more.get("crs"),
         cloud=folder / "dense.ply",
@@ -92,8 +93,58 @@ def test_photos_come_to_lie_on_a_scan_that_their_gps_is_metres_off(tmp_path):
     assert "by GPS; then laid on scan.laz" in value(content, "reason")
     moved = np.array(value(content, "laid_on_cloud_by"))
     assert abs(np.linalg.norm(moved[:2, 3]) - np.linalg.norm(BESIDE[:2])) < 1.5 and abs(moved[2, 3] + BESIDE[2]) < 2
-    # The positions' common shift is no error of a position.
+    # The positions' common shift is no error of a position, and known: photos to be taken are told in GPS heights.
+    assert abs(value(content, "gps_shift")[2] - BESIDE[2]) < 1
     assert value(content, "gps_residual_median_m") < 4
+
+
+@pytest.mark.parametrize(
+    ("extent", "most_m"),
+    [
+        ({"count": 1_500_000, "low": (-250, -200), "high": (250, 200)}, 0.25),
+        ({"low": (0, -35)}, 0.6),
+        ({"low": (-32, -22), "high": (32, 22)}, 0.6),
+    ],
+    ids=["a tile around the flight", "its eastern half", "40 % of it"],
+)
+def test_a_scan_may_be_larger_or_smaller_than_what_the_photos_show(tmp_path, extent, most_m):
+    flown(tmp_path)
+    content, dense, _ = laid(tmp_path, written(tmp_path, field(**extent)))
+    assert np.median(cameras_off(tmp_path, content)) < most_m and value(content, "seen_share") > 0.5
+    assert len(dense) == extent.get("count", 60000)
+
+
+def test_a_scan_that_shows_next_to_nothing_of_the_scene_is_one_sentence(tmp_path):
+    flown(tmp_path)
+    with pytest.raises(StageError, match="of the .* points that the photos' matches give lie over .*, 50 are needed"):
+        laid(tmp_path, written(tmp_path, field(low=(-8, -6), high=(8, 6))))
+
+
+def test_heights_keep_the_name_of_their_zero_and_a_table_that_contradicts_the_file_is_refused(tmp_path):
+    flown(tmp_path)
+    content, _, report = laid(tmp_path, written(tmp_path, field(), "EPSG:32632+5773"))
+    assert "EGM96 height" in value(content, "crs") and "EGM96 height" in value(report, "crs")
+    with pytest.raises(StageError, match="is in .*, but the column crs says WGS 84 / UTM zone 33N"):
+        laid(tmp_path, tmp_path / "scan.laz", crs="EPSG:32633")
+
+
+def test_a_user_s_points_are_in_the_scan_s_coordinates(tmp_path):
+    flown(tmp_path)
+    _, dense, _ = laid(tmp_path, written(tmp_path, field()))
+    corners = [[-5, -5], [5, -5], [-5, 5], [5, 5]]
+    middle = field().mean(0)
+    chosen = [int(np.linalg.norm(field()[:, :2] - middle[:2] - corner, axis=1).argmin()) for corner in corners]
+    rows = [f"p{k}\t{x:.3f}\t{y:.3f}\t{z:.3f}\n" for k, (x, y, z) in enumerate(field()[chosen].tolist())]
+    (tmp_path / "points.tsv").write_text("point\tx\ty\tz\n" + "".join(rows))
+    inputs = CropInputs(
+        scene=tmp_path / "dense.ply",
+        sparse=tmp_path / "georeferenced",
+        georeference_json=tmp_path / "georeference.json",
+        fiducials=tmp_path / "points.tsv",
+    )
+    settings = CropSettings(remove_ground=False)
+    crop_scene(inputs=inputs, crop=tmp_path / "crop.ply", report=tmp_path / "crop.json", settings=settings)
+    np.testing.assert_allclose(value(read_json(tmp_path / "crop.json"), "fiducials"), dense.points[chosen], atol=2e-3)
 
 
 def test_a_cloud_that_names_no_crs_takes_the_table_s(tmp_path):
@@ -101,7 +152,7 @@ def test_a_cloud_that_names_no_crs_takes_the_table_s(tmp_path):
     write_cloud(tmp_path / "scan.ply", Cloud(field()))
     with pytest.raises(StageError, match="scan.ply names no CRS, .*: fill the column crs, or give the cameras"):
         laid(tmp_path, tmp_path / "scan.ply")
-    content, _, _ = laid(tmp_path, tmp_path / "scan.ply", crs="EPSG:32632")
+    content, _, _ = laid(tmp_path, tmp_path / "scan.ply", crs="WGS84 UTM 32N")
     assert np.median(cameras_off(tmp_path, content)) < 0.25
 
 
@@ -117,9 +168,13 @@ def test_control_points_place_photos_without_gps_on_a_scan(tmp_path):
 @pytest.mark.parametrize(
     "points, crs, sentence",
     [
-        (field() + [30_000, 0, 0], "EPSG:32632", "scan.laz lies 30 km from where its photos were taken"),
-        (field(upside_down=True), "EPSG:32632", "photos were laid on .*scan.laz, and do not fit it: only"),
-        (field(), "EPSG:32618", "does not lie in WGS 84 / UTM zone 18N|km from where its photos were taken"),
+        (
+            field() + [30_000, 0, 0],
+            "EPSG:32632",
+            "scan.laz has 0 points where its photos were taken, and its middle lies 30 km",
+        ),
+        (field(upside_down=True), "EPSG:32632", "laid on .*scan.laz, and do not fit it: only"),
+        (field(), "EPSG:32618", "does not lie in WGS 84 / UTM zone 18N|km from there"),
     ],
     ids=["elsewhere", "another surface", "another zone"],
 )

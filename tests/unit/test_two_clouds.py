@@ -14,13 +14,13 @@ from support.cloud_files import UTM
 from support.planted import plant
 
 from scenefuse.fusion.modes import FusionSettings
+from scenefuse.io.cloud_file import EVERYWHERE, CloudFile
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud, write_laz
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import RegistrationSettings
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
-from scenefuse.two_clouds.cloud_file import CloudFile
 from scenefuse.two_clouds.complete import complete, write_completed
 from scenefuse.two_clouds.register import register
 from scenefuse.version import VERSION
@@ -287,7 +287,7 @@ def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
 def in_parts(monkeypatch, rows, most):
     """Files are read so many rows at a time, and so many points of a part are held."""
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", rows)
-    monkeypatch.setattr("scenefuse.two_clouds.cloud_file.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.io.cloud_file.AT_ONCE", rows)
     monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
 
 
@@ -352,3 +352,23 @@ def test_a_cloud_without_a_point_of_a_surface_is_one_sentence(tmp_path, fields):
     las.write(tmp_path / "yard.laz")
     with pytest.raises(StageError, match="holds no point of a surface .800 .*withheld|noise"):
         CloudFile.of(tmp_path / "yard.laz")
+
+
+def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeypatch):
+    in_parts(monkeypatch, 500, 1 << 22)
+    scene = in_scene(sheet(0, 4))
+    write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([scene.points, np.zeros((1200, 3))])))
+    held = CloudFile.of(tmp_path / "yard.ply")
+    assert (held.count, held.total, len(held.part)) == (len(scene), len(scene), len(scene))
+    assert any("1200 points at 0 0 0, far from all others, of" in note for note in held.notes)
+    assert sum(len(cloud) for _, cloud in held.parts()) == len(held.near(*EVERYWHERE)[0]) == len(scene)
+    # A site whose own zero lies in it has a point there.
+    write_cloud(tmp_path / "site.ply", Cloud(np.concatenate([sheet(0, 4).points, np.zeros((1, 3))])))
+    assert CloudFile.of(tmp_path / "site.ply").count == len(scene) + 1
+
+
+def test_an_object_may_be_anywhere_whatever_crs_its_file_names(tmp_path, house, monkeypatch):
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    write_laz(tmp_path / "house.laz", house.object, np.zeros(3), "EPSG:25832")
+    write_cloud(tmp_path / "yard.ply", house.scene)
+    assert register(object=tmp_path / "house.laz", scene=tmp_path / "yard.ply", out=tmp_path / "out") == 0

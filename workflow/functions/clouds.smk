@@ -16,13 +16,8 @@ def cloud_path(kind):
     return lambda wildcards: shlex.quote(*cloud_of(kind)(wildcards))
 
 
-def model_beside_cloud(wildcards):
-    """Input function: the model of a scene that its cloud goes with."""
-    folder = f"results/scenes/{wildcards.scene}"
-    return f"{folder}/{'georeferenced' if lies_on_cloud(wildcards) else 'sparse'}"
-
-
-def given_cameras_json(wildcards):
-    """Input function: the JSON of given cameras; none where photos were laid on the cloud."""
-    path = f"results/scenes/{wildcards.scene}/sparse.json"
-    return [] if lies_on_cloud(wildcards) else path
+def with_cameras(path):
+    """Input function: a file of a scene's given cameras; none where photos were laid on the scene's cloud."""
+    return lambda wildcards: (
+        [] if lies_on_cloud(wildcards) else path.format(scene=wildcards.scene)
+    )

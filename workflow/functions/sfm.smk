@@ -133,18 +133,18 @@ def cloud_to_lie_on(wildcards):
     beside = lies_on_cloud(wildcards)
     files = own_file("scene", wildcards.scene, "cloud") if beside else []
     for file in files:
-        if not made_here(file) and not crs_of(wildcards.scene):
-            check_names_crs(wildcards.scene, file)
+        if not made_here(file):
+            check_cloud_crs(wildcards.scene, file)
     return files
 
 
 @cache
-def check_names_crs(scene, file):
-    """Stop before hours of mapping where a cloud on which photos are to be laid names no CRS."""
+def check_cloud_crs(scene, file):
+    """Stop before hours of mapping where a cloud on which photos are to be laid names no CRS, or one in degrees."""
     from scenefuse.sfm.survey.on_cloud import cloud_crs
 
     try:
-        cloud_crs(Path(file), None)
+        cloud_crs(Path(file), crs_of(scene).get("crs"))
     except StageError as error:
         raise WorkflowError(
             f"{config['scenes']}, scene '{scene}': {error}"

@@ -1,7 +1,6 @@
 # Clouds and meshes of the tables, in the place of what is made from photos.
 #
-# INPUTS    config/scenes.tsv, config/objects.tsv: cloud; where there are photos and cameras too, sparse/, sparse.json,
-#           and without cameras, georeferenced/
+# INPUTS    config/scenes.tsv, config/objects.tsv: cloud; where there are photos and cameras too, sparse/, sparse.json
 # OUTPUTS   results/scenes/{scene}/dense.ply, dense.json      of scenes with a cloud
 #           results/scenes/{scene}/georeference.json          of those without photos
 #           results/objects/{object}/object.ply, object.json  of objects with a cloud
@@ -81,8 +80,8 @@ rule import_posed_scene_cloud:
     one on which its photos were laid (M14)."""
     input:
         as_inputs(cloud_of("scene")),
-        sparse=model_beside_cloud,
-        sparse_json=given_cameras_json,
+        sparse=with_cameras("results/scenes/{scene}/sparse"),
+        sparse_json=with_cameras("results/scenes/{scene}/sparse.json"),
         georeference_json="results/scenes/{scene}/georeference.json",
     output:
         cloud="results/scenes/{scene}/dense.ply",
@@ -100,7 +99,7 @@ rule import_posed_scene_cloud:
         runtime=by_size(30, all=0.1),
     params:
         source=cloud_path("scene"),
-        place=options_of("sparse_json", "georeference_json"),
+        place=options_of("sparse", "sparse_json", "georeference_json"),
         crs=lambda wildcards: crs_flag(wildcards) if lies_on_cloud(wildcards) else "",
         files=state_of(cloud_of("scene")),
         script=script("sfm/import_posed_cloud.py"),
@@ -108,8 +107,8 @@ rule import_posed_scene_cloud:
     message:
         "Scene {wildcards.scene}: cloud of the table, with its photos"
     shell:
-        "exec python {params.script} --source {params.source} --sparse {input.sparse}"
-        " {params.place} {params.crs} --cloud {output.cloud} --report {output.report} &> {log}"
+        "exec python {params.script} --source {params.source} {params.place} {params.crs}"
+        " --cloud {output.cloud} --report {output.report} &> {log}"
 
 
 use rule import_posed_scene_cloud as import_posed_object_cloud with:
@@ -134,7 +133,7 @@ use rule import_posed_scene_cloud as import_posed_object_cloud with:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         source=cloud_path("object"),
-        place=options_of("sparse_json", "workspace", "masks"),
+        place=options_of("sparse", "sparse_json", "workspace", "masks"),
         crs="",
         files=state_of(cloud_of("object")),
         script=script("sfm/import_posed_cloud.py"),

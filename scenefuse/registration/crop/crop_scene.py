@@ -4,9 +4,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pyproj
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.io.crs import to_wgs84
 from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.io.units import length_unit
 from scenefuse.registration.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
@@ -14,7 +16,7 @@ from scenefuse.registration.crop.one_photo import MOST_GROWTH, SceneClicks, crop
 from scenefuse.registration.crop.parts import MIN_PART, parts
 from scenefuse.registration.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.sfm.fiducials import Labels, ScenePoints, locate, read_points
-from scenefuse.sfm.geodesy import scene_frame
+from scenefuse.sfm.geodesy import LocalFrame, scene_frame
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.transforms import Array, Sim3
 
@@ -167,8 +169,19 @@ def _located(
     if isinstance(marked, Labels):
         found = locate_clicks(marked, inputs.sparse, scene)
         return found.names, found.inside, found
+    frame = _frame_of_cloud(inputs.georeference_json)
+    if isinstance(marked, ScenePoints) and frame is not None:
+        there = to_wgs84(pyproj.CRS.from_user_input(frame.crs), marked.positions, str(inputs.fiducials))
+        return marked.points, frame.apply(there), None
     names, points, _ = locate(inputs.fiducials, inputs.sparse, settings.max_residual_px)
     return names, points, None
+
+
+def _frame_of_cloud(georeference_json: Path | None) -> LocalFrame | None:
+    """The frame of a scene whose photos were laid on its cloud, in whose coordinates a user's points are; else None."""
+    content = {} if georeference_json is None else read_json(georeference_json)
+    frame = scene_frame(content) if "laid_on_cloud_by" in content else None
+    return frame if isinstance(frame, LocalFrame) else None
 
 
 def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str], Array]:

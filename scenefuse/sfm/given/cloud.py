@@ -17,7 +17,7 @@ from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, 
 from scenefuse.io.tiles.parts import columns_in_parts
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import LocalFrame, scene_frame
-from scenefuse.sfm.given.fit import LEAST_PHOTOS, check_fit, fit_to_cameras, misfit
+from scenefuse.sfm.given.fit import FIT, LEAST_PHOTOS, check_fit, fit_to_cameras, misfit
 from scenefuse.sfm.given.place import read_place
 from scenefuse.sfm.survey.on_cloud import cloud_crs, in_local
 from scenefuse.stage import StageError, quantity, read_json, value, write_json
@@ -32,7 +32,7 @@ INSIDE, SLACK, LEAST_INSIDE = 0.9, 0.005, 200
 def import_posed_cloud(
     *,
     source: Path,
-    sparse: Path,
+    sparse: Path | None = None,
     sparse_json: Path | None = None,
     georeference_json: Path | None = None,
     crs: str | None = None,
@@ -48,9 +48,10 @@ def import_posed_cloud(
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
-        sparse: COLMAP model of the given cameras, with the points that the photos' own matches give.
+        sparse: COLMAP model of the given cameras, with the points that the photos' own matches give; None where the
+            scene's photos were laid on this cloud.
         sparse_json: its JSON; where known lengths scaled the model, they scale the cloud alike; it knows where the
-            given cameras lie on the earth. None for a georeferenced model that was laid on this cloud.
+            given cameras lie on the earth.
         georeference_json: JSON of a scene, with the similarity that georeferencing moved the model by, or its frame; an
             object's model stays where it is.
         crs: of a cloud on which the model was laid, where its file does not say it.
@@ -66,9 +67,10 @@ def import_posed_cloud(
     """
     parts = columns_in_parts(source, degrees=True)
     own = survey(source, parts, () if georeference_json is None else LAS_DIMENSIONS)
-    if sparse_json is None:
+    if sparse is None or sparse_json is None:
         assert georeference_json is not None
-        way, fit = _way_into_scene(source, own.sample, sparse, read_json(georeference_json), crs)
+        georeference = read_json(georeference_json)
+        way, fit = _way_into_scene(source, own.sample, georeference, crs), {name: georeference[name] for name in FIT}
     else:
         way, fit = _way_to_cameras(source, own.sample, sparse, read_json(sparse_json))
     if georeference_json is None:
@@ -81,7 +83,7 @@ def import_posed_cloud(
         content |= {"object_from_file": quantity(similar, "object units")}
     else:
         moved = Sim3.identity()
-        if sparse_json is not None:
+        if sparse is not None:
             moved = Sim3.from_matrix(np.array(value(read_json(georeference_json), "scene_from_sparse")))
 
         def move(part: Cloud) -> Cloud:
@@ -145,20 +147,14 @@ def _way_to_cameras(source: Path, sample: Array, sparse: Path, content: dict[str
     return Way(exact, nearest, crs.name if len(name) > len(crs.name) + 20 else name, in_degrees), fit
 
 
-def _way_into_scene(
-    source: Path, sample: Array, georeferenced: Path, georeference: dict[str, Any], crs: str | None
-) -> tuple[Way, dict[str, Any]]:
-    """How a cloud comes into the frame of a scene whose photos were laid on it, and how well it fits there.
+def _way_into_scene(source: Path, sample: Array, georeference: dict[str, Any], crs: str | None) -> Way:
+    """How a cloud comes into the frame of a scene whose photos were laid on it.
 
     Args:
         source: its file.
         sample: (N, 3) of its points.
-        georeferenced: model of the scene, in its frame.
-        georeference: of its JSON.
+        georeference: of the scene's JSON.
         crs: of the cloud, where its file does not say it.
-
-    Raises:
-        StageError: it does not fit.
     """
     known, frame = cloud_crs(source, crs), scene_frame(georeference)
     assert isinstance(frame, LocalFrame)
@@ -166,16 +162,8 @@ def _way_into_scene(
     def exact(points: Array) -> Array:
         return in_local(points, known, frame, source)
 
-    fit = fit_to_cameras(exact(sample), read_model(georeferenced))
-    found = misfit(fit)
-    if found:
-        raise StageError(
-            f"the scene's photos were laid on {source}, and do not fit it: only {found}; is it of this scene, as it was"
-            " when the photos were taken, and in the CRS that it says? With the column control, or the cameras of the"
-            " cloud's project in the column cameras, GPS does not count"
-        )
     name = known.to_string()
-    return Way(exact, fit_sim3(sample, exact(sample)), known.name if len(name) > len(known.name) + 20 else name), fit
+    return Way(exact, fit_sim3(sample, exact(sample)), known.name if len(name) > len(known.name) + 20 else name)
 
 
 def _turn_there(exact: Callable[[Array], Array], place: Array) -> Sim3:

@@ -24,6 +24,8 @@ LEAST_SEEN, LEAST_MET = 0.1, 0.2
 USUALLY_MET, BETTER_MET, MOST_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
 NEAR = 0.002
+# What is told of a fit in any case.
+FIT = ("seen_share", "met_share")
 # The cloud's box leaves out so much of it on each side; fewer points in it say that the cloud is elsewhere.
 STRAY_PERCENT, LEAST_POINTS = 1.0, 10
 # Points of the cloud that are projected into all photos, and that are compared with the cameras' own points.

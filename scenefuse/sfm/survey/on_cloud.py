@@ -2,26 +2,32 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
 import pyproj
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scenefuse.io.cloud_file import CloudFile
 from scenefuse.io.crs import check_place, grid_name, to_wgs84, usable
-from scenefuse.io.formats import las_crs
-from scenefuse.io.import_cloud import survey
-from scenefuse.io.tiles.parts import columns_in_parts
+from scenefuse.io.formats import check_projected, readable
+from scenefuse.io.import_cloud import crs_of
 from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.given.fit import fit_to_cameras, misfit
+from scenefuse.sfm.given.fit import FIT, fit_to_cameras, misfit
 from scenefuse.sfm.given.offset import cloud_from_own
 from scenefuse.sfm.survey.placement import middle_of
 from scenefuse.sfm.survey.residuals import Georeference
-from scenefuse.stage import StageError, threads
-from scenefuse.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.stage import StageError, quantity, threads
+from scenefuse.transforms import Array, Sim3, box_corners, rotation_angle_deg
 
-# Points of the cloud that the model is laid on.
-MOST_COMPARED = 200_000
+# Points of the cloud that the model is laid on, about, and of the model that have to lie over it at least.
+MOST_COMPARED, LEAST_OVER = 200_000, 50
+# What GPS is off at most, and how far beyond the model the cloud is looked at, as a share of the model's extent.
+OFF_M, BESIDE = 30.0, 0.1
+# Strays of either on each side, in percent, do not say how far it reaches.
+STRAY_PERCENT = 1.0
 # ICP goes on in so many rounds of steps, until one moves no point by more than this share of the model's extent.
 ROUNDS, STAYS = 10, 1e-3
 # Heights are compared with those of so many points of the cloud about each of the model's, seen from above.
@@ -32,20 +38,22 @@ def cloud_crs(cloud: Path, crs: str | None) -> pyproj.CRS:
     """The CRS of a scene's cloud: its file's, or the one that the table names.
 
     Raises:
-        StageError: neither says one.
+        StageError: neither says one, both differ, it is in degrees, or the file is damaged.
     """
-    named = las_crs(cloud)
-    if named is None and crs is None:
+    with readable(cloud):
+        check_projected(cloud)
+        named = crs_of(cloud, crs)
+    if named is None:
         raise StageError(
             f"{cloud} names no CRS, so nothing says where the photos lie in it: fill the column crs, or give the"
             " cameras of the cloud's project in the column cameras"
         )
-    return usable(pyproj.CRS.from_user_input(named or crs), str(cloud))
+    return usable(pyproj.CRS.from_user_input(named), str(cloud))
 
 
 def lay_on_cloud(
     model: pycolmap.Reconstruction, found: Georeference, cloud: Path, crs: str | None
-) -> tuple[Georeference, Sim3]:
+) -> tuple[Georeference, dict[str, Any]]:
     """Move a georeferenced model in place onto a cloud: first in height, then by ICP (method M14).
 
     Args:
@@ -55,10 +63,10 @@ def lay_on_cloud(
         crs: the cloud's, where its file does not say it.
 
     Returns:
-        where it lies now, with results in the cloud's CRS, and how it was moved.
+        where it lies now, with results in the cloud's CRS, and quantities: how it was moved, how well it fits.
 
     Raises:
-        StageError: nothing places the model, or the cloud lies elsewhere or in no CRS.
+        StageError: nothing places the model, or the cloud lies elsewhere or in no CRS, or does not fit.
     """
     grid = cloud_crs(cloud, crs)
     if found.frame is None or found.placement.status != "georeferenced":
@@ -66,15 +74,14 @@ def lay_on_cloud(
             f"nothing says where the photos lie in {cloud}: {found.placement.reason}; give photos with GPS, control"
             " points (column control), or the cameras of the cloud's project (column cameras)"
         )
-    sample = survey(cloud, columns_in_parts(cloud)).sample
-    check_place(grid.to_wkt(), sample, cloud)
-    there = in_local(sample[:: max(1, len(sample) // MOST_COMPARED)], grid, found.frame, cloud)
+    frame = replace(found.frame, grid=grid_name(grid))
     own = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    _check_near(there, own, cloud)
+    there = _beside(cloud, own, grid, frame)
     moved, said = Sim3.identity(), f"{found.placement.reason}; so they fit {cloud.name}"
     # Control points are as exact as a cloud, and their coordinates may well be of the same survey.
-    if found.control is None or misfit(fit_to_cameras(there, model)):
-        moved = _onto(there, own)
+    fit = fit_to_cameras(there, model)
+    if found.control is None or misfit(fit):
+        moved = _onto(there, own, str(cloud))
         off = moved.apply(own.mean(0)) - own.mean(0)
         turned, scaled = rotation_angle_deg(moved.rotation), 100 * (moved.scale - 1)
         said = (
@@ -82,7 +89,14 @@ def lay_on_cloud(
             f" {off[2]:+.2f} m in height, {turned:.2g} degrees and {scaled:+.2g} %"
         )
         model.transform(pycolmap.Sim3d(moved.scale, pycolmap.Rotation3d(moved.rotation), moved.translation))
-    frame = replace(found.frame, grid=grid_name(grid.sub_crs_list[0] if grid.is_compound else grid))
+        fit = fit_to_cameras(there, model)
+    if misfit(fit):
+        raise StageError(
+            f"the photos were placed by {found.placement.reason} and laid on {cloud}, and do not fit it: only"
+            f" {misfit(fit)}; is it of this scene, as it was when they were taken, and in the CRS that it says? Control"
+            " points (column control) place photos better than GPS, and the cameras of the cloud's project (column"
+            " cameras) best"
+        )
     names, positions = found.gps.names, frame.apply(found.gps.positions)
     centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
     placement = replace(
@@ -92,7 +106,8 @@ def lay_on_cloud(
         heights="measured",
         gps_shift=middle_of(positions - centres),
     )
-    return replace(found, placement=placement, frame=frame), moved
+    quantities = {"laid_on_cloud_by": quantity(moved.matrix, "m"), "gps_shift": quantity(placement.gps_shift, "m")}
+    return replace(found, placement=placement, frame=frame), quantities | {name: fit[name] for name in FIT}
 
 
 def in_local(points: Array, crs: pyproj.CRS, frame: LocalFrame, where: Path) -> Array:
@@ -100,12 +115,32 @@ def in_local(points: Array, crs: pyproj.CRS, frame: LocalFrame, where: Path) -> 
     return frame.apply(to_wgs84(crs, points, str(where)))
 
 
-def _onto(cloud: Array, own: Array) -> Sim3:
-    """The similarity that lays a model (M, 3) on a cloud (N, 3), from metres away: ICP until it stays."""
-    moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own)]))
+def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Array:
+    """The points (N, 3) of a cloud that lie over or near a model (M, 3), in the scene's frame."""
+    low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    reach = BESIDE * float(np.linalg.norm(high - low)) + OFF_M
+    corners = frame.in_crs(box_corners(low - reach, high + reach))
+    low, high = corners.min(0), corners.max(0)
+    low[2], high[2] = -np.inf, np.inf
+    file = CloudFile.of(cloud, (low, high), MOST_COMPARED)
+    check_place(crs.to_wkt(), file.sample, cloud)
+    if len(file.part) < LEAST_OVER:
+        off = in_local(np.median(file.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(own[:, :2], axis=0)
+        raise StageError(
+            f"{cloud} has {len(file.part)} points where its photos were taken, and its middle lies"
+            f" {np.linalg.norm(off) / 1000:.3g} km from there; give the cloud of this scene, or correct its CRS"
+        )
+    return in_local(file.part.points, crs, frame, cloud)
+
+
+def _onto(cloud: Array, own: Array, name: str) -> Sim3:
+    """The similarity that lays a model (M, 3) on a cloud (N, 3), from metres away: ICP until it stays, by the points of
+    the model that lie over the cloud."""
+    moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[_over(cloud, own, name)])]))
     stays = STAYS * float(np.linalg.norm(np.ptp(own, axis=0)))
     for _ in range(ROUNDS):
         here = moved.apply(own)
+        here = here[_over(cloud, here, name)]
         step = cloud_from_own(cloud, here)
         moved = step @ moved
         if np.linalg.norm(step.apply(here) - here, axis=1).max() < stays:
@@ -113,17 +148,16 @@ def _onto(cloud: Array, own: Array) -> Sim3:
     return moved
 
 
-def _check_near(cloud: Array, own: Array, path: Path) -> None:
-    """StageError where the model (M, 3) lies beside the cloud's box (N, 3), seen from above."""
-    low, high = cloud[:, :2].min(0), cloud[:, :2].max(0)
-    reach = float(np.linalg.norm(high - low))
-    middle = np.median(own[:, :2], axis=0)
-    off = np.maximum(np.maximum(low - middle, middle - high), 0)
-    if np.linalg.norm(off) > reach:
+def _over(cloud: Array, own: Array, name: str) -> NDArray[np.bool_]:
+    """(M,) which points of a model lie over a cloud (N, 3)."""
+    low, high = np.percentile(cloud[:, :2], [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    over = ((own[:, :2] >= low) & (own[:, :2] <= high)).all(1)
+    if over.sum() < LEAST_OVER:
         raise StageError(
-            f"{path} lies {np.linalg.norm(off) / 1000:.3g} km from where its photos were taken; give the cloud of this"
-            " scene, or correct its CRS"
+            f"{over.sum()} of the {len(own)} points that the photos' matches give lie over {name}, {LEAST_OVER} are"
+            " needed; give a cloud that shows more of what the photos do"
         )
+    return np.asarray(over)
 
 
 def _height_above(cloud: Array, own: Array) -> float:

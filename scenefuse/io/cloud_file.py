@@ -7,9 +7,18 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, chosen_rows, cloud_of, concatenate, finite_rows, precision_note, spacing
-from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees, las_crs
-from scenefuse.io.import_cloud import surface_rows
+from scenefuse.io.clouds import (
+    Cloud,
+    chosen_rows,
+    cloud_of,
+    concatenate,
+    finite_rows,
+    is_nothing_at_zero,
+    precision_note,
+    spacing,
+)
+from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees
+from scenefuse.io.import_cloud import AT_ZERO, surface_rows
 from scenefuse.io.readers.columns import COLOR, POSITION, Columns
 from scenefuse.io.readers.text import text_notes
 from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
@@ -52,6 +61,7 @@ class CloudFile:
     notes: list[str]
     _columns: ColumnParts
     _most_color: float | None
+    _without_zero: bool
 
     @classmethod
     def of(cls, path: Path, box: Box = EVERYWHERE, most: float = np.inf) -> "CloudFile":
@@ -63,46 +73,44 @@ class CloudFile:
             most: points that the part should have; of more than twice as many every second, fourth, ... is held.
 
         Raises:
-            StageError: the file is missing, damaged, of an unknown ending, in degrees, not where its CRS is used, or
-                holds no point of a surface.
+            StageError: the file is missing, damaged, of an unknown ending, in degrees, or holds no point of a surface.
         """
-        columns, is_las, rows, count, total, last = columns_in_parts(path), _is_las(path), 0, 0, 0, 0
+        columns, is_las, rows, count, total, last, zeros = columns_in_parts(path), _is_las(path), 0, 0, 0, 0, 0
         held, part, sample = list[Columns](), _Thinned(most), _Thinned(SAMPLE)
         left_out, most_color = dict[str, int](), None
         for some in columns():
             held = [*held, some] if rows < AT_ONCE else []
             rows += len(some["x"])
             surface, without = surface_rows(some, is_las)
-            count += len(surface["x"])
-            total += int(np.isfinite(_points(some)).all(1).sum()) if is_las else len(surface["x"])
+            points = _points(surface)
+            at_zero = (points == 0).all(1)
+            count, zeros = count + len(points), zeros + int(at_zero.sum())
+            total += int(np.isfinite(_points(some)).all(1).sum()) if is_las else len(points)
             left_out = {why: left_out.get(why, 0) + number for why, number in without.items()}
-            part.add(chosen_rows(surface, _inside(_points(surface), box))[0])
-            sample.add({name: surface[name] for name in POSITION})
+            part.add(chosen_rows(surface, _inside(points, box))[0])
+            sample.add(chosen_rows({name: surface[name] for name in POSITION}, ~at_zero)[0])
             if set(COLOR) <= set(some):
                 here = max(float(np.nan_to_num(some[name].astype(np.float64)).max(initial=0)) for name in COLOR)
                 most_color = max(here, most_color or 0.0)
             last = max(last, int(np.nan_to_num(some["source"]).max(initial=0)) if "source" in some else 0)
+        without_zero = zeros > 0 and is_nothing_at_zero(_points(sample.columns))
+        if without_zero:
+            left_out[AT_ZERO], count, total = zeros, count - zeros, total - zeros * (not is_las)
         if count == 0:
             raise StageError(_empty(path, rows, left_out))
         if most_color == 0 and is_las:
             most_color = None  # Formats with colours are used for points without, which are black then.
         if rows <= AT_ONCE:
             columns = held.__iter__
-        cloud, positions = _cloud(part.columns, most_color, is_las), _points(sample.columns)
+        cloud = _cloud(surface_rows(part.columns, False, without_zero)[0], most_color, is_las)
+        positions = _points(sample.columns)
+        positions = positions if len(positions) else np.zeros((1, 3))
         notes = [*text_notes(path)]
         notes += [f"{number} {why} of {path} are not used" for why, number in left_out.items() if number]
-        found = cls(path, count, total, cloud, part.every, positions, last, notes, columns, most_color)
-        found._check()
+        found = cls(path, count, total, cloud, part.every, positions, last, notes, columns, most_color, without_zero)
+        check_not_degrees(path, positions)
+        notes += precision_note(path, cloud.points, found.spacing)
         return found
-
-    def _check(self) -> None:
-        check_not_degrees(self.path, self.sample)
-        crs = las_crs(self.path)
-        if crs is not None:
-            from scenefuse.io.crs import check_place
-
-            check_place(crs, self.sample, self.path)
-        self.notes.extend(precision_note(self.path, self.part.points, self.spacing))
 
     @property
     def spacing(self) -> float:
@@ -134,9 +142,9 @@ class CloudFile:
             numbers = np.arange(first, first + len(columns["x"]))
             first += len(numbers)
             numbered = columns | {ROW: numbers}
-            chosen = (finite_rows(numbered) if everything else surface_rows(numbered, is_las))[0]
-            rows = chosen.pop(ROW)
-            yield rows, _cloud(chosen, self._most_color, is_las)
+            chosen = finite_rows(numbered) if everything else surface_rows(numbered, is_las, self._without_zero)
+            rows = chosen[0].pop(ROW)
+            yield rows, _cloud(chosen[0], self._most_color, is_las)
 
 
 class _Thinned:
