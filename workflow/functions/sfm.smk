@@ -146,9 +146,7 @@ def check_cloud_crs(scene, file):
     try:
         cloud_crs(Path(file), crs_of(scene).get("crs"))
     except StageError as error:
-        raise WorkflowError(
-            f"{config['scenes']}, scene '{scene}': {error}"
-        ) from None
+        raise WorkflowError(f"{config['scenes']}, scene '{scene}': {error}") from None
 
 
 def lie_on_flag(wildcards):
