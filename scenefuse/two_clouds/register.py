@@ -165,6 +165,12 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     notes = [*cloud.notes, *whole.notes, *_notes(object, scene)]
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
+    if box is not None and not len(whole.part):
+        low, high = (" ".join(f"{x:.6g}" for x in end(whole.sample, axis=0)) for end in (np.min, np.max))
+        raise StageError(
+            f"no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about {low} to"
+            f" {high} in {scene}"
+        )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
     near = whole.part if len(whole.part) or box is not None else Cloud(whole.sample)
     part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.count)
