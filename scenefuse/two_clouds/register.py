@@ -168,8 +168,8 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     if box is not None and not len(whole.part):
         low, high = (" ".join(f"{x:.6g}" for x in end(whole.sample, axis=0)) for end in (np.min, np.max))
         raise StageError(
-            f"no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about {low} to"
-            f" {high} in {scene}"
+            "no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about"
+            f" {low} to {high} in {scene}"
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
     near = whole.part if len(whole.part) or box is not None else Cloud(whole.sample)

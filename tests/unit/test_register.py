@@ -156,7 +156,7 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"scale": 1.0, "scale_range": (1.0, 2.0)}, "give one"),
         ({"up_object": (0.0, 0.0, 1.0)}, "--up-scene"),
         ({"up_scene": (0.0, 0.0, 0.0)}, "needs a direction"),
-        ({"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)}, "crop box; .* of what lies from about .* to .* in scene.ply"),
+        ({"crop_box": (90.0, 90.0, 90.0, 91.0, 91.0, 91.0)}, "crop box; .* lies from about .* to .* in scene.ply"),
         ({"fiducials": Path("three.txt")}, "at least 4"),
         ({"fiducials": Path("far.txt")}, "nearest scene point"),
         ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
