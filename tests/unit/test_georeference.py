@@ -50,6 +50,12 @@ def test_similarity_to_utm_agrees_with_pyproj(longitude, latitude, crs):
     np.testing.assert_allclose(in_crs[:, 2], 430.0 + local[:, 2], atol=0.02)
 
 
+def test_heights_of_a_crs_in_feet_are_in_feet_near_the_origin():
+    frame, local = LocalFrame(40.7, -74.0, 100.0, grid="EPSG:2263"), np.array([[0.0, 0, 0], [3, 4, 5]])
+    np.testing.assert_allclose(frame.crs_from_local().apply(local), frame.in_crs(local), atol=0.01)
+    assert frame.in_crs(local)[0, 2] == pytest.approx(328.083, abs=1e-3)
+
+
 def test_points_five_kilometres_away_are_projected_not_turned():
     frame = LocalFrame(47.37, 8.55, 430.0)
     far = np.array([[5000.0, 0.0, 0.0], [0.0, 5000.0, 0.0], [3000.0, -4000.0, 60.0]])

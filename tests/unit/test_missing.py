@@ -144,6 +144,9 @@ def test_rows_say_where_to_stand_and_where_to_look(half):
         highest = max(view.centre[2] for view in photos.views)
         assert row["above_close_ups"] == pytest.approx(eye[2] - highest, abs=1e-3)
     assert "longitude_deg" not in photo_rows(plan, photos.views, UP, None)[0]
+    # GPS may count heights from another zero than the scene does.
+    higher = photo_rows(plan, photos.views, UP, frame, gps_higher=47.0)
+    assert {round(b["altitude_m"] - a["altitude_m"], 2) for a, b in zip(rows, higher)} == {47.0}
 
 
 def test_an_object_of_which_nothing_came_into_the_scene_is_missing_as_a_whole(half):
