@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.io.cloud_file import EVERYWHERE
 from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.io.readers.text import TEXTS
 from scenefuse.io.settings import build, read_settings
@@ -180,7 +181,7 @@ def search_box(settings: CropSettings, fiducials: Path | None = None, box: Array
     if box is not None:
         return box[:3], box[3:]
     if fiducials is None:
-        return np.full(3, -np.inf), np.full(3, np.inf)
+        return EVERYWHERE
     return around_marks(_fiducials(fiducials)[1], settings)
 
 

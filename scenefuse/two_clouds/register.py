@@ -172,7 +172,7 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
             f" {low} to {high} in {scene}"
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
-    near = whole.part if len(whole.part) or box is not None else Cloud(whole.sample)
+    near = whole.part if len(whole.part) else Cloud(whole.sample)
     part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.count)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     return Given(cloud.part, replace(whole, part=part), searched, notes, ups)

@@ -280,8 +280,8 @@ rule georegister:
     params:
         options=settings("scene.georegister"),
         survey=survey_flags,
-        held=lambda wildcards: not cloud_to_lie_on(wildcards)
-        and wildcards.scene in POSED_SCENES,
+        held=lambda wildcards: wildcards.scene in POSED_SCENES
+        and not lies_on_cloud(wildcards),
         crs=crs_flag,
         cloud=lie_on_flag,
         files=state_of(survey_of),
