@@ -14,7 +14,7 @@ from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
 from scenefuse.io.formats import LAS_DIMENSIONS, bytes_of, read_columns
-from scenefuse.io.readers.columns import COLOR, NORMAL, POSITION, Columns
+from scenefuse.io.readers.columns import COLOR, NORMAL, POSITION, Columns, positions
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Sim3
 from scenefuse.version import VERSION
@@ -234,7 +234,7 @@ def cloud_of(columns: Columns, most_color: float | None = None) -> Cloud:
     normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
     colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
     return Cloud(
-        np.stack([columns[k].astype(np.float64) for k in POSITION], axis=1),
+        positions(columns),
         None if normals is None else np.nan_to_num(normals.astype(np.float32)),
         None if colors is None else bytes_of(colors, most_color),
         {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},

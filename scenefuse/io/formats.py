@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.readers.columns import COLOR, POSITION, Columns, common_name
+from scenefuse.io.readers.columns import COLOR, POSITION, Columns, common_name, positions
 from scenefuse.io.readers.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
 from scenefuse.io.readers.text import TEXTS, text_parts
 from scenefuse.io.tiles.ply_header import read_header
@@ -167,7 +167,7 @@ def _ply(path: Path) -> Columns:
     if corners is None or not set(POSITION) <= set(columns):
         return columns
     named = {common_name(name): values for name, values in columns.items()}
-    vertices = np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)
+    vertices = positions(columns)
     colors = None
     if set(COLOR) <= set(named):
         colors = bytes_of(np.stack([named[name] for name in COLOR], axis=1)).astype(np.float64)

@@ -7,21 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.io.clouds import (
-    Cloud,
-    chosen_rows,
-    cloud_of,
-    concatenate,
-    finite_rows,
-    is_nothing_at_zero,
-    precision_note,
-    spacing,
-    write_cloud,
-)
-from scenefuse.io.formats import LAS_DIMENSIONS, NOISE, WITHHELD, check_not_degrees, las_crs, las_dimensions
-from scenefuse.io.readers.columns import COLOR, POSITION, Columns
+from scenefuse.io.clouds import Cloud, cloud_of, concatenate, precision_note, spacing, write_cloud
+from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees, las_crs, las_dimensions
+from scenefuse.io.readers.columns import Columns
 from scenefuse.io.readers.text import text_notes
-from scenefuse.io.tiles.parts import ColumnParts, columns_in_parts
+from scenefuse.io.tiles.parts import columns_in_parts
+from scenefuse.io.tiles.survey import Survey, survey
 from scenefuse.io.tiles.tiled_cloud import open_cloud
 from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.stage import StageError, quantity, write_json
@@ -33,12 +24,8 @@ LEAST_POINTS = 200
 ENOUGH = 10_000
 # Positions below this share of the points, and above the same share, are strays: they do not move the origin.
 STRAY_PERCENT = 1.0
-# Of a larger cloud, its place is found from every so manyth point: from so many at least.
-SAMPLE = 1 << 20
 # Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
-# Why points at 0 0 0 are left out.
-AT_ZERO = "points at 0 0 0, far from all others,"
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -61,19 +48,19 @@ def import_scene_cloud(
         StageError: the file is missing, damaged, in degrees, of an unknown ending, not where its CRS is used, in
             another CRS than `crs`, or has too few different points.
     """
-    parts = columns_in_parts(source)
-    own = survey(source, parts, LAS_DIMENSIONS)
-    check_not_degrees(source, own.sample)
+    file = ImportedFile.of(source, LAS_DIMENSIONS)
+    sample = file.survey.sample
+    check_not_degrees(source, sample)
     crs = crs_of(source, crs)
     unit, name = "scene units", None
     if crs is not None:
         unit, name = unit_and_name(crs)
         from scenefuse.io.crs import check_place
 
-        check_place(crs, own.sample, source)
-    origin = near_origin(own.sample)
+        check_place(crs, sample, source)
+    origin = near_origin(sample)
     shift = Sim3(1.0, np.eye(3), origin)
-    content = write_placed(cloud, source, parts, own, lambda part: part.transformed(shift.inverse()), unit)
+    content = file.write(cloud, lambda part: part.transformed(shift.inverse()), unit)
     write_json(report, content | {"backend": quantity(IMPORTED, "")})
     place = {
         "length_unit": quantity(unit, ""),
@@ -111,15 +98,14 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     Raises:
         StageError: as of `import_scene_cloud`.
     """
-    parts = columns_in_parts(source)
-    own = survey(source, parts)
-    check_not_degrees(source, own.sample)
-    whole = concatenate(list(clouds_in_parts(parts, own)))
+    file = ImportedFile.of(source)
+    check_not_degrees(source, file.survey.sample)
+    whole = concatenate(list(file.clouds()))
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
-    content = import_report(source, own, spacing(placed.points), placed.diagonal, "object units")
+    content = file.report(spacing(placed.points), placed.diagonal, "object units")
     write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
 
 
@@ -134,153 +120,108 @@ def near_origin(points: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Survey:
-    """What has to be known of all of a file's points before any is written.
+class ImportedFile:
+    """A file whose points are taken over.
 
     Attributes:
-        count: of the rows with a finite position.
-        left_out: why rows were left out -> how many.
-        sample: (S, 3) positions of every so manyth of them: of all up to SAMPLE.
+        survey: what is known of all its points.
         unit_normals: whether there are normals, all of unit length; None where there are none.
-        most_color: the greatest colour; None where there are none.
-        without_zero: whether points at 0 0 0 are none; they are not among the sample in any case.
-        is_las: whether the file is LAS or LAZ.
         kept: names of further columns that are taken over.
         unused: names of further columns.
     """
 
-    count: int
-    left_out: dict[str, int]
-    sample: Array
+    survey: Survey
     unit_normals: bool | None
-    most_color: float | None
-    without_zero: bool
-    is_las: bool
     kept: tuple[str, ...]
     unused: list[str]
 
+    @classmethod
+    def of(cls, source: Path, keep: Collection[str] = (), degrees: bool = False) -> "ImportedFile":
+        """Go through a file once.
 
-def survey(source: Path, parts: ColumnParts, keep: Collection[str] = ()) -> Survey:
-    """Go through a file once.
+        Args:
+            source: the file.
+            keep: dimensions of LAS to take over, where the file says something by them.
+            degrees: whether LAS and LAZ may be in degrees.
 
-    Args:
-        source: the file.
-        parts: its columns.
-        keep: dimensions of LAS to take over, where the file says something by them.
+        Raises:
+            StageError: it is missing, damaged, of an unknown ending, or has too few different points.
+        """
+        unit_normals, said, names = None, set[str](), set[str]()
 
-    Raises:
-        StageError: it is damaged, or has too few different points.
-    """
-    known = set(LAS_DIMENSIONS) if source.suffix.lower() in (".las", ".laz") else set()
-    count, left_out, every, sample = 0, dict[str, int](), 1, np.zeros((0, 3))
-    unit_normals, most_color, unused, kept, zeros = None, None, set[str](), set[str](), 0
-    for columns in parts():
-        columns, without = surface_rows(columns, bool(known))
-        left_out = {why: left_out.get(why, 0) + rows for why, rows in without.items()}
-        part = cloud_of(columns)
-        at_zero = (part.points == 0).all(1)
-        zeros += int(at_zero.sum())
-        sample = np.concatenate([sample, part.points[-count % every :: every][~at_zero[-count % every :: every]]])
-        while len(sample) > 2 * SAMPLE:
-            sample, every = sample[::2], 2 * every
-        count, unused = count + len(part), unused | (set(part.fields) - known)
-        kept |= {name for name in known.intersection(keep) - kept if part.fields[name].any()}
-        if part.normals is not None:
-            off = np.abs(np.linalg.norm(part.normals, axis=1) - 1) > UNIT_TOLERANCE
-            unit_normals = unit_normals is not False and not off.any()
-        if part.colors is not None:
-            here = max(float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0)) for name in COLOR)
-            most_color = max(here, most_color or 0.0)
-    without_zero = zeros > 0 and is_nothing_at_zero(sample)
-    if without_zero:
-        left_out[AT_ZERO], count = zeros, count - zeros
-    sample = sample if len(sample) else np.zeros((min(count, 1), 3))
-    if count == 0:
-        what = "point with a finite position" if any(left_out.values()) else "points"
-        raise StageError(f"{source} holds no {what}; look at what wrote it")
-    unused = (unused | set(las_dimensions(source))) - known.intersection(keep) - {WITHHELD}
-    different = len(np.unique(sample[:: max(1, len(sample) // ENOUGH)], axis=0))
-    if different < LEAST_POINTS and (different := len(np.unique(sample, axis=0))) < LEAST_POINTS:
-        raise StageError(
-            f"{source} has only {different} different positions among its {count} points; {LEAST_POINTS} or more"
-            " are needed to place it"
-        )
-    if most_color == 0 and source.suffix.lower() in (".las", ".laz"):
-        most_color = None  # Formats with colours are used for points without, which are black then.
-    names = tuple(sorted(kept)), sorted(unused - {""})
-    return Survey(count, left_out, sample, unit_normals, most_color, without_zero, bool(known), *names)
+        def look(_: Columns, surface: Columns) -> None:
+            nonlocal unit_normals
+            part = cloud_of(surface)
+            names.update(part.fields)
+            said.update(name for name in {*keep} - said if name in part.fields and part.fields[name].any())
+            if part.normals is not None:
+                off = np.abs(np.linalg.norm(part.normals, axis=1) - 1) > UNIT_TOLERANCE
+                unit_normals = unit_normals is not False and not off.any()
 
+        whole = survey(source, columns_in_parts(source, degrees), look)
+        different = len(np.unique(whole.sample[:: max(1, len(whole.sample) // ENOUGH)], axis=0))
+        if different < LEAST_POINTS and (different := len(np.unique(whole.sample, axis=0))) < LEAST_POINTS:
+            raise StageError(
+                f"{source} has only {different} different positions among its {whole.count} points; {LEAST_POINTS} or"
+                " more are needed to place it"
+            )
+        own = set(LAS_DIMENSIONS) if whole.is_las else set[str]()
+        unused = (names - own | set(las_dimensions(source))) - own.intersection(keep) - {WITHHELD, ""}
+        return cls(whole, unit_normals, tuple(sorted(said & own)), sorted(unused))
 
-def surface_rows(columns: Columns, is_las: bool, without_zero: bool = False) -> tuple[Columns, dict[str, int]]:
-    """The rows that are points of a surface, without the column `withheld`, and why others were left out -> how
-    many. `without_zero` is true where points at 0 0 0 are none, which only the whole file says."""
-    without = dict[str, int]()
-    columns, without["rows without a finite position"] = finite_rows(columns)
-    if without_zero:
-        elsewhere = np.any([columns[axis] != 0 for axis in POSITION], axis=0)
-        columns, without[AT_ZERO] = chosen_rows(columns, elsewhere)
-    if is_las:
-        columns, noise = chosen_rows(columns, ~np.isin(columns["classification"], NOISE))
-        without[f"points of the classes {NOISE[0]} and {NOISE[1]} (noise)"] = noise
-        columns, without["withheld points"] = chosen_rows(columns, ~columns[WITHHELD])
-        columns = {name: values for name, values in columns.items() if name != WITHHELD}
-    return columns, without
+    def clouds(self) -> Iterator[Cloud]:
+        """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
+        for columns in self.survey.columns():
+            cloud = cloud_of(self.survey.surface(columns), self.survey.most_color)
+            normals = None
+            if self.unit_normals and cloud.normals is not None:
+                normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
+            colors = None if self.survey.most_color is None else cloud.colors
+            yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in self.kept})
 
+    def write(self, cloud: Path, move: Callable[[Cloud], Cloud], unit: str) -> dict[str, Any]:
+        """Write the points in another frame, tile by tile; the report of it.
 
-def clouds_in_parts(parts: ColumnParts, own: Survey) -> Iterator[Cloud]:
-    """The file's points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
-    for columns in parts():
-        cloud = cloud_of(surface_rows(columns, own.is_las, own.without_zero)[0], own.most_color)
-        normals = None
-        if own.unit_normals and cloud.normals is not None:
-            normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
-        colors = None if own.most_color is None else cloud.colors
-        yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in own.kept})
+        Args:
+            cloud: output PLY.
+            move: from the file's frame into another.
+            unit: of lengths in that frame.
+        """
 
+        def placed() -> Iterator[Cloud]:
+            return map(move, self.clouds())
 
-def write_placed(
-    cloud: Path, source: Path, parts: ColumnParts, own: Survey, move: Callable[[Cloud], Cloud], unit: str
-) -> dict[str, Any]:
-    """Write a file's points in another frame, tile by tile; the report of it.
+        write_tiled(cloud, placed, self.survey.count, move(Cloud(self.survey.sample)).points)
+        tiles = open_cloud(cloud)
+        return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit)
 
-    Args:
-        cloud: output PLY.
-        source: the file.
-        parts: its columns.
-        own: what `survey` says of it.
-        move: from the file's frame into another.
-        unit: of lengths in that frame.
-    """
+    def report(self, step: float, diagonal: float, unit: str) -> dict[str, Any]:
+        """What was taken over, and what became of the rest; printed too.
 
-    def placed() -> Iterator[Cloud]:
-        return map(move, clouds_in_parts(parts, own))
-
-    write_tiled(cloud, placed, own.count, move(Cloud(own.sample)).points)
-    tiles = open_cloud(cloud)
-    diagonal = float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0)))
-    return import_report(source, own, tiles.spacing(), diagonal, unit)
-
-
-def import_report(source: Path, own: Survey, step: float, diagonal: float, unit: str) -> dict[str, Any]:
-    """What was taken over, and what became of the rest; printed too."""
-    notes = [f"{count} {why} were left out" for why, count in own.left_out.items() if count]
-    notes += [*text_notes(source), *precision_note(source, own.sample, step)]
-    if own.unit_normals is False:
-        notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
-    if own.unused:
-        notes.append(f"not taken over, and so not in the results: {', '.join(own.unused)}")
-    for note in notes:
-        print(note, flush=True)
-    return {
-        "points": quantity(own.count, "1"),
-        "spacing": quantity(step, unit),
-        "diagonal": quantity(diagonal, unit),
-        "source": quantity(source.name, ""),
-        "columns_not_used": quantity(own.unused, ""),
-        "has_colors": quantity(own.most_color is not None, ""),
-        "has_normals": quantity(bool(own.unit_normals), ""),
-        "notes": quantity(notes, ""),
-    }
+        Args:
+            step: distance between neighbouring points.
+            diagonal: of the points' box.
+            unit: of both.
+        """
+        source = self.survey.path
+        notes = [f"{count} {why} were left out" for why, count in self.survey.left_out.items() if count]
+        notes += [*text_notes(source), *precision_note(source, self.survey.sample, step)]
+        if self.unit_normals is False:
+            notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
+        if self.unused:
+            notes.append(f"not taken over, and so not in the results: {', '.join(self.unused)}")
+        for note in notes:
+            print(note, flush=True)
+        return {
+            "points": quantity(self.survey.count, "1"),
+            "spacing": quantity(step, unit),
+            "diagonal": quantity(diagonal, unit),
+            "source": quantity(source.name, ""),
+            "columns_not_used": quantity(self.unused, ""),
+            "has_colors": quantity(self.survey.most_color is not None, ""),
+            "has_normals": quantity(bool(self.unit_normals), ""),
+            "notes": quantity(notes, ""),
+        }
 
 
 def unit_and_name(crs: str) -> tuple[str, str]:

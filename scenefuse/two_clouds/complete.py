@@ -106,15 +106,15 @@ def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) 
 
     The scene is read and written in parts.
     """
-    notes, crs, written = list(done.notes), las_crs(scene.path), [out / "completed.ply"]
+    notes, crs, written = list(done.notes), las_crs(scene.survey.path), [out / "completed.ply"]
     _write_ply(written[0], done, scene)
-    if scene.path.suffix.lower() in (".las", ".laz"):
+    if scene.survey.is_las:
         written.append(out / "completed.laz")
         notes += append_to_las(written[1], scene, done)
     for note in notes:
         print(f"note       {note}", flush=True)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
-    earlier = {str(number): f"{number} in {scene.path.name}" for number in range(FROM_OBJECT, done.source)}
+    earlier = {str(number): f"{number} in {scene.survey.path.name}" for number in range(FROM_OBJECT, done.source)}
     kept = scene.total - len(done.gone)
     content = {
         "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
@@ -177,7 +177,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
     """
     import laspy
 
-    with laspy.open(scene.path) as reader:
+    with laspy.open(scene.survey.path) as reader:
         header = copy.deepcopy(reader.header)
         # An index of the points (COPC) is not one of more points.
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
@@ -203,7 +203,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                     _fill_in(part, {names[name]: values for name, values in unknown.items()})
                 writer.write_points(part)
             colors = 1 if 0 < brightest <= 255 else 257
-            writer.write_points(_added_record(header, done, names, colors, scene.path))
+            writer.write_points(_added_record(header, done, names, colors, scene.survey.path))
             if further:
                 writer.write_evlrs(further)
     return [f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other]

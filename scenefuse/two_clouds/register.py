@@ -161,19 +161,19 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     if crs is not None:
         from scenefuse.io.crs import check_place
 
-        check_place(crs, whole.sample, scene)
+        check_place(crs, whole.survey.sample, scene)
     notes = [*cloud.notes, *whole.notes, *_notes(object, scene)]
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
     if box is not None and not len(whole.part):
-        low, high = (" ".join(f"{x:.6g}" for x in end(whole.sample, axis=0)) for end in (np.min, np.max))
+        low, high = (" ".join(f"{x:.6g}" for x in end(whole.survey.sample, axis=0)) for end in (np.min, np.max))
         raise StageError(
             "no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about"
             f" {low} to {high} in {scene}"
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
-    near = whole.part if len(whole.part) else Cloud(whole.sample)
-    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.count)
+    near = whole.part if len(whole.part) else Cloud(whole.survey.sample)
+    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.survey.count)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
     return Given(cloud.part, replace(whole, part=part), searched, notes, ups)
 

@@ -5,8 +5,10 @@ python tests/benchmarks/clicked_masks.py --folder results/objects/house --truth 
 """
 
 from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Literal
+from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
@@ -16,7 +18,7 @@ from scenefuse.demo.prompts import PromptSettings, clicks_on, random_misses
 from scenefuse.io.mask_files import mask_files
 from scenefuse.io.pictures import read_mask
 from scenefuse.io.settings import build, read_settings
-from scenefuse.masks.prompted import masks_from_prompts
+from scenefuse.masks import prompted
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.masks.supplied import supplied_masks
@@ -105,11 +107,13 @@ def clicked_masks(
     if method == "sam2":
         network = Remembering(load_network(Path(settings.sam2_encoder), Path(settings.sam2_decoder), None, 1)[0])
     names = sorted(thing.truth)
-    rows, prompts = [], PromptSettings(inside=3 if box else 5, box=box)
-    for name in [names[k] for k in np.linspace(0, len(names) - 1, photos).round().astype(int)]:
-        for trial in range(clicks):
-            rows.append(_trial(thing, name, trial, prompts, part, network, settings))
-            print(" ".join(f"{key} {cell}" for key, cell in rows[-1].items()), flush=True)
+    rows, how = [], PromptSettings(inside=3 if box else 5, box=box)
+    with_stereo_points = cache(partial(prompted.with_stereo_points, thing.photos))
+    with patch.object(prompted, "with_stereo_points", lambda _: with_stereo_points()):
+        for name in [names[k] for k in np.linspace(0, len(names) - 1, photos).round().astype(int)]:
+            for trial in range(clicks):
+                rows.append(_trial(thing, name, trial, how, part, network, settings))
+                print(" ".join(f"{key} {cell}" for key, cell in rows[-1].items()), flush=True)
     table = pd.DataFrame(rows)
     out.parent.mkdir(parents=True, exist_ok=True)
     table.to_csv(out, sep="\t", index=False, float_format="%.4f")
@@ -148,20 +152,20 @@ def _smaller_part(mask: Mask) -> Array | None:
 
 
 def _trial(
-    thing: Object, name: str, trial: int, prompts: PromptSettings, part: bool, network: Any, settings: MaskSettings
+    thing: Object, name: str, trial: int, how: PromptSettings, part: bool, network: Any, settings: MaskSettings
 ) -> dict[str, Any]:
     """Masks from one choice of clicks, and how like the true ones they are."""
     rng = np.random.default_rng([trial, *name.encode()])
     true = read_mask(thing.files[Path(name).stem])
-    labels, pixels = clicks_on(true, prompts, rng)
+    labels, pixels = clicks_on(true, how, rng)
     middle = _smaller_part(true) if part else None
     if middle is not None:
-        miss = random_misses(1, prompts.least_miss_px, prompts.most_miss_px, rng)[0]
-        pixels[prompts.inside - 1] = np.clip(middle + miss, 1.0, np.array(true.shape[::-1]) - 1.0)
+        miss = random_misses(1, how.least_miss_px, how.most_miss_px, rng)[0]
+        pixels[how.inside - 1] = np.clip(middle + miss, 1.0, np.array(true.shape[::-1]) - 1.0)
     marked = Labels(Path(name), labels, [name] * len(pixels), pixels)
     row: dict[str, Any] = {"photo": name, "trial": trial}
     try:
-        found = masks_from_prompts(
+        found = prompted.masks_from_prompts(
             marked, thing.folder / "sparse", thing.sizes, thing.photos, thing.up, network, settings, 0
         )
         scored = score_masks(found.masks, found.target, thing.photos.views, settings)

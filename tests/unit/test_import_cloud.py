@@ -70,7 +70,7 @@ def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkey
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
     whole, *jsons = imported_scene(tmp_path, source)
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
-    monkeypatch.setattr("scenefuse.io.import_cloud.SAMPLE", 220)  # of which the origin is found
+    monkeypatch.setattr("scenefuse.io.tiles.survey.SAMPLE", 220)  # of which the origin is found
     found, *others = imported_scene(tmp_path, source)
     assert jsons == others and np.array_equal(found.points, whole.points)
     assert np.array_equal(found.colors, cloud.colors)
@@ -253,7 +253,7 @@ def test_longitude_and_latitude_without_a_word_are_refused(tmp_path, cloud):
     [
         ("a.xyz", "", r"is empty \(0 bytes\)"),
         ("a.xyz", "1 2 3\n" * 300, "only 1 different positions among its 300 points; 200 or more are needed"),
-        ("a.xyz", "nan nan nan\n" * 300, "no point with a finite position"),
+        ("a.xyz", "nan nan nan\n" * 300, "300 rows without a finite position"),
         ("a.dwg", "", r"'\.dwg' is no known ending"),
         ("a.laz", "LASF", "not a readable LAZ cloud"),
     ],

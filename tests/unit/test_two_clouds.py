@@ -287,7 +287,7 @@ def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
 def in_parts(monkeypatch, rows, most):
     """Files are read so many rows at a time, and so many points of a part are held."""
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", rows)
-    monkeypatch.setattr("scenefuse.io.cloud_file.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.io.tiles.survey.AT_ONCE", rows)
     monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
 
 
@@ -338,7 +338,7 @@ def test_a_crop_box_is_all_that_is_held_of_a_scene(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 40)))
     low, high = UTM + [2.95, -1, -1], UTM + [4.95, 3, 1]
     held = CloudFile.of(tmp_path / "yard.laz", (low, high))
-    assert (len(held.part), held.count, held.total) == (20 * 20, 400 * 20, 400 * 20)
+    assert (len(held.part), held.survey.count, held.total) == (20 * 20, 400 * 20, 400 * 20)
     rows, near = held.near(low - 1, high + 1)
     assert len(near) == 40 * 20 and np.array_equal(near.points, read_cloud(tmp_path / "yard.laz").points[rows])
 
@@ -359,12 +359,12 @@ def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeyp
     scene = in_scene(sheet(0, 4))
     write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([scene.points, np.zeros((1200, 3))])))
     held = CloudFile.of(tmp_path / "yard.ply")
-    assert (held.count, held.total, len(held.part)) == (len(scene), len(scene), len(scene))
+    assert (held.survey.count, held.total, len(held.part)) == (len(scene), len(scene), len(scene))
     assert any("1200 points at 0 0 0, far from all others, of" in note for note in held.notes)
     assert sum(len(cloud) for _, cloud in held.parts()) == len(held.near(*EVERYWHERE)[0]) == len(scene)
     # A site whose own zero lies in it has a point there.
     write_cloud(tmp_path / "site.ply", Cloud(np.concatenate([sheet(0, 4).points, np.zeros((1, 3))])))
-    assert CloudFile.of(tmp_path / "site.ply").count == len(scene) + 1
+    assert CloudFile.of(tmp_path / "site.ply").survey.count == len(scene) + 1
 
 
 def test_an_object_may_be_anywhere_whatever_crs_its_file_names(tmp_path, house, monkeypatch):

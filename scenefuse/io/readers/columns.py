@@ -3,6 +3,7 @@
 import re
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 Columns = dict[str, NDArray[Any]]
@@ -19,3 +20,8 @@ def common_name(name: str) -> str:
     """The name that PLY uses for a column; its own where it is none of position, normal and colour."""
     plain = re.sub(r"[\s._]", "", name.lower())
     return OTHER_NAMES.get(plain, plain if plain in (*POSITION, *NORMAL, *COLOR) else name)
+
+
+def positions(columns: Columns) -> NDArray[np.float64]:
+    """(N, 3) positions."""
+    return np.stack([columns[axis].astype(np.float64) for axis in POSITION], axis=1)

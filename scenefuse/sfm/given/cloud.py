@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.io.clouds import Cloud, concatenate, spacing, write_cloud
 from scenefuse.io.crs import plane
 from scenefuse.io.formats import LAS_DIMENSIONS, las_crs
-from scenefuse.io.import_cloud import IMPORTED, clouds_in_parts, import_report, survey, write_placed
-from scenefuse.io.tiles.parts import columns_in_parts
+from scenefuse.io.import_cloud import IMPORTED, ImportedFile
 from scenefuse.io.units import length_unit
 from scenefuse.sfm.geodesy import LocalFrame, scene_frame
 from scenefuse.sfm.given.fit import FIT, LEAST_PHOTOS, check_fit, fit_to_cameras, misfit
@@ -65,19 +64,19 @@ def import_posed_cloud(
         StageError: the file is missing, damaged, of an unknown ending, has too few different points, or lies in other
             coordinates than the cameras.
     """
-    parts = columns_in_parts(source, degrees=True)
-    own = survey(source, parts, () if georeference_json is None else LAS_DIMENSIONS)
+    file = ImportedFile.of(source, () if georeference_json is None else LAS_DIMENSIONS, degrees=True)
+    sample = file.survey.sample
     if sparse is None or sparse_json is None:
         assert georeference_json is not None
         georeference = read_json(georeference_json)
-        way, fit = _way_into_scene(source, own.sample, georeference, crs), {name: georeference[name] for name in FIT}
+        way, fit = _way_into_scene(source, sample, georeference, crs), {name: georeference[name] for name in FIT}
     else:
-        way, fit = _way_to_cameras(source, own.sample, sparse, read_json(sparse_json))
+        way, fit = _way_to_cameras(source, sample, sparse, read_json(sparse_json))
     if georeference_json is None:
-        whole = way.apply(concatenate(list(clouds_in_parts(parts, own))))
+        whole = way.apply(concatenate(list(file.clouds())))
         placed = whole if workspace is None or masks is None else _cut_out(whole, source, workspace, masks)
         write_cloud(cloud, placed)
-        content = import_report(source, own, spacing(placed.points), placed.diagonal, "object units")
+        content = file.report(spacing(placed.points), placed.diagonal, "object units")
         content |= {"points": quantity(len(placed), "1"), "outside_masks": quantity(len(whole) - len(placed), "1")}
         similar = None if way.turned_alone else way.nearest.matrix
         content |= {"object_from_file": quantity(similar, "object units")}
@@ -89,7 +88,7 @@ def import_posed_cloud(
         def move(part: Cloud) -> Cloud:
             return way.apply(part).transformed(moved)
 
-        content = write_placed(cloud, source, parts, own, move, length_unit(georeference_json))
+        content = file.write(cloud, move, length_unit(georeference_json))
         content |= {"backend": quantity(IMPORTED, "")}
     write_json(report, content | fit | {"crs": quantity(way.crs, "")})
 

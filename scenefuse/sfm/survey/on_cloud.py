@@ -123,9 +123,11 @@ def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Arra
     low, high = corners.min(0), corners.max(0)
     low[2], high[2] = -np.inf, np.inf
     file = CloudFile.of(cloud, (low, high), MOST_COMPARED)
-    check_place(crs.to_wkt(), file.sample, cloud)
+    check_place(crs.to_wkt(), file.survey.sample, cloud)
     if len(file.part) < LEAST_OVER:
-        off = in_local(np.median(file.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(own[:, :2], axis=0)
+        off = in_local(np.median(file.survey.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(
+            own[:, :2], axis=0
+        )
         raise StageError(
             f"{cloud} has {len(file.part)} points where its photos were taken, and its middle lies"
             f" {np.linalg.norm(off) / 1000:.3g} km from there; give the cloud of this scene, or correct its CRS"
