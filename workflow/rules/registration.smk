@@ -100,7 +100,7 @@ rule register_coarsely:
         "../../envs/registration.yaml"
     threads: min(2, OBJECT_THREADS)
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, cloud=4, crop=4),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=variant_options("scale", "coarse"),
@@ -147,7 +147,7 @@ rule register_finely:
         "../../envs/registration.yaml"
     threads: min(2, OBJECT_THREADS)
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, cloud=4, crop=4),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options=variant_options("fine"),
@@ -193,7 +193,7 @@ rule register_as_paper:
         "../../envs/registration.yaml"
     threads: min(2, OBJECT_THREADS)
     resources:
-        mem_mb=lambda wildcards, attempt: 4000 * attempt,
+        mem_mb=by_size(4000, cloud=4, crop=4),
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         options="--scale rms",
