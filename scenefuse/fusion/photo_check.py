@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.fusion.photo_kernel import OFFSETS, match_points
-from scenefuse.registration.free_space import most_different
 from scenefuse.transforms import Array, Sim3
 from scenefuse.workspace import View, Workspace
 
@@ -27,6 +26,9 @@ MOST_DEVIATION = 1.2
 measure nothing, sky and blank walls above all."""
 MOST_PHOTOS = 64
 """Photos of one side that points are checked in at most: from the most different directions."""
+ENOUGH, USEFUL = 12, 0.5
+"""Of these, photos that have a place in their picture, if there are so many; a photo is as good as the best one that
+shows this share of what that one shows of places that have not."""
 HALVINGS = 1
 """How often a point that photos match nowhere near is tried again in photos of half the size."""
 SEEN_SHARE = 0.02
@@ -98,10 +100,40 @@ def unpacked(photos: Photos) -> list[View]:
 def read_photos(workspace: Workspace, points: Array) -> Photos:
     """The photos of a workspace that have points (N, 3; its frame) in their picture, packed for the kernel."""
     sample = points[:: max(1, len(points) // 2000)]
-    seeing = [view for view in workspace.views if len(view.visible(sample)[0]) > SEEN_SHARE * len(sample)]
-    if len(seeing) > MOST_PHOTOS:
-        seeing = [seeing[k] for k in most_different(seeing, sample.mean(0), MOST_PHOTOS)]
-    return pack([workspace.gray(view) for view in seeing])
+    shown = np.zeros((len(workspace.views), len(sample)), dtype=bool)
+    for row, view in zip(shown, workspace.views):
+        row[view.visible(sample)[0]] = True
+    asked = np.flatnonzero(shown.sum(1) > SEEN_SHARE * len(sample))
+    if len(asked) > MOST_PHOTOS:
+        print(f"{MOST_PHOTOS} of the {len(asked)} photos that show the object are asked", flush=True)
+        centres = np.array([workspace.views[k].centre for k in asked])
+        asked = asked[covering(shown[asked], centres, sample, MOST_PHOTOS)]
+    return pack([workspace.gray(workspace.views[k]) for k in asked])
+
+
+def covering(shown: NDArray[np.bool_], centres: Array, points: Array, most: int) -> NDArray[np.int64]:
+    """Rows of photos, sorted: every point is in ENOUGH of them where it can be, from the most different directions.
+
+    Args:
+        shown: (V, N), which photos have which points in their picture; each has one.
+        centres: (V, 3) of the cameras.
+        points: (N, 3).
+        most: how many photos to choose.
+    """
+    directions = centres - (shown @ points) / shown.sum(1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    chosen: list[int] = []
+    nearest, times = np.full(len(shown), -np.inf), np.zeros(len(points), dtype=np.int64)
+    while len(chosen) < min(most, len(shown)):
+        gain = (shown & (times < ENOUGH)).sum(1)
+        gain[chosen] = -1
+        # Of photos that show about as much of what few have shown, the one from where none was taken.
+        worth = np.where(gain >= USEFUL * gain.max(), nearest, np.inf)
+        worth[chosen] = np.inf
+        chosen.append(int(worth.argmin()))
+        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
+        times += shown[chosen[-1]]
+    return np.sort(chosen)
 
 
 def moved_view(view: View, b_from_a: Sim3) -> View:

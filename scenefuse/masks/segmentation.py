@@ -159,7 +159,8 @@ def carve_trusted(
         if len(trusted) < 2:
             hull = None
             break
-        hull = carve(target.box, target.ground.height_of, trusted, settings.hull_voxels, share)
+        own = target.sparse[target.kind > 0]
+        hull = carve(target.box, target.ground.height_of, trusted, settings.hull_voxels, share, own)
     if hull is None or len(hull.shell) == 0:
         raise StageError(
             "the masks of the photos have no common object; check that the prompts lie on one object and span it, "

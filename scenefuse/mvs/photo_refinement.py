@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from scenefuse.mvs.consistency import back_project
 from scenefuse.mvs.matcher import Matcher
 from scenefuse.mvs.plane_sweep import refine_by_matching
 from scenefuse.mvs.views import Views
@@ -17,6 +18,9 @@ SOURCES, BEST_SOURCES = 8, 3
 """Photos that a photo is matched with, and of these the ones that count: others may not see the place."""
 BEST_ANGLE_DEG = 15.0
 """Between two photos: enough baseline to measure, little enough to look alike."""
+PLACES, HIDDEN = 200, 0.05
+"""Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
+place is hidden there."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +55,10 @@ def refine_by_photos(
 ) -> RefinedDepths:
     """Depth maps (V, H, W) with every pixel moved along its ray to the best match.
 
-    Windows of a photo are matched with those of the eight photos that see the object from about 15 degrees aside; the
-    best three count (`scenefuse.mvs.plane_sweep`). A pixel whose match is poor, hardly better than where it was, or
-    farther off than the reach, keeps its depth. Where there is texture that matches neither there nor nearby in
-    photos that have the place in view, the depth is not photo-consistent.
+    Windows of a photo are matched with those of the eight photos that show most of the same from about 15 degrees
+    aside; the best three count (`scenefuse.mvs.plane_sweep`). A pixel whose match is poor, hardly better than where it
+    was, or farther off than the reach, keeps its depth. Where there is texture that matches neither there nor nearby
+    in photos that have the place in view, the depth is not photo-consistent.
 
     Args:
         views: photos and intrinsics at the maps' size.
@@ -68,7 +72,7 @@ def refine_by_photos(
     device = "cuda" if torch.cuda.is_available() else "cpu"
     window = settings.match_window_px
     photos = [_gray(views.view(index), poses[index]) for index in range(len(depths))]
-    sources = _sources(poses, depths, views.intrinsics)
+    sources = _sources(views, poses, depths)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows) == 0:
@@ -97,17 +101,30 @@ def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
     return replace(view, pixels=pixels, intrinsics=intrinsics, width=pixels.shape[1], height=pixels.shape[0])
 
 
-def _sources(poses: Array, depths: NDArray[np.float32], intrinsics: Array) -> NDArray[np.int64]:
-    """(V, S) the photos that look at the middle of what all see from about 15 degrees beside each photo."""
-    centres, middles = poses[:, :3, 3], []
-    for depth, k, pose in zip(depths, intrinsics, poses):
+def _sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(V, S) for each photo those that show most of what it shows, from about 15 degrees beside it; the best first."""
+    places = np.full((len(depths), PLACES, 3), np.nan)
+    for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows):
-            pixel = np.array([np.median(columns) + 0.5, np.median(rows) + 0.5, 1.0])
-            middles.append(pose[:3, :3] @ (np.linalg.inv(k) @ pixel * np.median(depth[rows, columns])) + pose[:3, 3])
-    rays = centres - np.median(middles, axis=0)
-    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    angle = np.degrees(np.arccos(np.clip(rays @ rays.T, -1.0, 1.0)))
-    score = -np.abs(angle - BEST_ANGLE_DEG)
-    np.fill_diagonal(score, -np.inf)
-    return np.argsort(-score, axis=1, kind="stable")[:, : min(SOURCES, len(poses) - 1)]
+            chosen = np.linspace(0, len(rows) - 1, PLACES).round().astype(int)
+            rows, columns = rows[chosen], columns[chosen]
+            places[index] = back_project(depth[rows, columns], views.intrinsics[index], poses[index], rows, columns)
+    centres, middles = poses[:, :3, 3], np.nan_to_num(places.mean(axis=1))
+    worth = np.full((len(depths), len(depths)), -np.inf)
+    for index, depth in enumerate(depths):
+        view = replace(views.view(index), cam_from_world=np.linalg.inv(poses[index]))
+        shown, pixels, away = view.visible(places.reshape(-1, 3))
+        there = depth[pixels[:, 1], pixels[:, 0]]
+        shown = shown[(there == 0) | (away <= (1 + HIDDEN) * there)]
+        share = np.bincount(shown // PLACES, minlength=len(depths)) / PLACES
+        off = np.abs(_angles_deg(centres - middles, centres[index] - middles) - BEST_ANGLE_DEG)
+        worth[:, index] = share / (1 + off / BEST_ANGLE_DEG)
+    np.fill_diagonal(worth, -np.inf)
+    return np.argsort(-worth, axis=1, kind="stable")[:, : min(SOURCES, len(poses) - 1)]
+
+
+def _angles_deg(a: Array, b: Array) -> Array:
+    """Angles (N,) between vectors (N, 3)."""
+    lengths = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    return np.asarray(np.degrees(np.arccos(np.clip((a * b).sum(1) / np.maximum(lengths, 1e-12), -1.0, 1.0))))

@@ -26,11 +26,11 @@ def sparse_depths(views: Views) -> NDArray[np.float32]:
     which inverse depth is linear. A point of the object that a photo has off its mask, and does not observe, is hidden
     by something just before it.
     """
-    own = _own_points(views)
+    own = own_points(views)
     return np.stack([_depths_of(views, index, own) for index in range(len(views.names))])
 
 
-def _own_points(views: Views) -> NDArray[np.bool_]:
+def own_points(views: Views) -> NDArray[np.bool_]:
     """(P,) which sparse points are the object's: on the masks of three photos, and of nearly all that observe them."""
     on, seen = np.zeros(len(views.sparse), np.int64), np.zeros(len(views.sparse), np.int64)
     for index in range(len(views.names)):

@@ -3,7 +3,7 @@
 Source: Laurentini 1994 (visual hull), with voting instead of a strict intersection.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,6 +20,11 @@ Counts = NDArray[np.int32]
 
 BATCH = 4
 """Photos after which `carve` leaves out the voxels that are decided: most are, early."""
+LEAST_FRAMING, RARELY_FRAMED, LEAST_PHOTOS = 0.3, 10, 2
+"""Of `least_framing`: the share; the percentile of the own points; never fewer photos."""
+LEAST_OWN, LEAST_WHOLE = 20, 1 / 3
+"""Own points that say how many photos have a part; else those with all of it, or so large a share of all photos."""
+NO_POINTS: Array = np.zeros((0, 3))
 
 
 @dataclass(frozen=True)
@@ -117,8 +122,38 @@ def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond:
     return counts
 
 
+def least_framing(views: Sequence[View], own: Array) -> int:
+    """How many photos must have a place in their frame for it to be the object's, whatever they show there.
+
+    A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
+    head, some have a part only.
+
+    Args:
+        views: the photos, with masks as `pixels`.
+        own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
+    """
+    if len(own) >= LEAST_OWN:
+        framed = np.zeros(len(own), dtype=np.int64)
+        for view in views:
+            framed[view.visible(own)[0]] += 1
+        usual = float(np.percentile(framed, RARELY_FRAMED))
+    else:
+        usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
+    return max(LEAST_PHOTOS, int(np.ceil(LEAST_FRAMING * usual)))
+
+
+def is_whole(mask: Mask) -> bool:
+    """Whether a mask (H, W) ends before the photo does."""
+    return bool(mask.any() and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()))
+
+
 def carve(
-    box: Box, height_of: Callable[[Array], Array], silhouettes: list[View], voxels: int, tolerance: float
+    box: Box,
+    height_of: Callable[[Array], Array],
+    silhouettes: list[View],
+    voxels: int,
+    tolerance: float,
+    own: Array = NO_POINTS,
 ) -> Hull:
     """The voxels of a box, above the ground, that all masks but a share of `tolerance` contain.
 
@@ -129,6 +164,7 @@ def carve(
         silhouettes: cameras with masks as `pixels`; a photo counts for the voxels in its frame.
         voxels: number along the longest side.
         tolerance: share of the photos that show a voxel which may have it outside their mask.
+        own: (N, 3) points on the object, for `least_framing`.
     """
     size = (box.high - box.low).max() / voxels
     shape = np.maximum(np.ceil((box.high - box.low) / size).astype(int), 1)
@@ -144,7 +180,7 @@ def carve(
         # A voxel outside more masks than all photos together could excuse is decided.
         alive = alive[missed[alive] <= tolerance * len(silhouettes)]
     occupied = np.zeros(len(centres), dtype=bool)
-    enough = shown[alive] >= max(2, len(silhouettes) // 4)
+    enough = shown[alive] >= least_framing(silhouettes, own)
     occupied[alive] = enough & (missed[alive] <= tolerance * shown[alive])
     grid = occupied.reshape(shape)
     shell = grid & ~ndimage.binary_erosion(grid)
@@ -167,7 +203,7 @@ def silhouette(hull: Hull, view: View) -> Mask:
     # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
     reach = 2 * int(np.ceil(0.75 * side)) + 1
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
-    return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel, borderValue=0) > 0
+    return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel) > 0
 
 
 def mask_iou(a: Mask, b: Mask) -> float:

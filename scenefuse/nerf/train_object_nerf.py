@@ -15,7 +15,7 @@ from scenefuse.checkpoints import State, key_of
 from scenefuse.cores import use_threads
 from scenefuse.depth.prior import DepthPrior, Unconfirmed, read_prior
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.mvs.sparse_depths import sparse_depths
+from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
@@ -190,7 +190,8 @@ def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _G
     trained = np.flatnonzero(~views.held_out)
     outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam, views.sizes)
     seen = [outlines[row] for row in trained]
-    volume = find_volume(seen, settings.recipe.occupancy_cells, settings.hull_tolerance, cube)
+    cells, tolerance = settings.recipe.occupancy_cells, settings.hull_tolerance
+    volume = find_volume(seen, cells, tolerance, cube, views.sparse[own_points(views)])
     prior = None
     if inputs.prior is not None:
         of_all = Unconfirmed(settings.recipe.order_of_all, settings.recipe.prior_of_all)

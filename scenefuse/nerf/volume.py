@@ -7,7 +7,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.mvs.visual_hull import Outline, count_silhouettes
+from scenefuse.mvs.visual_hull import (
+    LEAST_OWN,
+    LEAST_WHOLE,
+    NO_POINTS,
+    Outline,
+    count_silhouettes,
+    is_whole,
+    least_framing,
+)
 from scenefuse.nerf.rays import dilate
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array, Sim3
@@ -23,9 +31,10 @@ ROUGH_FACTOR = 1.5
 LEAST_PIXELS = 16
 # Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
 HALF_DIAGONAL = 0.87
-# A cell counts only where so large a share has it in the frame of the photos that have the object whole; details, whose
-# masks touch the border, may be many more (two thirds of all are taken to be such, at most).
-LEAST_SHARE, LEAST_WHOLE, LEAST_PHOTOS = 0.3, 1 / 3, 2
+# The rough cube around the object's own points is wider than these by this share of their diagonal on each side.
+REACH = 0.25
+# Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
+FORGIVING = 12
 # Photos that must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
 # have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
 LEAST_OPEN, BEYOND = 3, 0.05
@@ -39,7 +48,9 @@ class Volume:
     hull: NDArray[np.bool_]
 
 
-def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim3 | None = None) -> Volume:
+def find_volume(
+    outlines: list[Outline], cells: int, tolerance: float, cube: Sim3 | None = None, own: Array = NO_POINTS
+) -> Volume:
     """The unit cube and the visual hull in it.
 
     Args:
@@ -47,15 +58,16 @@ def find_volume(outlines: list[Outline], cells: int, tolerance: float, cube: Sim
         cells: per side of the hull, a multiple of 4 times a power of 2.
         tolerance: share of the photos that may have a cell of the hull outside their mask.
         cube: nerf_from_object of an earlier stage, which is kept, or None.
+        own: (N, 3) points on the object: they say where it is where few photos have it whole, and how many have a part.
 
     Raises:
         StageError: fewer than two photos have a mask, or no cell is left.
     """
     try:
         if cube is None:
-            rough = cube_from_cameras([outline.view for outline in outlines])
-            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance), rough, MARGIN)
-        hull = visual_hull(outlines, cube, cells, tolerance)
+            rough = _rough_cube([outline.view for outline in outlines], own)
+            cube = tight_cube(visual_hull(outlines, rough, FIRST_CELLS, tolerance, own), rough, MARGIN)
+        hull = visual_hull(outlines, cube, cells, tolerance, own)
     except ValueError as error:
         raise StageError(f"no volume for the object: {error}; check the masks and the cameras") from None
     if not hull.any():
@@ -114,6 +126,16 @@ def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
     return np.asarray(~view.pixels & (first < grown))
 
 
+def _rough_cube(views: list[View], own: Array) -> Sim3:
+    """By the cameras where a third of the photos have the object whole; else around its own points, if there are some:
+    what masks show of a facade has neither its middle nor its extent."""
+    if len(own) < LEAST_OWN or sum(is_whole(view.pixels) for view in views) >= LEAST_WHOLE * len(views):
+        return cube_from_cameras(views)
+    low, high = np.percentile(own, [1, 99], axis=0)
+    side = float((high - low).max() + 2 * REACH * np.linalg.norm(high - low))
+    return Sim3(1 / side, np.eye(3), 0.5 - (low + high) / (2 * side))
+
+
 def cube_from_cameras(views: list[View]) -> Sim3:
     """A generous cube around the object from masks and cameras alone: unit_from_object.
 
@@ -160,7 +182,9 @@ def tight_cube(hull: NDArray[np.bool_], unit_from_object: Sim3, margin: float) -
     return Sim3(scale, np.eye(3), 0.5 - scale * center)
 
 
-def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tolerance: float) -> NDArray[np.bool_]:
+def visual_hull(
+    outlines: list[Outline], unit_from_object: Sim3, size: int, tolerance: float, own: Array = NO_POINTS
+) -> NDArray[np.bool_]:
     """Cells (size, size, size) of the unit cube that project into (nearly) every mask of the photos that may see them.
 
     From coarse to fine: a coarse cell is kept where it touches the masks, and split into eight.
@@ -169,11 +193,12 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
         outlines: of the photos.
         unit_from_object: the cube.
         size: cells per side, a multiple of 4 times a power of 2.
-        tolerance: share of the photos that may have a cell outside their mask.
+        tolerance: share of the photos that may have a cell outside their mask; one of twelve or more may.
+        own: (N, 3) points on the object.
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
-    whole = max(sum(_is_whole(outline.view.pixels) for outline in outlines), LEAST_WHOLE * len(outlines))
+    quorum = least_framing([outline.view for outline in outlines], own)
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
@@ -182,7 +207,7 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
         found = count_silhouettes(points, grown, object_from_unit.scale * BEYOND)
         # Of a coarse cell that is hidden one part may be in sight.
         shown = found.shown + (found.hidden if count < size else 0)
-        kept = (found.missed <= tolerance * shown) & (shown >= max(LEAST_PHOTOS, LEAST_SHARE * whole))
+        kept = (found.missed <= np.maximum(tolerance * shown, shown >= FORGIVING)) & (shown >= quorum)
         if count == size:
             kept &= (found.hidden == 0) | (found.open >= LEAST_OPEN)
         cells = cells[kept]
@@ -191,11 +216,6 @@ def visual_hull(outlines: list[Outline], unit_from_object: Sim3, size: int, tole
             hull[tuple(cells.T)] = True
             return hull
         cells, count = (2 * cells[:, None] + children).reshape(-1, 3), 2 * count
-
-
-def _is_whole(mask: NDArray[np.bool_]) -> bool:
-    """Whether a mask (H, W) ends before the photo does."""
-    return bool(mask.any() and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()))
 
 
 def _corners(count: int) -> NDArray[np.int64]:

@@ -61,7 +61,12 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
     print(f"{len(listed)} frames from {source}", flush=True)
     turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
     more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
-    write_photos(photos, listed, frames, kind, photo_notes(listed), **more)
+    notes = photo_notes(listed)
+    if kind == "photos" and len(listed) < (given := len(photo_names(source))):
+        notes.insert(
+            0, f"{len(listed)} of {given} photos are used, spread evenly (object.frames.max_frames, frame_step)"
+        )
+    write_photos(photos, listed, frames, kind, notes, **more)
 
 
 def original_sizes(content: dict[str, Any]) -> dict[str, tuple[int, int]]:

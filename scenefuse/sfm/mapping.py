@@ -131,11 +131,17 @@ def _mapped(
 ) -> tuple[pycolmap.Reconstruction, dict[str, Any]]:
     """The model of photos by name, and what it is, as quantities: of a few attempts the one that explains most matches.
 
-    One attempt is enough where no photo is doubtful.
+    One attempt is enough where no photo is doubtful. A further one that registers too few photos is left out.
     """
     attempts: list[tuple[int, pycolmap.Reconstruction, dict[str, Any]]] = []
     for attempt in range(ATTEMPTS):
-        model, content = _attempt(names, folder, database, sparse, calibrated, settings, seed + attempt)
+        try:
+            model, content = _attempt(names, folder, database, sparse, calibrated, settings, seed + attempt)
+        except StageError as error:
+            if not attempts:
+                raise
+            print(f"attempt {attempt + 1} of {ATTEMPTS} is left out: {error}", flush=True)
+            continue
         found = explained_matches(model, database)
         doubtful = doubtful_photos(model, found)
         content["doubtful_photos"] = quantity(doubtful, "1")
@@ -145,7 +151,7 @@ def _mapped(
             break
         print(f"attempt {attempt + 1} of {ATTEMPTS}: {_doubt(doubtful)}", flush=True)
     _, model, content = max(attempts, key=lambda attempt: attempt[0])
-    return model, content | {"attempts": quantity(len(attempts), "1")}
+    return model, content | {"attempts": quantity(attempt + 1, "1")}
 
 
 def _attempt(

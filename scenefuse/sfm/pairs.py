@@ -38,7 +38,8 @@ class MatchSettings:
     spatial_from: int = 40
     """Auto compares GPS neighbours only from this many photos on: all pairs of fewer cost little."""
     neighbours: int = 20
-    """Spatial: nearest photos (horizontal distance) that each photo is compared with."""
+    """Spatial: nearest photos that each photo is compared with: half of them by horizontal distance, for flights at two
+    heights, half in space, for flights up and down a facade."""
     overlap: int = 10
     """Sequential: following photos that each photo is compared with."""
     loop_every: int = 5
@@ -77,12 +78,15 @@ def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
     known, positions = gps_positions(photos)
     at = {name: row for row, name in enumerate(known)}
     order = {name: index for index, name in enumerate(names)}
-    horizontal = local_frame(positions).apply(positions)[:, :2]
+    metric = local_frame(positions).apply(positions)
+    heights = metric[:, 2][np.isfinite(metric[:, 2])]
+    metric[:, 2] = np.nan_to_num(metric[:, 2], nan=np.median(heights) if len(heights) else 0.0)
     chosen = {_ordered(a, b, order) for a in names if a not in at for b in names if a != b}
-    distance = cdist(horizontal, horizontal)
-    nearest = np.argsort(distance, axis=1, kind="stable")
+    distance = cdist(metric[:, :2], metric[:, :2])
+    by_ground, by_space = (np.argsort(d, axis=1, kind="stable") for d in (distance, cdist(metric, metric)))
     for row, name in enumerate(known):
-        others = [c for c in nearest[row] if c != row][:neighbours]
+        others = [c for c in by_ground[row] if c != row][: neighbours // 2]
+        others += [c for c in by_space[row] if c != row and c not in others][: neighbours - len(others)]
         chosen |= {_ordered(name, known[c], order) for c in others}
     # Coincident positions would be no edge at all in a sparse graph, hence the small constant.
     tree = minimum_spanning_tree(distance + 1e-6).tocoo()

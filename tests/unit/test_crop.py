@@ -264,7 +264,7 @@ def test_what_shines_through_a_hole_far_behind_the_object_is_not_the_object(orbi
     both = np.concatenate([behind, on_it])
     photos = read_masked_views(folder / "undistorted", tmp_path / "masks", 0.8)
     votes = vote(both, photos, trial.scene_from_object, 0.8)
-    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), photos.views)
+    _, shown, inside = count(trial.scene_from_object.inverse().apply(behind), photos.views, 2)
     assert ((inside == 3) & (shown == 3)).mean() > 0.8
     assert not votes.object[:50].any()
 
@@ -287,7 +287,7 @@ def test_what_hides_the_object_takes_no_vote_from_it(orbit):
     assert len(facing) > 100
     shares = []
     for scene in (np.concatenate([points, fence]), points):
-        _, shown, inside = count(trial.scene_from_object.inverse().apply(scene), blind)
+        _, shown, inside = count(trial.scene_from_object.inverse().apply(scene), blind, 2)
         shares.append(np.mean((shown >= 3)[facing] & (inside >= 0.8 * shown)[facing]))
     assert shares[0] > 0.8 and shares[1] < 0.4
 

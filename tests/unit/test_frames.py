@@ -84,8 +84,9 @@ def test_step_and_limit(tmp_path):
     assert thin_out(101, 1, 3) == [0, 50, 100]
     assert thin_out(4, 1, 9) == [0, 1, 2, 3]
     folder = folder_of(tmp_path, [(64, 48)] * 9)
-    photos, _ = extract(tmp_path, folder, FrameSettings(frame_step=2, max_frames=3, max_width_px=64))
+    photos, content = extract(tmp_path, folder, FrameSettings(frame_step=2, max_frames=3, max_width_px=64))
     assert [p.name for p in photos] == ["00.png", "04.png", "08.png"]
+    assert value(content, "notes")[0].startswith("3 of 9 photos are used, spread evenly (object.frames.max_frames")
 
 
 def test_the_sharpest_frame_of_each_window_of_a_video_is_kept(tmp_path):

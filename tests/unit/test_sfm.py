@@ -6,6 +6,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from scenefuse.sfm import mapping
 from scenefuse.sfm.bundle.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.frames import FrameSettings, extract_frames
@@ -58,6 +59,19 @@ def test_spatial_pairs_are_neighbours_and_connected():
     assert ("005.jpg", "far0.jpg") in pairs  # the spanning tree
     assert sum("no_gps.jpg" in pair for pair in pairs) == 9
     assert len(set(pairs)) == len(pairs)
+
+
+def test_flights_up_a_facade_and_flights_at_two_heights_hold_together():
+    columns = [photo(f"{c}_{r:02d}.jpg", (4.0 * c, 0.0, 2.0 * r)) for c in range(4) for r in range(12)]
+    pairs = set(spatial_pairs(columns, 10))
+    for one in range(3):
+        beside = [(f"{one}_{r:02d}.jpg", f"{one + 1}_{r:02d}.jpg") for r in range(12)]
+        assert pairs.issuperset(beside)
+    floors = [photo(f"{f}_{k:02d}.jpg", (2.0 * k, 0.0, 40.0 * f)) for f in range(2) for k in range(20)]
+    pairs = set(spatial_pairs(floors, 10))
+    assert pairs.issuperset([(f"0_{k:02d}.jpg", f"1_{k:02d}.jpg") for k in range(20)])
+    unknown = [replace(p, altitude_m=None) if k % 3 == 0 else p for k, p in enumerate(floors)]
+    assert len(spatial_pairs(unknown, 10)) > 0
 
 
 def test_sequential_pairs_close_loops():
@@ -391,6 +405,23 @@ def test_a_photo_in_a_wrong_place_is_named(tmp_path):
         moved.camera_id, pycolmap.Rigid3d(turned, np.zeros(3)) * moved.cam_from_world()
     )
     assert list(doubtful_photos(model, explained_matches(model, tmp_path / "database.db"))) == [moved.name]
+
+
+def test_a_further_attempt_that_fails_loses_nothing(tmp_path, monkeypatch, capsys):
+    small_capture(tmp_path)
+    asked, attempt = [], mapping._attempt
+
+    def once(*arguments):
+        asked.append(arguments)
+        if len(asked) == 2:
+            raise StageError("only 3 of 8 photos were registered")
+        return attempt(*arguments)
+
+    monkeypatch.setattr(mapping, "_attempt", once)
+    monkeypatch.setattr(mapping, "doubtful_photos", lambda *_: {"a.jpg": 0.5})
+    report = mapped(tmp_path)
+    assert (value(report, "registered"), value(report, "attempts"), len(asked)) == (8, 3, 3)
+    assert "attempt 2 of 3 is left out: only 3 of 8 photos were registered" in capsys.readouterr().out
 
 
 def test_photos_with_weak_pairs_only_come_in_by_all_of_them(tmp_path):

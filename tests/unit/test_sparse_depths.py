@@ -86,7 +86,8 @@ def test_feet_that_some_photos_cannot_see_stay_in_the_hull_and_the_plinth_does_n
     side = 1 / volume.nerf_from_object.scale / CELLS
     corners = (np.abs(cells[:, :2]) > 0.2).all(1)
     assert cells[corners, 2].min() < side
-    assert np.abs(cells[cells[:, 2] > 2 * side, :2]).max() < 0.3 + 6 * side
+    # One of sixteen photos may err: the figure's sides bulge to what the other fifteen leave.
+    assert np.abs(cells[cells[:, 2] > 2 * side, :2]).max() < 0.3 + 9 * side
     # Nothing of the plinth, though all photos from above have some of it behind the figure.
     assert (cells[:, 2] < -3 * side).mean() < 0.005
     hidden = hidden_pixels(volume, outlines)

@@ -12,7 +12,17 @@ from scipy import ndimage
 
 from scenefuse.masks.clicked.votes import SURE, Voter, central, shares_of
 from scenefuse.masks.grabcut import fill_hull
-from scenefuse.mvs.visual_hull import Box, Hull, Mask, Outline, count_silhouettes, mask_iou, silhouette
+from scenefuse.mvs.visual_hull import (
+    NO_POINTS,
+    Box,
+    Hull,
+    Mask,
+    Outline,
+    count_silhouettes,
+    least_framing,
+    mask_iou,
+    silhouette,
+)
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
 
@@ -70,6 +80,7 @@ class Space:
         """Nothing is known yet."""
         self._photos = photos
         self._voters = 0
+        self._own = NO_POINTS
         self._grid: tuple[Box, Array, float, tuple[int, ...]] | None = None
         self._said: dict[int, tuple[Voter, NDArray[np.uint8]]] = {}
 
@@ -85,7 +96,8 @@ class Space:
             says = self._says(row, voter, centres)
             shown += says != UNSHOWN
             missed += says == MISSED
-        free = ((shown >= max(2, len(others) // 4)) & (missed <= TOLERANCE * shown)).reshape(shape)
+        views = [replace(self._photos.views[row], pixels=voter.mask) for row, voter in others.items()]
+        free = ((shown >= least_framing(views, self._own)) & (missed <= TOLERANCE * shown)).reshape(shape)
         # Thin parts pass between the voxels' centres.
         free = ndimage.binary_dilation(free)
         shell = free & ~ndimage.binary_erosion(free)
@@ -105,9 +117,9 @@ class Space:
         """Whether there is a grid, laid anew if the voting photos have doubled."""
         if self._grid is not None and len(voters) < 2 * self._voters:
             return True
-        own = self._photos.points[shares_of(self._photos, voters) >= SURE]
+        self._own = self._photos.points[shares_of(self._photos, voters) >= SURE]
         placed = [voter.clicks.placed for voter in voters.values()]
-        placed.append(central(own))
+        placed.append(central(self._own))
         points = np.concatenate([np.zeros((0, 3)), *placed])
         grow = REACH * float(np.linalg.norm(np.ptp(points, axis=0))) if len(points) >= LEAST_POINTS else 0.0
         if grow == 0.0:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.io.clouds import spacing
+from scenefuse.mvs.visual_hull import least_framing
 from scenefuse.stage import StageError, threads
 from scenefuse.transforms import Array, Sim3
 from scenefuse.workspace import View, read_workspace, with_mask
@@ -21,8 +22,8 @@ MOST_PHOTOS = 60
 SLACK = 0.005
 # A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
 CELL_SPACINGS, HIDDEN_CELLS = 4, 2
-# Photos that must show a point, and the share of all that must have it in their frame.
-MIN_SHOWN, MIN_FRAMED = 3, 1 / 4
+# Photos that must show a point.
+MIN_SHOWN = 3
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
 FAR_EXTENTS = 4.0
 # How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
@@ -68,8 +69,9 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     """Project every point of a scene into an object's masks.
 
     A photo votes on a point that falls into its frame and that no nearer scene point hides; three votes make a
-    decision. A point is the object's when at least `min_share` of them have it inside their mask, a quarter of all
-    photos frame it, and one of the object's own SfM points is near; something else's when most have it outside.
+    decision. A point is the object's when at least `min_share` of them have it inside their mask, enough photos have it
+    in their frame (`least_framing`), and one of the object's own SfM points is near; something else's when most have it
+    outside.
 
     Args:
         points: (N, 3) in the scene frame.
@@ -79,9 +81,10 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     """
     views, own = masked.views, masked.own
     in_object = scene_from_object.inverse().apply(points)
-    framed, shown, inside = count(in_object, views)
+    least = least_framing(views, own)
+    framed, shown, inside = count(in_object, views, least)
     decided = shown >= MIN_SHOWN
-    is_object = decided & (framed >= len(views) * MIN_FRAMED) & (inside >= min_share * shown)
+    is_object = decided & (framed >= least) & (inside >= min_share * shown)
     rows = np.flatnonzero(is_object)
     reach = NEAR_OWN * float(np.linalg.norm(np.ptp(own, axis=0)))
     is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
@@ -136,13 +139,18 @@ def _with_grown_mask(view: View, path: Path) -> View:
     return replace(view, pixels=grown > 0)
 
 
-def count(in_object: Array, views: list[View]) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-    """How many photos frame each of (N, 3) points, show it unhidden, and have it inside the mask then."""
+def count(
+    in_object: Array, views: list[View], least: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """How many photos frame each of (N, 3) points, show it unhidden, and have it inside the mask then.
+
+    What hides is judged by the spacing of those that `least` photos frame.
+    """
     columns = _columns(in_object)
     framed, shown, inside = (np.zeros(len(in_object), dtype=np.int32) for _ in range(3))
     for one in views:
         framed[_in_frame(columns, one)[0]] += 1
-    around = np.flatnonzero(framed >= len(views) * MIN_FRAMED)
+    around = np.flatnonzero(framed >= least)
     if len(around) < 2:
         return framed, shown, inside
     step = spacing(in_object[around])

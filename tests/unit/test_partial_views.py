@@ -1,0 +1,131 @@
+"""Photos that show a part of the object only: a long facade, many photos of a statue's head, a mask that lacks it."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy import ndimage
+
+from scenefuse.masks.box import Ground
+from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.mvs.visual_hull import Box, Outline, least_framing
+from scenefuse.nerf.volume import find_volume
+from scenefuse.registration.crop.vote import Masked, vote
+from scenefuse.transforms import Sim3
+from scenefuse.workspace import View
+
+CELLS = 64
+FACADE = [((-15.0, 0.0, 0.0), (15.0, 1.0, 9.0))]
+STATUE = [((-0.3, -0.3, 0.0), (0.3, 0.3, 1.5)), ((-0.2, -0.2, 1.5), (0.2, 0.2, 1.9))]
+
+
+def photo(name, centre, target, degrees, boxes, width=160, height=120):
+    """A photo of boxes, with its true mask."""
+    focal = width / 2 / np.tan(np.radians(degrees) / 2)
+    z = (np.array(target) - centre) / np.linalg.norm(np.array(target) - centre)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([x, np.cross(z, x), z])
+    pose[:3, 3] = -pose[:3, :3] @ np.array(centre)
+    lens = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1.0]])
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    rays = np.stack([u, v, np.ones_like(u)], -1).reshape(-1, 3) @ np.linalg.inv(lens).T @ pose[:3, :3]
+    hit = np.zeros(len(rays), bool)
+    for low, high in boxes:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (np.array(low) - centre) / rays, (np.array(high) - centre) / rays
+        hit |= np.minimum(a, b).max(1) < np.maximum(np.maximum(a, b).min(1), 0)
+    return View(name, lens, pose, width, height, hit.reshape(height, width))
+
+
+def along_a_facade():
+    return [
+        photo(f"{x:+05.1f}{z}", (x, -10.0, 1.7), (x, 0.0, z), 40, FACADE)
+        for x in np.arange(-15, 15.1, 1.0)
+        for z in (2, 7)
+    ]
+
+
+def around_a_statue(whole, heads):
+    return [
+        *(photo(f"a{k}", ring(k, whole, 4.0, 1.6), (0, 0, 0.95), 65, STATUE) for k in range(whole)),
+        *(photo(f"b{k}", ring(k, heads, 1.2, 1.8), (0, 0, 1.7), 40, STATUE) for k in range(heads)),
+    ]
+
+
+def ring(k, count, radius, height):
+    angle = 2 * np.pi * k / count
+    return radius * np.cos(angle), radius * np.sin(angle), height
+
+
+def surface(boxes, count=1500):
+    rng, points = np.random.default_rng(0), []
+    for low, high in boxes:
+        some, face = rng.uniform(low, high, (count, 3)), rng.integers(0, 3, count)
+        side = np.where(rng.random(count) < 0.5, np.array(low)[face], np.array(high)[face])
+        some[np.arange(count), face] = side
+        points.append(some)
+    return np.concatenate(points)
+
+
+def target(boxes):
+    own = surface(boxes)
+    grow = 0.15 * np.linalg.norm(np.ptp(own, axis=0))
+    box, ground = (
+        Box(np.eye(3, 4), own.min(0) - grow, own.max(0) + grow),
+        Ground(np.full(6, -0.01) * [1, 0, 0, 0, 0, 0], np.zeros(2)),
+    )
+    return SimpleNamespace(box=box, ground=ground, sparse=own, kind=np.ones(len(own), np.int8))
+
+
+def share_in(volume, points):
+    """Share of points in the hull, or in a cell beside it."""
+    unit = volume.nerf_from_object.apply(points)
+    inside = ((unit >= 0) & (unit < 1)).all(1)
+    cells = np.clip((unit * CELLS).astype(int), 0, CELLS - 1)
+    return (inside & ndimage.binary_dilation(volume.hull)[tuple(cells.T)]).mean()
+
+
+CAPTURES = {"facade": (FACADE, along_a_facade), "statue": (STATUE, lambda: around_a_statue(16, 60))}
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_photos_of_a_part_lose_nothing_of_the_object(name):
+    boxes, photos = CAPTURES[name][0], CAPTURES[name][1]()
+    scored = score_masks([view.pixels for view in photos], target(boxes), photos, MaskSettings(hull_voxels=128))
+    assert not scored.dropped
+    volume = find_volume([Outline(view) for view in photos], CELLS, 0.04, own=surface(boxes))
+    front = surface(boxes)
+    front = front[front[:, 1] < 0.1] if name == "facade" else front
+    assert share_in(volume, front) > 0.97
+    assert 1 / volume.nerf_from_object.scale < 2.5 * np.ptp(front, axis=0).max()
+
+
+@pytest.mark.parametrize("name", CAPTURES)
+def test_points_of_a_scene_that_few_photos_frame_are_the_objects(name):
+    boxes, photos = CAPTURES[name][0], CAPTURES[name][1]()
+    own = surface(boxes, 300)
+    # What one side hides from another is left to the photos: here the points that most of them show.
+    votes = vote(own, Masked(photos, own), Sim3.identity(), 0.8)
+    front = own[:, 1] < 0.1 if name == "facade" else np.abs(own[:, :2]).max(1) > 0.19
+    assert votes.object[front].mean() > 0.7
+    lower = front & (own[:, 2] < 0.6 * own[:, 2].max())
+    assert votes.object[lower].mean() > 0.7
+
+
+def test_one_mask_that_lacks_the_head_takes_it_from_no_object():
+    photos = around_a_statue(18, 0)
+    headless = photo("a0", ring(0, 18, 4.0, 1.6), (0, 0, 0.95), 65, STATUE[:1]).pixels
+    photos[0] = replace(photos[0], pixels=headless)
+    volume = find_volume([Outline(view) for view in photos], CELLS, 0.04, own=surface(STATUE))
+    head = surface(STATUE)[-1500:]
+    assert share_in(volume, head[head[:, 2] > 1.6]) > 0.95
+
+
+def test_how_many_photos_frame_a_place():
+    photos, own = around_a_statue(16, 60), surface(STATUE)
+    assert least_framing(photos, own) == np.ceil(0.3 * 16)
+    assert least_framing(photos[:16], own) == least_framing(photos[:16], own[:5]) == np.ceil(0.3 * 16)
+    assert least_framing(photos, own[:5]) == np.ceil(0.3 * 76 / 3)  # of few points nothing is known
