@@ -51,9 +51,10 @@ def setting(
 def run(function: Callable[..., Any]) -> None:
     """Run a stage function as a command line built from its signature and docstring.
 
-    A StageError or a full disk ends in one sentence on stderr and exit status 1; a number that the function returns is
-    the exit status. SIGTERM and SIGINT unwind the stack, so that temporary outputs are removed; the process also gets
-    SIGTERM when its parent dies. A log of the workflow, which sets SCENEFUSE, begins with the command, to be pasted.
+    A StageError, a full disk or a file that may not be read or written ends in one sentence on stderr and exit status
+    1; a number that the function returns is the exit status. SIGTERM and SIGINT unwind the stack, so that temporary
+    outputs are removed; the process also gets SIGTERM when its parent dies. A log of the workflow, which sets
+    SCENEFUSE, begins with the command, to be pasted.
     """
     import tyro
 
@@ -67,6 +68,12 @@ def run(function: Callable[..., Any]) -> None:
         status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except (PermissionError, NotADirectoryError) as error:
+        if error.filename is None:
+            raise
+        why = (error.strerror or "not allowed").lower()
+        print(f"error: {error.filename}: {why}; check the folder and who may write there", file=sys.stderr)
         sys.exit(1)
     except OSError as error:
         if error.errno not in (errno.ENOSPC, errno.EDQUOT):

@@ -11,6 +11,8 @@ from scenefuse.stage import atomic_file
 from scenefuse.transforms import Array, Sim3
 
 SIDE_PX = 460
+# An object that is more times as large as the part of the scene is not shown whole.
+MOST_LARGER = 3.0
 SCENE_RGB, OBJECT_RGB = (60, 60, 60), (214, 92, 30)
 
 
@@ -21,7 +23,11 @@ def draw_alignment(
     rng = np.random.default_rng(seed)
     thin = [c[np.sort(rng.permutation(len(c))[:most])] for c in (cloud, scene)]
     obj, ground = thin[0].transformed(scene_from_object), thin[1]
-    low, high = ground.points.min(0), ground.points.max(0)
+    # Strays at either side do not count, and neither does an object where the pose is absurd.
+    low, high = np.percentile(ground.points, [0.5, 99.5], axis=0)
+    own = np.percentile(obj.points, [0.5, 99.5], axis=0)
+    if (np.ptp(own, axis=0) <= MOST_LARGER * (high - low).max()).all():
+        low, high = np.minimum(low, own[0]), np.maximum(high, own[1])
     middle, half = (low + high) / 2, 0.62 * max(float((high - low).max()), 1e-9)
     points = np.concatenate([ground.points, obj.points]) - middle
     flat = np.concatenate([np.tile(SCENE_RGB, (len(ground), 1)), np.tile(OBJECT_RGB, (len(obj), 1))])

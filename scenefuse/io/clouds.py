@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.io.formats import LAS_DIMENSIONS, bytes_of, read_columns
 from scenefuse.io.readers.columns import COLOR, NORMAL, POSITION, Columns, positions
-from scenefuse.stage import StageError, atomic_file
+from scenefuse.stage import StageError, atomic_file, threads
 from scenefuse.transforms import Sim3
 from scenefuse.version import VERSION
 
@@ -36,6 +36,15 @@ FAR = 10.0
 
 SINGLE_STEP = 0.25
 """Of the spacing of points, from which the steps of single precision show."""
+
+
+NEIGHBOURS, ALONE, LONELY, FEW = 8, 0.02, 10.0, 0.1
+"""Of `strays`: neighbours of a point; how far they are from a lonely one, of the diagonal and beside the median; the
+largest share of all points that strays are."""
+
+
+UNIT_TOLERANCE = 0.05
+"""Normals may be this far from unit length."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +224,34 @@ def is_nothing_at_zero(others: NDArray[np.float64]) -> bool:
     low, high = np.percentile(others, [1, 99], axis=0)
     away = np.linalg.norm(np.maximum(np.maximum(low, -high), 0))
     return bool(away > FAR * np.linalg.norm(high - low))
+
+
+def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which of (N, 3) points lie far from all others, N as many as one looks through at once.
+
+    Outside the box around the middle 98 % of them, grown by its size on each side; or with the eighth neighbour
+    farther away than 2 % of that box's diagonal, and ten times as far as most have it. None, if they are many.
+    """
+    low, high = np.percentile(points, [1, 99], axis=0)
+    far = ((points < low - (high - low).max()) | (points > high + (high - low).max())).any(1)
+    near = np.flatnonzero(~far)
+    if len(near) > NEIGHBOURS:
+        away = cKDTree(points[near]).query(points[near], k=NEIGHBOURS + 1, workers=threads())[0][:, -1]
+        far[near] = away > max(ALONE * float(np.linalg.norm(high - low)), LONELY * float(np.median(away)))
+    return far if far.mean() <= FEW else np.zeros(len(points), dtype=bool)
+
+
+def without_strays(cloud: Cloud, what: str) -> tuple[Cloud, list[str]]:
+    """The cloud without its strays, and a note, if there are any, in which the cloud is called `what`."""
+    far = strays(cloud.points)
+    if not far.any():
+        return cloud, []
+    return cloud[np.flatnonzero(~far)], [f"{far.sum()} points of {what}, far from all others, are left out"]
+
+
+def has_unit_normals(cloud: Cloud) -> bool:
+    """Whether all normals have unit length; other ones say nothing of the surface."""
+    return cloud.normals is None or bool((np.abs(np.linalg.norm(cloud.normals, axis=1) - 1) <= UNIT_TOLERANCE).all())
 
 
 def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list[str]:

@@ -1,13 +1,22 @@
 """A user's cloud or mesh in the place of photos: a scene's dense cloud, or an object's."""
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from scenefuse.io.clouds import Cloud, cloud_of, concatenate, precision_note, spacing, write_cloud
+from scenefuse.io.clouds import (
+    Cloud,
+    cloud_of,
+    concatenate,
+    has_unit_normals,
+    precision_note,
+    spacing,
+    without_strays,
+    write_cloud,
+)
 from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees, las_crs, las_dimensions
 from scenefuse.io.readers.columns import Columns
 from scenefuse.io.readers.text import text_notes
@@ -24,8 +33,6 @@ LEAST_POINTS = 200
 ENOUGH = 10_000
 # Positions below this share of the points, and above the same share, are strays: they do not move the origin.
 STRAY_PERCENT = 1.0
-# Normals may be this far from unit length.
-UNIT_TOLERANCE = 0.05
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -100,12 +107,13 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     """
     file = ImportedFile.of(source)
     check_not_degrees(source, file.survey.sample)
-    whole = concatenate(list(file.clouds()))
+    whole, notes = without_strays(concatenate(list(file.clouds())), source.name)
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
-    content = file.report(spacing(placed.points), placed.diagonal, "object units")
+    content = file.report(spacing(placed.points), placed.diagonal, "object units", notes)
+    content["points"] = quantity(len(placed), "1")
     write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
 
 
@@ -155,8 +163,7 @@ class ImportedFile:
             names.update(part.fields)
             said.update(name for name in {*keep} - said if name in part.fields and part.fields[name].any())
             if part.normals is not None:
-                off = np.abs(np.linalg.norm(part.normals, axis=1) - 1) > UNIT_TOLERANCE
-                unit_normals = unit_normals is not False and not off.any()
+                unit_normals = unit_normals is not False and has_unit_normals(part)
 
         whole = survey(source, columns_in_parts(source, degrees), look)
         different = len(np.unique(whole.sample[:: max(1, len(whole.sample) // ENOUGH)], axis=0))
@@ -195,17 +202,18 @@ class ImportedFile:
         tiles = open_cloud(cloud)
         return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit)
 
-    def report(self, step: float, diagonal: float, unit: str) -> dict[str, Any]:
+    def report(self, step: float, diagonal: float, unit: str, more: Sequence[str] = ()) -> dict[str, Any]:
         """What was taken over, and what became of the rest; printed too.
 
         Args:
             step: distance between neighbouring points.
             diagonal: of the points' box.
             unit: of both.
+            more: further notes.
         """
         source = self.survey.path
         notes = [f"{count} {why} were left out" for why, count in self.survey.left_out.items() if count]
-        notes += [*text_notes(source), *precision_note(source, self.survey.sample, step)]
+        notes += [*more, *text_notes(source), *precision_note(source, self.survey.sample, step)]
         if self.unit_normals is False:
             notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
         if self.unused:

@@ -105,7 +105,7 @@ def decide(
     of_spread = _reasons_of_spread(free_axis, uncertainty, problem.scene.diagonal, settings)
     reason = next(_reasons(best, (*of_clouds, *of_spread), problem), None)
     words = {
-        "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose",
+        "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose{_freely(free_axis)}",
         "both": f"alignment and clouds agree, F-score {best.score.f_score:.2f}",
         "photos": f"by the alignment, against the clouds' best fit, F-score {best.score.f_score:.2f}",
     }[decided_by]
@@ -143,6 +143,14 @@ def _rivals(
         elif free_axis is None and other.score.total > (1 - settings.min_margin) * best.score.total:
             free_axis = rotation_axis(other.pose.rotation @ best.pose.rotation.T)
     return rivals, free_axis
+
+
+def _freely(axis: Array | None) -> str:
+    """What to say of an object that fits as well when it is turned."""
+    if axis is None:
+        return ""
+    about = ", ".join(f"{x:.2f}" for x in axis)
+    return f"; turned about ({about}) the object fits as well, and which turn is right its shape does not tell"
 
 
 def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:

@@ -75,8 +75,9 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
 
     Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
-    polish; ranking by the two-way F-score, the agreement of colours and free space; comparison with the alignment from
-    shared features, which replaces the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
+    polish; turned copies of what is best then; ranking by the two-way F-score, the agreement of colours and free space;
+    comparison with the alignment from shared features, which replaces the clouds' pose where they differ; the most
+    likely pose; the uncertainty; the gate.
 
     Args:
         problem: the clouds and what is known.
@@ -89,6 +90,8 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     polished = work.best_first([work.polish(h) for h in refined[:POLISHED]])
     both_sides = [work.polish(work.resized(polished[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE)]
     polished = work.best_first([*polished, *both_sides])
+    # About the polished pose, whose axis is exact, rivals turn up that the copies of a rough one slid past.
+    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED])])
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings)

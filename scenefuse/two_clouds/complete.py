@@ -89,6 +89,8 @@ def complete(
     if near.colors is not None and obj.colors is None:
         notes.append("the object has no colours: its points are grey in the scene")
         added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
+    if near.colors is None and obj.colors is not None:
+        notes.append("the scene has no colours: the completed scene leaves out the object's, object_in_scene has them")
     left_out = sorted({*near.fields, *obj.fields} - (OWN if _again(near) else set()))
     if left_out:
         notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
@@ -179,6 +181,8 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
 
     with laspy.open(scene.survey.path) as reader:
         header = copy.deepcopy(reader.header)
+        # What laspy writes; a later version has all that 1.0 and 1.1 have.
+        header.version = max(header.version, laspy.header.Version(1, 2))
         # An index of the points (COPC) is not one of more points.
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
         further = type(header.vlrs)(_but_copc(header.evlrs or []))

@@ -65,7 +65,8 @@ def write_page(page: Path, content: dict[str, Any], picture: Path, done: Complet
     parts.append(_table(content))
     if "scene_from_object" in content:
         rows = "\n".join(" ".join(f"{cell:.17g}" for cell in row) for row in value(content, "scene_from_object"))
-        parts.append(f"<h2>x_scene = M x_object</h2><pre>{rows}</pre>")
+        refused = "" if done is not None else ", of the refused pose: not to be used"
+        parts.append(f"<h2>x_scene = M x_object{refused}</h2><pre>{rows}</pre>")
     with atomic_file(page) as temporary:
         temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
 

@@ -1,5 +1,6 @@
 """Two files in; a decision, a transform, a picture and, if asked for, the completed scene out."""
 
+import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,7 @@ import tyro
 
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.cloud_file import CloudFile
-from scenefuse.io.clouds import Cloud, write_cloud, write_laz
+from scenefuse.io.clouds import Cloud, has_unit_normals, without_strays, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
@@ -149,12 +150,15 @@ def _clear(out: Path, inputs: list[Path]) -> None:
             raise StageError(f"{path} is an input, and a run removes what lies in --out {out}; give another folder")
     for path in earlier:
         path.unlink(missing_ok=True)
+    if not os.access(next(place for place in (out, *out.absolute().parents) if place.exists()), os.W_OK):
+        raise StageError(f"nothing may be written in --out {out}; give another folder")
 
 
 def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Known) -> Given:
     up_object, up_scene = known.ups()
     box = None if known.crop_box is None else np.array(known.crop_box)
     cloud = CloudFile.of(object)
+    own, strays = without_strays(cloud.part, str(object))
     marked = search_box(settings.crop, known.fiducials, box)
     whole = CloudFile.of(scene, marked, SEARCHED)
     crs = las_crs(scene)
@@ -162,11 +166,11 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
         from scenefuse.io.crs import check_place
 
         check_place(crs, whole.survey.sample, scene)
-    notes = [*cloud.notes, *whole.notes, *_notes(object, scene)]
+    notes = [*cloud.notes, *strays, *whole.notes, *_notes(object, scene)]
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
     if box is not None and not len(whole.part):
-        low, high = (" ".join(f"{x:.6g}" for x in end(whole.survey.sample, axis=0)) for end in (np.min, np.max))
+        low, high = (" ".join(f"{x:.10g}" for x in end(whole.survey.sample, axis=0)) for end in (np.min, np.max))
         raise StageError(
             "no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about"
             f" {low} to {high} in {scene}"
@@ -174,8 +178,14 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     # Marks around which nothing lies are far from all of the scene, which the crop says.
     near = whole.part if len(whole.part) else Cloud(whole.survey.sample)
     part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.survey.count)
+    part, strays = without_strays(part, f"what is searched of {scene}")
+    notes += strays
+    for each, path in ((own, object), (part, scene)):
+        if not has_unit_normals(each):
+            notes.append(f"the normals of {path} are not all of unit length: they are estimated from the points")
+    own = own if has_unit_normals(own) else replace(own, normals=None)
     ups = None if up_object is None or up_scene is None else (up_object, up_scene)
-    return Given(cloud.part, replace(whole, part=part), searched, notes, ups)
+    return Given(own, replace(whole, part=part), searched, notes, ups)
 
 
 def _notes(object: Path, scene: Path) -> list[str]:

@@ -328,3 +328,24 @@ def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, 
     (tmp_path / "b.xyz").write_text("\n".join([*lines[:-1], "1 2"]) + "\n")
     with pytest.raises(ValueError, match=r"row 5.*rows counted from line 23"):
         list(text_parts(tmp_path / "b.xyz", 10))
+
+
+@pytest.mark.parametrize(
+    ("content", "colored"),
+    [
+        ("//X Y Z R G B Scalar Nx Ny Nz\n4\n" + "1 2 3 10 20 30 0.5 0 0 1\n" * 4, True),  # CloudCompare's, with a count
+        ("ID,N [m],E [m],H [m]\n" + "".join(f"P{k},2,1,3\n" for k in range(4)), False),
+        ("x,y,z,red,green,blue,\n" + "1,2,3,10,20,30,\n" * 4, True),
+    ],
+)
+def test_text_as_programs_write_it(tmp_path, content, colored):
+    (tmp_path / "a.csv").write_text(content)
+    found = read_cloud(tmp_path / "a.csv")
+    assert found.points.tolist() == [[1, 2, 3]] * 4
+    assert (found.colors is not None) == colored and (not colored or found.colors[0].tolist() == [10, 20, 30])
+
+
+@pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig"])
+def test_text_in_other_encodings(tmp_path, encoding):
+    (tmp_path / "a.csv").write_text("Punkt;Rechtswert;Hochwert;Höhe\n" + "7;1;2;3\n9;4;5;6\n" * 2, encoding=encoding)
+    assert read_cloud(tmp_path / "a.csv").points.tolist() == [[1, 2, 3], [4, 5, 6]] * 2

@@ -152,3 +152,18 @@ def test_a_compressed_glb_says_so(tmp_path):
     write_glb(tmp_path / "roof.glb", ["KHR_draco_mesh_compression"])
     with pytest.raises(StageError, match="compressed by KHR_draco_mesh_compression: export them without"):
         read_cloud(tmp_path / "roof.glb")
+
+
+def test_a_mesh_whose_materials_say_nothing_has_no_colours(tmp_path, capsys):
+    (tmp_path / "a.mtl").write_text("newmtl grey\nNs 10\n")
+    (tmp_path / "a.obj").write_text("mtllib a.mtl\nv\t0 0 0\nv\t1 0 0\nv\t0 1 0\nusemtl grey\nf 1 2 3\n")
+    assert read_cloud(tmp_path / "a.obj").colors is None
+    assert "neither pictures nor colours" in capsys.readouterr().out
+
+
+def test_a_picture_behind_options_is_found(tmp_path):
+    cv2.imwrite(str(tmp_path / "my tex.png"), np.full((4, 4, 3), 40, np.uint8))
+    (tmp_path / "a.mtl").write_text('newmtl m\nmap_Kd -s 1 1 1 -clamp on "my tex.png"\n')
+    corners = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nvt 1 0\nvt 0 1\n"
+    (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{corners}usemtl m\nf 1/1 2/2 3/3\n")
+    assert (read_cloud(tmp_path / "a.obj").colors == 40).all()

@@ -82,6 +82,19 @@ def test_the_same_object_is_registered_where_the_scene_shows_its_distinctive_par
     assert is_at(outcome.decision.rival.pose, TURNED, with_canopy)
 
 
+def test_an_object_that_is_the_same_when_turned_is_registered_and_that_is_said():
+    decision = register(hut(False, 0).transformed(TRUTH.inverse()), hut(False, 1)).decision
+    assert decision.registered and abs(decision.free_axis @ UP) > 0.99
+    assert "the object fits as well, and which turn is right its shape does not tell" in decision.reason
+
+
+def test_colours_that_the_scene_does_not_have_do_not_choose_among_turns():
+    plain = hut(False, 0)
+    red = np.where(plain.points[:, :1] > 0, [[200, 30, 30]], [[30, 200, 30]]).astype(np.uint8)
+    outcome = register(replace(plain, colors=red).transformed(TRUTH.inverse()), hut(False, 1))
+    assert not outcome.decision.registered and outcome.decision.margin < FINE.min_margin
+
+
 def test_a_pose_is_refused_where_the_objects_own_model_may_be_bent_beyond_use():
     decision = Decision(True, "good", "photos", 1.0, None, None)
     assert unless_torn(decision, None, 10.0) is decision

@@ -409,15 +409,15 @@ def test_a_photo_in_a_wrong_place_is_named(tmp_path):
 
 def test_a_further_attempt_that_fails_loses_nothing(tmp_path, monkeypatch, capsys):
     small_capture(tmp_path)
-    asked, attempt = [], mapping._attempt
+    asked, choose = [], mapping.choose_lens
 
     def once(*arguments):
         asked.append(arguments)
         if len(asked) == 2:
             raise StageError("only 3 of 8 photos were registered")
-        return attempt(*arguments)
+        return choose(*arguments)
 
-    monkeypatch.setattr(mapping, "_attempt", once)
+    monkeypatch.setattr(mapping, "choose_lens", once)
     monkeypatch.setattr(mapping, "doubtful_photos", lambda *_: {"a.jpg": 0.5})
     report = mapped(tmp_path)
     assert (value(report, "registered"), value(report, "attempts"), len(asked)) == (8, 3, 3)

@@ -20,6 +20,7 @@ MAY_IMPORT |= {name: set(SHARED) for name in SHARED}
 MAY_IMPORT["metrics"] |= {"demo.cameras"}
 MAY_IMPORT |= {"demo": {*SHARED, "io", "workspace", "demo"}, "config": {*SHARED, *PACKAGES, "demo"}}
 MAY_IMPORT |= {"new_project": {*SHARED, "io"}, "command_line": {*SHARED, *PACKAGES, "new_project"}}
+MAY_IMPORT |= {"__main__": {"command_line"}}
 MOST_MODULES = 16
 CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
 CORE += ("appearance", "pose_refinement")

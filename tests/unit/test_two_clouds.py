@@ -21,7 +21,7 @@ from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import RegistrationSettings
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import Sim3
-from scenefuse.two_clouds.complete import complete, write_completed
+from scenefuse.two_clouds.complete import append_to_las, complete, write_completed
 from scenefuse.two_clouds.register import register
 from scenefuse.version import VERSION
 
@@ -372,3 +372,47 @@ def test_an_object_may_be_anywhere_whatever_crs_its_file_names(tmp_path, house, 
     write_laz(tmp_path / "house.laz", house.object, np.zeros(3), "EPSG:25832")
     write_cloud(tmp_path / "yard.ply", house.scene)
     assert register(object=tmp_path / "house.laz", scene=tmp_path / "yard.ply", out=tmp_path / "out") == 0
+
+
+def test_strays_and_normals_that_say_nothing_do_not_count(tmp_path, house, monkeypatch):
+    monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
+    points = np.concatenate([house.object.points, [[1e4, 0, 0], [0, -1e4, 5]]])
+    write_cloud(tmp_path / "house.ply", Cloud(points, np.zeros((len(points), 3), np.float32)))
+    write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([house.scene.points, [[0, 0, 9e5]]])))
+    files = {"object": tmp_path / "house.ply", "scene": tmp_path / "yard.ply"}
+    register(**files, out=tmp_path / "out")
+    content = read_json(tmp_path / "out/transform.json")
+    pose = Sim3.from_matrix(np.array(value(content, "scene_from_object")))
+    found, truth = (p.apply(house.object.points) for p in (pose, house.scene_from_object))
+    assert np.linalg.norm(found - truth, axis=1).max() < 0.03 * house.diagonal
+    notes = " ".join(value(content, "notes"))
+    assert "2 points of" in notes and "1 points of what is searched" in notes and "not all of unit length" in notes
+    assert value(content, "inputs")["object_points"] == len(house.object)
+
+
+def test_a_las_of_an_old_version_is_completed(tmp_path):
+    write_survey(tmp_path / "yard.las", in_scene(sheet(0, 4)))
+    las = laspy.convert(laspy.read(tmp_path / "yard.las"), point_format_id=1, file_version="1.1")
+    las.write(tmp_path / "old.las")
+    content = bytearray((tmp_path / "old.las").read_bytes())
+    content[24:26] = bytes([1, 0])
+    (tmp_path / "old.las").write_bytes(content)
+    scene = CloudFile.of(tmp_path / "old.las")
+    done = complete(own(sheet(2, 8)), scene, POSE, FusionSettings(mode="append"))
+    append_to_las(tmp_path / "completed.las", scene, done)
+    after = laspy.read(tmp_path / "completed.las")
+    assert len(after.points) == scene.total + len(done.added)
+
+
+def test_colours_that_the_scene_has_no_place_for_are_named(tmp_path):
+    scene = in_scene(sheet(0, 4))
+    write_cloud(tmp_path / "yard.ply", Cloud(scene.points))
+    done = complete(own(sheet(2, 8)), CloudFile.of(tmp_path / "yard.ply"), POSE, FusionSettings(mode="append"))
+    assert any("the scene has no colours" in note for note in done.notes)
+
+
+def test_a_folder_that_may_not_be_written_to_stops_at_once(tmp_path, house, monkeypatch):
+    write_cloud(tmp_path / "house.ply", house.object)
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(StageError, match="nothing may be written in --out"):
+        register(object=tmp_path / "house.ply", scene=tmp_path / "house.ply", out=tmp_path / "out")

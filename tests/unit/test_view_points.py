@@ -154,6 +154,15 @@ def test_a_view_without_colours_and_normals_and_of_one_point_is_packed():
     assert "green" not in planes and "deviation" not in planes and planes["shade"][0] == about["levels"]
 
 
+def test_the_shape_of_a_cloud_without_colours_and_normals_shows_by_its_light():
+    rng = np.random.default_rng(0)
+    floor, wall = np.c_[rng.random((400, 2)), np.zeros(400)], np.c_[np.zeros(400), rng.random((400, 2))]
+    fields = {"shown": np.zeros(800, np.uint8), "source": np.zeros(800, np.uint8)}
+    about, data = encode(view_of(Cloud(np.concatenate([floor, wall]), None, None, fields)))
+    darker, brighter = np.percentile(planes_of(about, data)["shade"], [10, 90])
+    assert brighter - darker > 0.1 * about["levels"]
+
+
 def test_deviations_that_say_nothing_are_left_out():
     for values in (np.zeros(30, dtype=np.float32), np.full(30, np.nan, dtype=np.float32)):
         scene = square(30, deviation=values)

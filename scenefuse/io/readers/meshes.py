@@ -4,6 +4,7 @@ Read here and not by Open3D, whose readers take positions as float32: at UTM coo
 """
 
 import json
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,9 @@ def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None
     """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of the vertices, else the materials."""
     if mesh.colors is not None:
         return np.asarray(np.einsum("nk,nkc->nc", weights, mesh.colors[mesh.faces[face]]))
-    if not mesh.materials:
+    if all(material.picture is None and material.color == WHITE for material in mesh.materials):
+        if mesh.materials:
+            print("note: the mesh's materials have neither pictures nor colours: it has none", flush=True)
         return None
     colors, of = np.tile(np.array(WHITE), (len(face), 1)), mesh.material[face]
     for number, material in enumerate(mesh.materials):
@@ -141,7 +144,7 @@ class _Obj:
     material: str = ""
 
     def take(self, line: str) -> None:
-        word, _, rest = line.strip().partition(" ")
+        word, rest = (*line.split(None, 1), "", "")[:2]
         if word == "v":
             self.vertices.append([float(cell) for cell in rest.split()])
         elif word == "vt":
@@ -204,9 +207,15 @@ def _materials(path: Path) -> dict[str, Material]:
         elif word == "Kd" and name:
             found[name] = Material(found[name].picture, tuple(255 * float(cell) for cell in rest.split()[:3]))
         elif word == "map_Kd" and name:
-            file = path.parent / rest.strip().replace("\\", "/")
+            file = path.parent / _named_file(rest).replace("\\", "/")
             found[name] = Material(_picture(file.read_bytes() if file.is_file() else b"", str(file)), found[name].color)
     return found
+
+
+def _named_file(rest: str) -> str:
+    """The file that a line of a material names: behind its options, perhaps in quotes."""
+    options = re.match(r"(?:-[A-Za-z]+(?:\s+(?:-?[\d.]+|on|off)(?=\s))*\s+)*", rest)
+    return rest[options.end() if options else 0 :].strip().strip('"')
 
 
 def _picture(content: bytes, name: str) -> NDArray[np.uint8] | None:

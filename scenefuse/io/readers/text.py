@@ -1,5 +1,6 @@
 """Clouds as rows of text: XYZ, PTS, TXT, ASC, CSV, as scanners, CloudCompare and spreadsheets write them."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -48,6 +49,9 @@ class TextLayout:
         """(N, C) numbers of lines that are rows."""
         # A name counts as a number, so that rows of another length are still an error.
         first_cell: Any = {0: lambda name: 0.0} if self.named else None
+        # Some programs end each row with a separator.
+        if self.separator and any(line.rstrip().endswith(self.separator) for line in lines[:1]):
+            lines = [line.rstrip().removesuffix(self.separator) for line in lines]
         return np.loadtxt(
             lines, delimiter=self.separator, ndmin=2, converters=first_cell, comments=None if self.named else "#"
         )
@@ -66,18 +70,18 @@ def text_layout(path: Path) -> TextLayout:
         StageError: longitude and latitude; commas as decimal points.
         ValueError: no rows of numbers.
     """
-    with open(path, encoding="utf-8-sig") as file:
+    with open(path, encoding=_encoding(path)) as file:
         head = list(islice(file, HEAD))
         if not "".join(head).strip():
             return TextLayout(columns=dict(zip(POSITION, range(3))))
         above, named = _first_row(path, head)
         begin = TextLayout(above, _separator(head[above]), named)
         rows = begin.rows(head[above:] + list(islice(file, LOOKED_AT)))
-    names = _titles(head[above - 1], begin.separator) if above else []
+    names = _names(head[:above], begin.separator, rows.shape[1])
     if len(names) == rows.shape[1]:
         if set(POSITION) <= {common_name(name) for name in names}:
             return TextLayout(above, begin.separator, named, {name: k for k, name in enumerate(names)})
-        axes = [[name for name in names if name.lower() in known] for known in (EASTING, NORTHING, ELEVATION)]
+        axes = [[name for name in names if _plain(name) in known] for known in (EASTING, NORTHING, ELEVATION)]
         if all(len(found) == 1 for found in axes):
             own = {found[0]: axis for axis, found in zip(POSITION, axes)}
             columns = {own.get(name, name): k for k, name in enumerate(names) if k or not named}
@@ -98,6 +102,19 @@ def text_layout(path: Path) -> TextLayout:
     )
 
 
+def _encoding(path: Path) -> str:
+    """That of a text whose first lines are UTF-8 or UTF-16, as spreadsheets write it; else of western Europe."""
+    with open(path, "rb") as file:
+        begin = file.read(1 << 16)
+    if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
+    try:
+        codecs.getincrementaldecoder("utf-8")().decode(begin)
+    except UnicodeDecodeError:
+        return "cp1252"
+    return "utf-8-sig"
+
+
 def text_notes(path: Path) -> list[str]:
     """What a user should know of how a file of text was read, a sentence each; none for any other file."""
     return text_layout(path).notes if path.suffix.lower() in TEXTS else []
@@ -110,7 +127,7 @@ def text_parts(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
         ValueError: a row that is none, or is of another length.
     """
     layout = text_layout(path)
-    with open(path, encoding="utf-8-sig") as file:
+    with open(path, encoding=_encoding(path)) as file:
         lines = islice(file, layout.above, None)
         first = layout.above + 1
         while some := list(islice(lines, at_once)):
@@ -121,6 +138,17 @@ def text_parts(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
                     raise ValueError(f"{error}, rows counted from line {first}") from None
                 yield {name: rows[:, k] for name, k in layout.columns.items()}
             first += len(some)
+
+
+def _names(above: list[str], separator: str | None, columns: int) -> list[str]:
+    """The names in the nearest line above the rows that has one for each column; else those in the last line."""
+    lines = [_titles(line, separator) for line in reversed(above)]
+    return next((names for names in lines if len(names) == columns), lines[0] if lines else [])
+
+
+def _plain(name: str) -> str:
+    """A column's name in lower case and without its unit: `N [m]`, `E_m`."""
+    return re.sub(r"[\s_]*(\[\w+\]|\(\w+\)|_m)$", "", name.strip()).lower()
 
 
 def _titles(line: str, separator: str | None) -> list[str]:
@@ -222,7 +250,8 @@ def _separator(line: str) -> str | None:
 
 def _numbers(line: str, named: bool = False) -> list[float]:
     """The numbers of a line of numbers, with a name before them or not; none of any other."""
-    cells = line.split(_separator(line))
+    mark = _separator(line)
+    cells = (line.rstrip().removesuffix(mark) if mark else line).split(mark)
     try:
         return [float(cell) for cell in cells[int(named) :]]
     except ValueError:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.io.clouds import Cloud, plane_normals, read_cloud, write_cloud
 from scenefuse.report.render import point_radii
 from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH
 from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
@@ -190,13 +190,21 @@ def _log_bytes(values: NDArray[np.float32]) -> tuple[Bytes, Bytes, list[float]]:
 
 
 def _shade(cloud: Cloud) -> Array:
-    """(N,) brightness from DARKEST to 1: the mean of the light on the normals and of the photo colours' brightness."""
+    """(N,) brightness from DARKEST to 1: the mean of the light on the normals and of the photo colours' brightness.
+
+    Where there is neither, that of the light on local planes, from either side.
+    """
     parts = []
     if cloud.normals is not None:
         parts.append(np.clip(0.4 + 0.7 * (_smooth(cloud.points, cloud.normals) @ LIGHT), 0, 1))
     if cloud.colors is not None:
         parts.append(cloud.colors @ np.array([0.299, 0.587, 0.114]) / 255)
-    return DARKEST + (1 - DARKEST) * np.mean(parts, axis=0) if parts else np.ones(len(cloud))
+    if not parts and len(cloud) < _SMOOTHED:
+        return np.ones(len(cloud))
+    if not parts:
+        nearest = cKDTree(cloud.points).query(cloud.points, k=_SMOOTHED, workers=threads())[1]
+        parts = [np.clip(np.abs(plane_normals(cloud.points, nearest) @ LIGHT), 0, 1)]
+    return DARKEST + (1 - DARKEST) * np.mean(parts, axis=0)
 
 
 def _smooth(points: Array, normals: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -1,0 +1,5 @@
+"""`python -m scenefuse`: the command `scenefuse`."""
+
+from scenefuse.command_line import main
+
+main()
