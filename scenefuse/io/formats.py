@@ -247,20 +247,23 @@ def _e57(path: Path) -> Columns:
 
 
 def _e57_parts(path: Path, at_once: int) -> Iterator[Columns]:
-    """The same, so many points at a time; colours where every scan has them."""
+    """The same, so many points at a time; colours and intensities where every scan has them."""
     import pye57
 
     file = pye57.E57(str(path))
     try:
         scans = [pye57.ScanHeader(node) for node in file.data3d]
-        colored = all("colorRed" in header.point_fields for header in scans)
+        with_colors, with_intensity = ([name in h.point_fields for h in scans] for name in ("colorRed", "intensity"))
+        if any(with_colors) and not all(with_colors):
+            said = f"{with_colors.count(False)} of the {len(scans)} scans of {path.name} have no colours"
+            print(f"note: {said}: none are read", flush=True)
         for header in scans:
-            yield from _e57_scan(file, header, colored, at_once)
+            yield from _e57_scan(file, header, all(with_colors), all(with_intensity), at_once)
     finally:
         file.close()
 
 
-def _e57_scan(file: Any, header: Any, colored: bool, at_once: int) -> Iterator[Columns]:
+def _e57_scan(file: Any, header: Any, colored: bool, measured: bool, at_once: int) -> Iterator[Columns]:
     """One scan in the file's frame, read as float64: pye57's own reader fails on colours above 255."""
     from pye57 import libe57
 
@@ -268,7 +271,8 @@ def _e57_scan(file: Any, header: Any, colored: bool, at_once: int) -> Iterator[C
     cartesian = ("cartesianX", "cartesianY", "cartesianZ")
     color = ("colorRed", "colorGreen", "colorBlue") if colored else ()
     states = ("cartesianInvalidState", "sphericalInvalidState")
-    wanted = [name for name in (*cartesian, *spherical, *color, *states) if name in header.point_fields]
+    more = ("intensity",) if measured else ()
+    wanted = [name for name in (*cartesian, *spherical, *color, *more, *states) if name in header.point_fields]
     buffer = {name: np.empty(min(header.point_count, at_once)) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, values in buffer.items():
@@ -285,6 +289,7 @@ def _e57_scan(file: Any, header: Any, colored: bool, at_once: int) -> Iterator[C
             state = states[1]
         found = dict(zip(POSITION, (points @ turn.T + shift).T))
         found |= {name: columns[own].astype(np.uint16) for name, own in zip(COLOR, color)}
+        found |= {name: columns[name].astype(np.float32) for name in more}
         valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
         yield {name: values[valid] for name, values in found.items()}
 

@@ -55,13 +55,14 @@ def write_page(page: Path, content: dict[str, Any], picture: Path, done: Complet
     badge = f'<span class="badge {"ok" if status == "registered" else "no"}">{escape(status)}</span>'
     parts = [f"<h1>{escape(title)}{badge}</h1>", f"<p>{escape(value(content, 'reason'))}</p>"]
     if done is None:
-        parts.append("<p>The pose was refused, so there is no completed scene.</p>")
+        parts.append(f"<p>The pose was refused, so there is no completed scene. {escape(value(content, 'next'))}.</p>")
     else:
         scene_points = inputs["scene_points"] - len(done.gone)
         parts += [_told(done, scene_points), view_section("scene", title, view_of(names[0], done, up))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
+    parts += [f"<p>Note: {escape(note)}.</p>" for note in value(content, "notes")]
     parts.append(_table(content))
     if "scene_from_object" in content:
         rows = "\n".join(" ".join(f"{cell:.17g}" for cell in row) for row in value(content, "scene_from_object"))

@@ -25,7 +25,7 @@ from scenefuse.registration.register import (
     search_box,
     summary,
 )
-from scenefuse.stage import StageError, atomic_file, quantity, write_json
+from scenefuse.stage import StageError, atomic_file, quantity, value, write_json
 from scenefuse.transforms import Array, Sim3
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
@@ -117,11 +117,13 @@ def register(
         "version": quantity(VERSION, ""),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
+    if not found.registered:
+        content["next"] = quantity(_advice(known), "")
     written = [out / "transform.json"]
     write_json(written[0], content)
     print("\n".join(summary(found, given.searched, given.ups, evidence)), flush=True)
     if not found.registered:
-        print(f"next       {_advice(known)}", flush=True)
+        print(f"next       {value(content, 'next')}", flush=True)
     written += _write(out, format, given, found, scene, seed)
     if fuse:
         written += _fuse(out, given, found, content, known, config)

@@ -81,6 +81,12 @@ def test_e57_points_that_are_marked_invalid_are_left_out(tmp_path, cloud):
     assert np.array_equal(found.colors, cloud.colors[state == 0])
 
 
+def test_intensities_of_e57_are_read(tmp_path, cloud):
+    bright, still = np.linspace(0, 1, 40).astype(np.float32), np.array([1.0, 0, 0, 0])
+    write_e57(tmp_path / "a.e57", [(cloud.points - UTM, cloud.colors, still, UTM)], intensity=bright)
+    assert np.allclose(read_cloud(tmp_path / "a.e57").fields["intensity"], bright)
+
+
 def test_e57_in_spherical_coordinates_with_sixteen_bit_colours(tmp_path):
     rng = np.random.default_rng(0)
     columns = {
