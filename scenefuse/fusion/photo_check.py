@@ -26,9 +26,9 @@ MOST_DEVIATION = 1.2
 measure nothing, sky and blank walls above all."""
 MOST_PHOTOS = 64
 """Photos of one side that points are checked in at most: from the most different directions."""
-ENOUGH, USEFUL = 12, 0.5
-"""Of these, photos that have a place in their picture, if there are so many; a photo is as good as the best one that
-shows this share of what that one shows of places that have not."""
+ENOUGH, USEFUL = (3, 6, 12), 0.5
+"""Of these, photos that have a place in their picture, all places first three; a photo is as good as the best one that
+shows this share of what that one shows of places that have not yet."""
 HALVINGS = 1
 """How often a point that photos match nowhere near is tried again in photos of half the size."""
 SEEN_SHARE = 0.02
@@ -112,7 +112,7 @@ def read_photos(workspace: Workspace, points: Array) -> Photos:
 
 
 def covering(shown: NDArray[np.bool_], centres: Array, points: Array, most: int) -> NDArray[np.int64]:
-    """Rows of photos, sorted: every point is in ENOUGH of them where it can be, from the most different directions.
+    """Rows of photos, sorted: every point is in enough of them where it can be, from the most different directions.
 
     Args:
         shown: (V, N), which photos have which points in their picture; each has one.
@@ -125,7 +125,11 @@ def covering(shown: NDArray[np.bool_], centres: Array, points: Array, most: int)
     chosen: list[int] = []
     nearest, times = np.full(len(shown), -np.inf), np.zeros(len(points), dtype=np.int64)
     while len(chosen) < min(most, len(shown)):
-        gain = (shown & (times < ENOUGH)).sum(1)
+        left = np.delete(np.arange(len(shown)), chosen)
+        lacking = next(
+            (times < many for many in ENOUGH if shown[left][:, times < many].any()), np.zeros(len(points), bool)
+        )
+        gain = (shown & lacking).sum(1)
         gain[chosen] = -1
         # Of photos that show about as much of what few have shown, the one from where none was taken.
         worth = np.where(gain >= USEFUL * gain.max(), nearest, np.inf)

@@ -72,7 +72,7 @@ def refine_by_photos(
     device = "cuda" if torch.cuda.is_available() else "cpu"
     window = settings.match_window_px
     photos = [_gray(views.view(index), poses[index]) for index in range(len(depths))]
-    sources = _sources(views, poses, depths)
+    sources = choose_sources(views, poses, depths)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows) == 0:
@@ -101,7 +101,7 @@ def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
     return replace(view, pixels=pixels, intrinsics=intrinsics, width=pixels.shape[1], height=pixels.shape[0])
 
 
-def _sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> NDArray[np.int64]:
+def choose_sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> NDArray[np.int64]:
     """(V, S) for each photo those that show most of what it shows, from about 15 degrees beside it; the best first."""
     places = np.full((len(depths), PLACES, 3), np.nan)
     for index, depth in enumerate(depths):

@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
+from scenefuse.fusion.photo_check import covering
 from scenefuse.masks.box import Ground
 from scenefuse.masks.segmentation import MaskSettings, score_masks
+from scenefuse.mvs.photo_refinement import choose_sources
 from scenefuse.mvs.visual_hull import Box, Outline, least_framing
 from scenefuse.nerf.volume import find_volume
 from scenefuse.registration.crop.vote import Masked, vote
@@ -129,3 +131,39 @@ def test_how_many_photos_frame_a_place():
     assert least_framing(photos, own) == np.ceil(0.3 * 16)
     assert least_framing(photos[:16], own) == least_framing(photos[:16], own[:5]) == np.ceil(0.3 * 16)
     assert least_framing(photos, own[:5]) == np.ceil(0.3 * 76 / 3)  # of few points nothing is known
+
+
+def test_photos_that_are_asked_together_have_all_of_a_facade():
+    photos, points = along_a_facade(), surface(FACADE)
+    points = points[points[:, 1] < 0.1]
+    shown = np.zeros((len(photos), len(points)), bool)
+    for row, view in zip(shown, photos):
+        row[view.visible(points)[0]] = True
+    centres = np.array([view.centre for view in photos])
+    chosen = covering(shown, centres, points, 36)
+    often = shown.sum(0) >= 6
+    assert len(chosen) == 36 and (shown[chosen].sum(0)[often] >= 3).all()
+    # Where all photos have all of it, directions decide: none is far from one that was chosen.
+    ring = [photo(f"{k}", ring_of(k, 40), (0, 0, 0.95), 65, STATUE).centre for k in range(40)]
+    chosen = covering(np.ones((40, len(points)), bool), np.array(ring), np.zeros((len(points), 3)), 20)
+    assert np.abs(np.subtract.outer(np.arange(40), chosen)).min(1).max() <= 1
+
+
+def ring_of(k, count):
+    return ring(k, count, 4.0, 1.6)
+
+
+def test_depths_are_refined_with_photos_that_show_the_same_place():
+    """A wall whose photos are taken along it: the farthest ones of eight must still show what the photo shows."""
+    photos = [photo(f"{x:.1f}", (x, -10.0, 4.0), (x, 0.0, 4.0), 40, FACADE) for x in np.arange(-15, 15.1, 0.75)]
+    depths = np.stack([np.where(view.pixels, 10.0, 0).astype(np.float32) for view in photos])
+    views = SimpleNamespace(
+        view=lambda k: photos[k],
+        intrinsics=np.stack([view.intrinsics for view in photos]),
+        sizes=np.array([[120, 160]]),
+    )
+    poses = np.stack([view.world_from_cam for view in photos])
+    for index, chosen in enumerate(choose_sources(views, poses, depths)):
+        apart = np.abs(poses[chosen, 0, 3] - poses[index, 0, 3])
+        # A photo shows 7.3 m of the wall, and 15 degrees beside it are 2.7 m.
+        assert apart.max() < 7 and np.abs(apart - 2.7).min() < 0.5
