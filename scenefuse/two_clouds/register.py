@@ -192,16 +192,23 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
 
 def _notes(object: Path, scene: Path) -> list[str]:
     """What a user should know of the coordinate systems of both files."""
-    own_text, scene_text = las_crs(object), las_crs(scene)
-    if own_text is None:
+    texts = las_crs(object), las_crs(scene)
+    if texts == (None, None):
         return []
     import pyproj
 
-    own, other = pyproj.CRS.from_wkt(own_text), None if scene_text is None else pyproj.CRS.from_wkt(scene_text)
-    if own == other:
-        return []
+    own, other = (None if text is None else pyproj.CRS.from_wkt(text) for text in texts)
+    notes = [
+        f"{path} counts its plane in {units[0]} and its heights in {units[-1]}, as its CRS says: no turned object fits;"
+        " bring both into one unit"
+        for path, crs in ((object, own), (scene, other))
+        if crs is not None and len(set(units := [axis.unit_name for axis in crs.axis_info])) > 1
+    ]
+    if own is None or own == other:
+        return notes
     there = "names no CRS" if other is None else f"is in {other.name}"
-    return [f"{object} is in {own.name}, which is not used: its points are laid on those of {scene}, which {there}"]
+    said = f"{object} is in {own.name}, which is not used: its points are laid on those of {scene}, which {there}"
+    return [*notes, said]
 
 
 def _write(out: Path, format: str, given: Given, found: Registration, scene: Path, seed: int) -> list[Path]:

@@ -351,6 +351,11 @@ def test_text_as_programs_write_it(tmp_path, content, colored):
     assert (found.colors is not None) == colored and (not colored or found.colors[0].tolist() == [10, 20, 30])
 
 
+def test_pts_of_several_scans_is_one_cloud(tmp_path):
+    (tmp_path / "a.pts").write_text(("2\n1 2 3 -900 10 20 30\n4 5 6 -800 10 20 30\n") * 3)
+    assert read_cloud(tmp_path / "a.pts").points.tolist() == [[1, 2, 3], [4, 5, 6]] * 3
+
+
 @pytest.mark.parametrize("encoding", ["cp1252", "utf-16", "utf-8-sig"])
 def test_text_in_other_encodings(tmp_path, encoding):
     (tmp_path / "a.csv").write_text("Punkt;Rechtswert;Hochwert;Höhe\n" + "7;1;2;3\n9;4;5;6\n" * 2, encoding=encoding)

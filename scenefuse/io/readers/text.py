@@ -49,6 +49,8 @@ class TextLayout:
         """(N, C) numbers of lines that are rows."""
         # A name counts as a number, so that rows of another length are still an error.
         first_cell: Any = {0: lambda name: 0.0} if self.named else None
+        # PTS of several scans counts the points of each one in a line of its own.
+        lines = [line for line in lines if self.separator or len(line.split()) != 1]
         # Some programs end each row with a separator.
         if self.separator and any(line.rstrip().endswith(self.separator) for line in lines[:1]):
             lines = [line.rstrip().removesuffix(self.separator) for line in lines]
