@@ -89,7 +89,7 @@ def init(
 def _name(path: Path) -> str:
     """A name for the tables from that of a file or folder; letters lose their accents."""
     letters = "".join(a for a in unicodedata.normalize("NFKD", _stem(path)) if not unicodedata.combining(a))
-    return re.sub(r"[^A-Za-z0-9_-]+", "_", letters).lstrip("-") or "_"
+    return re.sub(r"[^A-Za-z0-9_-]+", "_", letters).strip("-_") or "_"
 
 
 def _stem(path: Path) -> str:
