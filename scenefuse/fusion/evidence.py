@@ -109,8 +109,8 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
 
     A point is measured where three photos of its own side confirm it, and most of its neighbours; a scene's point also
     where three of the object's do. A side without photos is judged by the other's. Measured points are the surface
-    that hides and is seen. What photos see through is not there (a measured point of the scene where a larger share of
-    the photos that it is open to see through it than of those asked confirm it), nor what no photo can see, nor what
+    that hides and is seen. What photos see through is not there (a measured point where a larger share of the photos
+    that it is open to see through it than of those asked confirm it), nor what no photo can see, nor what
     the object's photos match clearly better elsewhere. Where both sides measured a place, the object's points stay
     unless the scene's standard deviation is clearly smaller; a clearly denser scene stays unless the object's is. What
     the scene measured goes only where something is left beside it.
@@ -144,7 +144,7 @@ def weigh(obj: Side, scene: Side, nerf_only: bool, certain: float | None = None,
     reason[is_seen_through(seen, sure, on_scene)] = SEEN_THROUGH
     left = on_scene & (reason == KEPT)
     behind = _seen(obj.cloud.points, concatenate([surface, scene.cloud[left]]), obj, scene, diagonal)
-    contradicted = behind.through >= LEAST_THROUGH
+    contradicted = np.where(on_obj, is_seen_through(behind, of_obj, on_obj), behind.through >= LEAST_THROUGH)
     added = on_obj & ~contradicted
     worse, better = compare(obj.cloud, of_obj.deviation, added, scene.cloud, sure.deviation, left, diagonal, share)
     reason[(reason == KEPT) & worse] = REPLACED
