@@ -3,7 +3,7 @@
 import codecs
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -35,6 +35,7 @@ class TextLayout:
         above: lines before the first row.
         separator: of numbers; None for blanks.
         named: whether a name stands before the numbers of every row.
+        counted: whether a line of its own may count the points of each scan, as in PTS.
         columns: the names of those that are read -> where they stand in a row.
         notes: what was guessed and what is left out, a sentence each.
     """
@@ -42,6 +43,7 @@ class TextLayout:
     above: int = 0
     separator: str | None = None
     named: bool = False
+    counted: bool = False
     columns: dict[str, int] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -49,8 +51,8 @@ class TextLayout:
         """(N, C) numbers of lines that are rows."""
         # A name counts as a number, so that rows of another length are still an error.
         first_cell: Any = {0: lambda name: 0.0} if self.named else None
-        # PTS of several scans counts the points of each one in a line of its own.
-        lines = [line for line in lines if self.separator or len(line.split()) != 1]
+        if self.counted:
+            lines = [line for line in lines if not line.strip().isdecimal()]
         # Some programs end each row with a separator.
         if self.separator and any(line.rstrip().endswith(self.separator) for line in lines[:1]):
             lines = [line.rstrip().removesuffix(self.separator) for line in lines]
@@ -77,18 +79,18 @@ def text_layout(path: Path) -> TextLayout:
         if not "".join(head).strip():
             return TextLayout(columns=dict(zip(POSITION, range(3))))
         above, named = _first_row(path, head)
-        begin = TextLayout(above, _separator(head[above]), named)
+        begin = TextLayout(above, _separator(head[above]), named, path.suffix.lower() == ".pts")
         rows = begin.rows(head[above:] + list(islice(file, LOOKED_AT)))
     names = _names(head[:above], begin.separator, rows.shape[1])
     if len(names) == rows.shape[1]:
         if set(POSITION) <= {common_name(name) for name in names}:
-            return TextLayout(above, begin.separator, named, {name: k for k, name in enumerate(names)})
+            return replace(begin, columns={name: k for k, name in enumerate(names)})
         axes = [[name for name in names if _plain(name) in known] for known in (EASTING, NORTHING, ELEVATION)]
         if all(len(found) == 1 for found in axes):
             own = {found[0]: axis for axis, found in zip(POSITION, axes)}
             columns = {own.get(name, name): k for k, name in enumerate(names) if k or not named}
             said = f"{path.name}: {', '.join(f'{axis} is {name}' for name, axis in own.items())}"
-            return TextLayout(above, begin.separator, named, columns, [said])
+            return replace(begin, columns=columns, notes=[said])
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
@@ -99,9 +101,7 @@ def text_layout(path: Path) -> TextLayout:
         title = head[above - 1].strip()[:60]
         notes.append(f"{path.name}: '{title}' names no columns x, y, z; the first three are these")
     columns, guessed = _unnamed(path, rows[:, first:])
-    return TextLayout(
-        above, begin.separator, named, {name: first + k for name, k in columns.items()}, [*notes, *guessed]
-    )
+    return replace(begin, columns={name: first + k for name, k in columns.items()}, notes=[*notes, *guessed])
 
 
 def _encoding(path: Path) -> str:
