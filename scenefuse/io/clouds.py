@@ -43,6 +43,10 @@ NEIGHBOURS, ALONE, LONELY, FEW = 8, 0.02, 10.0, 0.1
 largest share of all points that strays are."""
 
 
+AT_ONCE = 1 << 18
+"""Points whose neighbours are held at once."""
+
+
 UNIT_TOLERANCE = 0.05
 """Normals may be this far from unit length."""
 
@@ -236,7 +240,8 @@ def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     far = ((points < low - (high - low).max()) | (points > high + (high - low).max())).any(1)
     near = np.flatnonzero(~far)
     if len(near) > NEIGHBOURS:
-        away = cKDTree(points[near]).query(points[near], k=NEIGHBOURS + 1, workers=threads())[0][:, -1]
+        tree, parts = cKDTree(points[near]), np.array_split(points[near], 1 + len(near) // AT_ONCE)
+        away = np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
         far[near] = away > max(ALONE * float(np.linalg.norm(high - low)), LONELY * float(np.median(away)))
     return far if far.mean() <= FEW else np.zeros(len(points), dtype=bool)
 
