@@ -347,7 +347,7 @@ class LasLayout:
         import laspy
         import pyproj
 
-        header = laspy.LasHeader(point_format=7, version="1.4")
+        header = laspy.LasHeader(point_format=6 if like.colors is None else 7, version="1.4")
         header.generating_software = f"scenefuse {VERSION}"
         low, high = box
         if crs is not None:

@@ -110,6 +110,7 @@ class Registration:
         origins: the (3,) points subtracted from the object's and the scene's coordinates.
         scales: the scale prior.
         agreement: fitness, RMSE and normals at the best pose; see `registration_metrics`.
+        unit: of the scene's lengths.
     """
 
     registered: bool
@@ -119,6 +120,7 @@ class Registration:
     origins: tuple[Array, Array]
     scales: ScaleRange
     agreement: dict[str, dict[str, Any]]
+    unit: str = "scene units"
 
 
 def register_clouds(
@@ -129,6 +131,7 @@ def register_clouds(
     *,
     ups: tuple[Array, Array] | None = None,
     scales: ScaleRange | None = None,
+    unit: str = "scene units",
 ) -> Registration:
     """Find where an object lies in a scene: scale, coarse and fine registration as in the workflow, and the gate.
 
@@ -139,6 +142,7 @@ def register_clouds(
         seed: of all random choices.
         ups: up directions in the object's and in the scene's frame; None where one of them is not known.
         scales: scene units per object unit; None to estimate them from both extents.
+        unit: what the scene's lengths are counted in, for the report.
 
     Raises:
         StageError: too few different points, or all in one place or along one line, on either side.
@@ -158,10 +162,10 @@ def register_clouds(
     outcome = refine_hypotheses(problem, [(hypothesis.pose, hypothesis.source) for hypothesis in found], settings.fine)
     pose, diagonal = outcome.ranked[0].pose, near_scene.diagonal
     tau = settings.agreement.tau_fraction * diagonal
-    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, "scene units")
+    agreement = registration_metrics(near_obj, near_scene, pose, tau, diagonal, unit)
     whole = Sim3(1.0, np.eye(3), origins[1]) @ pose @ Sim3(1.0, np.eye(3), -origins[0])
     return Registration(
-        outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement
+        outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement, unit
     )
 
 
@@ -236,7 +240,7 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
     pose, outcome = found.scene_from_object, found.outcome
     if pose is not None and outcome is not None:
         best, decision = outcome.ranked[0], outcome.decision
-        unit = "scene units per object unit"
+        unit = f"{found.unit} per object unit"
         content |= pose_quantities(best)
         content |= {
             "scene_from_object": quantity(pose.matrix, ""),
@@ -244,7 +248,7 @@ def report(found: Registration, ups: tuple[Array, Array] | None) -> dict[str, An
             "scale_prior": quantity([found.scales.clamp(0.0), found.scales.clamp(np.inf)], unit),
             "margin": quantity(decision.margin, "1"),
             "free_axis": quantity(decision.free_axis, ""),
-            **uncertainty_quantities(outcome.stated, "scene units"),
+            **uncertainty_quantities(outcome.stated, found.unit),
             "tilt_deg": quantity(tilt_deg(best.pose, ups), "deg"),
             "gravity_used": quantity(ups is not None, ""),
             "agreement": found.agreement,
@@ -267,7 +271,7 @@ def summary(found: Registration, searched: str, ups: tuple[Array, Array] | None,
     low, high = found.scales.clamp(0.0), found.scales.clamp(np.inf)
     held = f"held at {low:.6g}" if found.scales.width == 0 else f"searched from {low:.4g} to {high:.4g}"
     scale = (
-        "" if found.scene_from_object is None else f"{found.scene_from_object.scale:.6g} scene units per object unit, "
+        "" if found.scene_from_object is None else f"{found.scene_from_object.scale:.6g} {found.unit} per object unit, "
     )
     lines.append(f"scale      {scale}{held}")
     lines.append(f"evidence   {evidence}")

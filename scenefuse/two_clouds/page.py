@@ -39,12 +39,15 @@ ROWS = {
 """Quantities of transform.json that the page lists."""
 
 
-def write_page(page: Path, content: dict[str, Any], picture: Path, done: Completed | None, up: Array | None) -> None:
+def write_page(
+    page: Path, content: dict[str, Any], unit: str, picture: Path, done: Completed | None, up: Array | None
+) -> None:
     """Write one HTML file that needs no other and no network.
 
     Args:
         page: output.
         content: of transform.json.
+        unit: of the scene's lengths.
         picture: of the alignment; left out where no pose was found.
         done: the scene completed; None where the pose was refused.
         up: (3,) unit up direction in the scene; z where it is not known.
@@ -58,7 +61,7 @@ def write_page(page: Path, content: dict[str, Any], picture: Path, done: Complet
         parts.append(f"<p>The pose was refused, so there is no completed scene. {escape(value(content, 'next'))}.</p>")
     else:
         scene_points = inputs["scene_points"] - len(done.gone)
-        parts += [_told(done, scene_points), view_section("scene", title, view_of(names[0], done, up))]
+        parts += [_told(done, scene_points), view_section("scene", title, view_of(names[0], done, up, unit))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
@@ -72,7 +75,7 @@ def write_page(page: Path, content: dict[str, Any], picture: Path, done: Complet
         temporary.write_text(document(title, parts, done is not None), encoding="utf-8")
 
 
-def view_of(name: str, done: Completed, up: Array | None) -> View:
+def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
     level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
     added = done.added if len(done.added) else done.near
@@ -91,7 +94,7 @@ def view_of(name: str, done: Completed, up: Array | None) -> View:
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
     told = {done.source: f"added from {name}"}
     sources = {0: "scene"} | {code: told.get(code, f"{code} in the scene") for code in found}
-    return View(thinned, sources, "scene units", low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
+    return View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
 
 
 def _told(done: Completed, scene_points: int) -> str:

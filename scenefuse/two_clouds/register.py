@@ -13,6 +13,7 @@ from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.cloud_file import CloudFile
 from scenefuse.io.clouds import Cloud, has_unit_normals, without_strays, write_cloud, write_laz
 from scenefuse.io.formats import las_crs
+from scenefuse.io.import_cloud import unit_and_name
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.register import (
     Known,
@@ -105,7 +106,9 @@ def register(
         print(f"note       {note}", flush=True)
     if scales is not None:
         _check_size(scales, given)
-    found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales)
+    crs = las_crs(scene)
+    unit = "scene units" if crs is None else unit_and_name(crs)[0]
+    found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": given.scene.total}
     content = report(found, given.ups) | {
@@ -264,5 +267,5 @@ def _fuse(
         done = complete(given.object, given.scene, pose, fusion_settings(config), around)
         written += write_completed(out, done, inputs["object"], given.scene)
     page = out / "report.html"
-    write_page(page, content, out / "picture.png", done, known.ups()[1])
+    write_page(page, content, found.unit, out / "picture.png", done, known.ups()[1])
     return [*written, page]

@@ -2,6 +2,7 @@
 
 import sys
 import tracemalloc
+from dataclasses import replace
 
 import laspy
 import numpy as np
@@ -115,6 +116,13 @@ def test_without_a_crs_and_for_few_or_equal_points(tmp_path):
         with laspy.CopcReader.open(path) as file:
             assert file.header.global_encoding.wkt
             assert np.allclose(np.sort(places(file.query()), axis=0), np.sort(points, axis=0), atol=1e-9)
+
+
+def test_a_cloud_without_colours_has_no_black_ones(tmp_path, small_nodes):
+    cloud = replace(ground(3000), colors=None)
+    las = laspy.read(written(tmp_path, cloud))
+    assert "red" not in las.point_format.dimension_names and len(las.points) == 3000
+    assert np.array_equal(np.sort(las["source"]), cloud.fields["source"])
 
 
 def test_a_stray_far_away_costs_digits_and_is_named(tmp_path, capsys):

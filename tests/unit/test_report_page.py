@@ -161,7 +161,7 @@ def test_a_scene_of_kilometres_fills_its_view(browser, page):
 def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
     pictures = {}
     for mode, words in {
-        "Photo": "Colours of the photos",
+        "Colours": "The points' own colours",
         "Source": "added",
         "Class": "not measured: of the NeRF, or a given cloud",
         "Std. deviation": "0.049 m",
@@ -179,7 +179,7 @@ def test_every_way_of_colouring_changes_the_picture_and_has_its_legend(opened):
 
 def test_colours_whose_fields_are_absent_are_not_offered(opened):
     labels = opened.find("[aria-label='3D view of shed'] .colour").text
-    assert "Photo" in labels and "Source" in labels
+    assert "Colours" in labels and "Source" in labels
     assert "Class" not in labels and "deviation" not in labels
 
 

@@ -312,7 +312,7 @@ def test_a_place_in_the_shade_is_shown_brighter_and_says_so(capture, tmp_path):
         (capture / name).write_bytes(content)
     view = read_view(tmp_path / "figures")
     assert view.brighter == 4 and view.cloud.colors.max() == 4 * dark
-    assert "Colours of the photos, 4.0 x as bright" in view_section("object-box", "box", view)
+    assert "The points' own colours, 4.0 x as bright" in view_section("object-box", "box", view)
 
 
 def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(capture, tmp_path):

@@ -96,7 +96,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
         brighter = "" if view.brighter == 1 else f", {view.brighter:.1f} x as bright"
-        modes.append({"name": "photo", "button": "Photo", "label": f"Colours of the photos{brighter}"})
+        modes.append({"name": "photo", "button": "Colours", "label": f"The points' own colours{brighter}"})
     codes = sorted(set(view.sources) - {REMOVED})
     sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
