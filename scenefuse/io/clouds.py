@@ -28,6 +28,8 @@ LAS_DESCRIPTIONS = {
     "evidence": "1 measured; 0, 2, 3 not (README)",
 }
 """What fields mean, in the header of a LAS file: 32 bytes at most."""
+LENGTHS = {"deviation", "world_deviation"}
+"""Fields that are lengths, in the unit of the points."""
 
 
 FAR = 10.0

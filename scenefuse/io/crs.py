@@ -69,9 +69,15 @@ def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
     """A CRS as its register has it, where it does.
 
     Raises:
-        StageError: its heights have another unit than its plane, or it is neither projected nor geographic.
+        StageError: its heights have another unit than its plane, it is neither projected nor geographic, or its axes
+            are a mirror image of east and north.
     """
     crs = registered(crs)
+    if [axis.direction for axis in plane(crs).axis_info[:2]] == ["south", "west"]:
+        raise StageError(
+            f"{where}: the axes of the CRS {crs.name} point south and west, a mirror image of the ground; name its"
+            " variant with axes to the east and north, EPSG:5514 for EPSG:5513"
+        )
     units = {axis.unit_name for axis in crs.axis_info}
     if plane(crs).is_projected and len(units) > 1:
         raise StageError(
@@ -86,9 +92,8 @@ def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
 
 def registered(crs: pyproj.CRS) -> pyproj.CRS:
     """A CRS as its register has it, where it does: older WKT does not say where it is used."""
-    if crs.is_bound and crs.source_crs is not None:
-        crs = crs.source_crs  # Older WKT names a way to WGS84 as well; PROJ knows better ones.
-    known = crs.to_epsg()
+    # Older WKT names a way to WGS84 as well; for a CRS of its register PROJ knows better ones.
+    known = (crs.source_crs if crs.is_bound and crs.source_crs is not None else crs).to_epsg()
     return crs if known is None else pyproj.CRS.from_epsg(known)
 
 
@@ -98,8 +103,9 @@ def plane(crs: pyproj.CRS) -> pyproj.CRS:
 
 
 def unit_m(crs: pyproj.CRS) -> float:
-    """Metres in the unit of a projected CRS and of its heights; 1 for a geographic one."""
-    return 1.0 if plane(crs).is_geographic else float(plane(crs).axis_info[0].unit_conversion_factor)
+    """Metres in the unit of a CRS's heights, which is that of its plane too where it is projected."""
+    axes = crs.axis_info if len(crs.axis_info) > 2 else [] if plane(crs).is_geographic else crs.axis_info
+    return float(axes[-1].unit_conversion_factor) if axes else 1.0
 
 
 def grid_name(crs: pyproj.CRS) -> str:
@@ -156,7 +162,8 @@ def _in_area(crs: pyproj.CRS, degrees: Array, beyond_deg: float) -> np.ndarray:
     longitude, latitude = degrees.T
     good = np.isfinite(degrees).all(1) & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
     area = plane(crs).area_of_use
-    if area is None or area.west > area.east:
+    if area is None:
         return good
     good &= (latitude >= area.south - beyond_deg) & (latitude <= area.north + beyond_deg)
-    return np.asarray(good & (longitude >= area.west - beyond_deg) & (longitude <= area.east + beyond_deg))
+    wide = (area.east - area.west) % 360 or 360.0  # an area may lie on both sides of the antimeridian
+    return np.asarray(good & ((longitude - area.west + beyond_deg) % 360 <= wide + 2 * beyond_deg))

@@ -61,9 +61,12 @@ def import_scene_cloud(
     crs = crs_of(source, crs)
     unit, name = "scene units", None
     if crs is not None:
-        unit, name = unit_and_name(crs)
-        from scenefuse.io.crs import check_place
+        import pyproj
 
+        from scenefuse.io.crs import check_place, usable
+
+        usable(pyproj.CRS.from_user_input(crs), str(source))
+        unit, name = unit_and_name(crs)
         check_place(crs, sample, source)
     origin = near_origin(sample)
     shift = Sim3(1.0, np.eye(3), origin)

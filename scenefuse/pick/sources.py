@@ -10,7 +10,7 @@ from scenefuse.io.photo_files import frame_name, thin_out, upright_size
 from scenefuse.io.project import Project
 from scenefuse.pick.clicks import Kind, Sizes
 from scenefuse.pick.pictures import Picture
-from scenefuse.sfm.photos import photo_names
+from scenefuse.sfm.photos import photo_names, without_copies
 from scenefuse.stage import StageError, read_json
 
 OF_OBJECT: dict[Kind, str] = {
@@ -132,14 +132,14 @@ def object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dict
     """
     if source.is_file():
         return _video_pictures(source, results)
-    names = photo_names(source)
+    names, _ = without_copies(source, photo_names(source))
     chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
     return _pictures((frame_name(name), source / name) for name in chosen)
 
 
 def scene_pictures(source: Path, results: Path) -> dict[str, Picture]:
     """The photos of a scene by name; those that the workflow turned upright are the same to a person."""
-    return _pictures((name, source / name) for name in photo_names(source))
+    return _pictures((name, source / name) for name in without_copies(source, photo_names(source))[0])
 
 
 def _video_pictures(video: Path, results: Path) -> dict[str, Picture]:

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 
 from scenefuse.io.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
 from scenefuse.io.pictures import write_picture
-from scenefuse.sfm.photos import JPEG_QUALITY, inspect_photo, photo_names, photo_notes, save_upright, write_photos
+from scenefuse.sfm.photos import (
+    JPEG_QUALITY,
+    inspect_photo,
+    photo_names,
+    photo_notes,
+    save_upright,
+    without_copies,
+    write_photos,
+)
 from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads
 
 
@@ -62,10 +70,12 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
     turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
     more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
     notes = photo_notes(listed)
-    if kind == "photos" and len(listed) < (given := len(photo_names(source))):
-        notes.insert(
-            0, f"{len(listed)} of {given} photos are used, spread evenly (object.frames.max_frames, frame_step)"
-        )
+    if kind == "photos":
+        distinct, copies = without_copies(source, photo_names(source))
+        if len(listed) < len(distinct):
+            used = f"{len(listed)} of {len(distinct)} photos are used, spread evenly"
+            notes.insert(0, f"{used} (object.frames.max_frames, frame_step)")
+        notes += copies
     write_photos(photos, listed, frames, kind, notes, **more)
 
 
@@ -85,7 +95,7 @@ def sharpness(frame: NDArray[Any]) -> float:
 
 
 def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:
-    names = photo_names(source)
+    names, _ = without_copies(source, photo_names(source))
     flat: dict[str, str] = {}
     for name in (names[i] for i in thin_out(len(names), settings.frame_step, settings.max_frames)):
         stem = Path(frame_name(name)).stem

@@ -8,6 +8,7 @@ import numpy as np
 import pyproj
 from numpy.typing import NDArray
 
+from scenefuse.io.crs import unit_m
 from scenefuse.stage import value
 from scenefuse.transforms import Sim3, fit_sim3
 
@@ -136,12 +137,12 @@ class GridFrame:
         return np.asarray(x_in_local, dtype=np.float64) + self.origin
 
     def inverse(self, x_in_local: Array) -> Array:
-        """(N, 3) points of the frame to (N, 3) WGS84 latitude (deg), longitude (deg), and height as the file has it."""
+        """(N, 3) points of the frame to (N, 3) WGS84 latitude (deg), longitude (deg), and height, in metres."""
         assert self.crs is not None
         easting, northing, height = self.in_crs(x_in_local).T
         to_wgs84 = pyproj.Transformer.from_crs(self.crs, "EPSG:4326", always_xy=True)
         longitude, latitude = to_wgs84.transform(easting, northing)
-        return np.stack([latitude, longitude, height], axis=1)
+        return np.stack([latitude, longitude, height * unit_m(pyproj.CRS.from_user_input(self.crs))], axis=1)
 
 
 def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | None:

@@ -85,13 +85,13 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     Raises:
         StageError: the folder is missing or holds no photo, a photo cannot be decoded, or geo.txt is not well formed.
     """
-    names = photo_names(folder)
+    names, copies = without_copies(folder, photo_names(folder))
     positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
     with atomic_directory(upright) as temporary, ThreadPoolExecutor(threads()) as pool:
         stood = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
     turned = {p.name: orientation for p, orientation in stood if orientation != 1}
     listed = [p for p, _ in stood]
-    notes = photo_notes(listed)
+    notes = copies + photo_notes(listed)
     if positions is not None:
         listed = [replace(p, **place) for p, place in zip(listed, positions_of(names, positions, folder / GEO_FILE))]
         notes.append(
@@ -116,6 +116,28 @@ def photo_names(folder: Path) -> list[str]:
     if odd is not None:
         raise StageError(f"{odd!r} in {folder} has a name that lists and tables cannot hold; rename it")
     return names
+
+
+def without_copies(folder: Path, names: list[str]) -> tuple[list[str], list[str]]:
+    """Photos of which none is another's file again, byte for byte, and a note that names those left out.
+
+    A copy sees nothing that its original does not, but would count as one more photo that confirms it. The shortest
+    name stays.
+    """
+    by_size, first_of = dict[int, list[str]](), dict[str, str]()
+    for name in sorted(names, key=lambda name: (len(name), name)):
+        by_size.setdefault((folder / name).stat().st_size, []).append(name)
+    for alike in (group for group in by_size.values() if len(group) > 1):
+        kept = dict[str, str]()
+        for name in alike:
+            first = kept.setdefault(sha256(folder / name), name)
+            if first != name:
+                first_of[name] = first
+    if not first_of:
+        return names, []
+    copy = min(first_of)
+    note = f"{len(first_of)} photos are copies of others, byte for byte, and are left out ({copy} of {first_of[copy]})"
+    return [name for name in names if name not in first_of], [note]
 
 
 def orientations_in(content: Mapping[str, Any]) -> dict[str, int]:
@@ -202,6 +224,8 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             equivalent_mm, focal_mm = (
                 _number(taken.get(tag)) or None for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
             )
+            if image.mode == "F":
+                raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
             image.load()
             width, height = image.size
     except Exception as error:
@@ -217,17 +241,9 @@ def inspect_photo(folder: Path, name: str) -> Photo:
 
 
 def photo_notes(photos: list[Photo]) -> list[str]:
-    """What a person should know about a list of photos: repeated files, odd sizes."""
-    notes = []
-    first_of: dict[str, str] = {}
-    for photo in photos:
-        if photo.sha256 in first_of:
-            notes.append(f"{photo.name} is a copy of {first_of[photo.sha256]}")
-        first_of.setdefault(photo.sha256, photo.name)
+    """What a person should know about a list of photos: odd sizes."""
     sizes = {(p.width, p.height) for p in photos}
-    if len(sizes) > 1:
-        notes.append(f"the photos have {len(sizes)} different sizes")
-    return notes
+    return [f"the photos have {len(sizes)} different sizes"] if len(sizes) > 1 else []
 
 
 def write_photos(

@@ -227,6 +227,14 @@ def test_exact_close_ups_do_not_contradict_a_pose_in_a_scene_of_ordinary_gps(pai
     assert value(beside, "gps_shift_apart") == pytest.approx(5**0.5, abs=0.1)
 
 
+def test_a_flight_whose_base_was_off_does_not_contradict_the_pose(pair, tmp_path):
+    exact = positions(tmp_path, (2, 1, 0), noise_m=0.02, scene_sd_m=0.02)
+    assert value(aligned(tmp_path, *pair, **exact), "gps_miss") > 4
+    scene = read_json(exact["scene_json"])
+    write_json(exact["scene_json"], scene | {"gps_shift": quantity([2.0, 1.0, 30.0], "m")})
+    assert value(aligned(tmp_path, *pair, **exact), "gps_miss") < 3
+
+
 def test_gps_says_where_to_click_on_an_object_that_shares_nothing(pair, tmp_path):
     elsewhere = capture(tmp_path, "elsewhere", world(7), ring(6, 14, 12), 8)
     lost = aligned(tmp_path, pair[0], elsewhere, **positions(tmp_path, (9, 0, 0)))

@@ -125,6 +125,13 @@ def test_a_cloud_without_colours_has_no_black_ones(tmp_path, small_nodes):
     assert np.array_equal(np.sort(las["source"]), cloud.fields["source"])
 
 
+def test_lengths_of_points_are_in_the_unit_of_the_crs(tmp_path, small_nodes):
+    cloud, frame = ground(3000), LocalFrame(40.71, -74.0, 10.0, grid="EPSG:2263")
+    las = laspy.read(written(tmp_path, cloud, frame.in_crs, frame.crs))
+    feet = cloud.fields["deviation"][las["source"]] / 0.3048006
+    assert np.allclose(las["deviation"], feet, rtol=1e-5)
+
+
 def test_a_stray_far_away_costs_digits_and_is_named(tmp_path, capsys):
     points = np.random.default_rng(0).random((1000, 3))
     points[0] = [5e6, 0, 0]

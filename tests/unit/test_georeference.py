@@ -6,7 +6,8 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.sfm.geodesy import LocalFrame, local_frame, scene_frame
+from scenefuse.io.crs import read_crs, to_wgs84
+from scenefuse.sfm.geodesy import GridFrame, LocalFrame, local_frame, scene_frame
 from scenefuse.sfm.georeference import camera_poses, georegister
 from scenefuse.sfm.photos import Photo, write_photos
 from scenefuse.sfm.survey.placement import GeoreferenceSettings, fit_level, place_by_gps
@@ -54,6 +55,32 @@ def test_heights_of_a_crs_in_feet_are_in_feet_near_the_origin():
     frame, local = LocalFrame(40.7, -74.0, 100.0, grid="EPSG:2263"), np.array([[0.0, 0, 0], [3, 4, 5]])
     np.testing.assert_allclose(frame.crs_from_local().apply(local), frame.in_crs(local), atol=0.01)
     assert frame.in_crs(local)[0, 2] == pytest.approx(328.083, abs=1e-3)
+
+
+def test_heights_of_degrees_are_in_the_unit_of_their_vertical_part():
+    feet = read_crs("EPSG:4269+6360", "here")
+    assert to_wgs84(feet, np.array([[-74.0, 40.7, 100.0]]), "here")[0, 2] == pytest.approx(30.48006)
+    station = GridFrame("EPSG:2263+6360", np.array([1e6, 2e5, 0.0]))
+    assert station.inverse(np.array([[0.0, 0.0, 328.0833]]))[0, 2] == pytest.approx(100.0, abs=1e-3)
+
+
+def test_a_datum_that_only_a_proj_string_knows_is_not_lost():
+    bessel = "+proj=tmerc +lat_0=0 +lon_0=15 +k=0.9996 +x_0=500000 +y_0=-5000000 +ellps=bessel +units=m +no_defs"
+    place = np.array([[500_000.0, 320_000.0, 300.0]])
+    plain, moved = (
+        local_frame(to_wgs84(read_crs(text, "here"), place, "here")).inverse(np.zeros((1, 3)))[0]
+        for text in (bessel, f"{bessel} +towgs84=577.326,90.129,463.919,5.137,1.474,5.297,2.4232")
+    )
+    assert 30 < 111_000 * np.hypot(*(moved - plain)[:2]) < 300
+
+
+def test_places_beside_the_antimeridian_are_in_their_zone():
+    assert to_wgs84(read_crs("EPSG:32760", "here"), np.array([[826_000.0, 8_000_000.0, 0]]), "here")[0, 1] < -179
+
+
+def test_axes_that_mirror_the_ground_are_refused():
+    with pytest.raises(StageError, match="point south and west"):
+        read_crs("EPSG:5513", "here")
 
 
 def test_points_five_kilometres_away_are_projected_not_turned():

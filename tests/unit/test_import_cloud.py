@@ -149,6 +149,12 @@ def test_feet_are_called_by_their_name(tmp_path, cloud):
     assert value(imported_scene(tmp_path, tmp_path / "a.laz")[2], "length_unit") == "US survey foot"
 
 
+def test_a_plane_in_feet_with_heights_in_metres_is_refused(tmp_path, cloud):
+    source = write_as(tmp_path / "a.xyz", replace(cloud, points=cloud.points - cloud.points.mean(0) + [1e6, 2e5, 50]))
+    with pytest.raises(StageError, match="counts US survey foot and metre; give heights in the unit of the plane"):
+        imported_scene(tmp_path, source, "EPSG:2263+5703")
+
+
 def test_clouds_near_zero_keep_their_coordinates_at_any_size():
     points = np.random.default_rng(0).normal(size=(1000, 3)) + [2, 0, -1]
     assert np.array_equal(near_origin(points), np.zeros(3)) and np.array_equal(near_origin(1e-4 * points), np.zeros(3))

@@ -74,7 +74,8 @@ def test_copies_and_rotations_are_noted(tmp_path):
     save(tmp_path / "p" / "c.jpg", orientation=6)
     listed(tmp_path, tmp_path / "p")
     notes = value(read_json(tmp_path / "photos.json"), "notes")
-    assert notes[0] == "b.jpg is a copy of a.jpg"
+    assert notes[0] == "1 photos are copies of others, byte for byte, and are left out (b.jpg of a.jpg)"
+    assert [photo.name for photo in read_photos(tmp_path / "photos.json")] == ["a.jpg", "c.jpg"]
     assert "1 photos (c.jpg, ...) carry an EXIF rotation; upright copies" in notes[-1]
 
 

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import LasLayout
+from scenefuse.io.clouds import LENGTHS, LasLayout
 from scenefuse.io.tiles.tiled_cloud import AT_ONCE, TiledCloud
 from scenefuse.stage import StageError, atomic_file
 from scenefuse.transforms import Array
@@ -87,6 +87,7 @@ class _Source:
     @classmethod
     def of(cls, cloud: TiledCloud, in_crs: Callable[[Array], Array], layout: LasLayout) -> "_Source":
         """Goes through the cloud once, for the boxes of its tiles in the CRS."""
+        unit = np.float32(np.ptp(in_crs(np.array([[0, 0, 0], [0, 0, 1.0]]))[:, 2]))  # heights have no scale factor
 
         @lru_cache(TILES_HELD)
         def read(tile: int) -> Records:
@@ -99,7 +100,8 @@ class _Source:
                     f"{cloud.path}: points such as ({one}) lie so far from the origin that the scene's CRS has no"
                     " coordinates there: remove them from the scene's cloud"
                 )
-            records: Records = layout.records(replace(part, points=points)).array
+            fields = {name: values * unit if name in LENGTHS else values for name, values in part.fields.items()}
+            records: Records = layout.records(replace(part, points=points, fields=fields)).array
             return records
 
         places = (_places(read(tile)) for tile in range(len(cloud.low)))

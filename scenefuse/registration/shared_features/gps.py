@@ -11,7 +11,7 @@ from scenefuse.sfm.geodesy import LocalFrame, scene_frame
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.photos import gps_accuracies, gps_positions, read_photos
 from scenefuse.sfm.survey.placement import MIN_GPS_PHOTOS, GeoreferenceSettings, place_by_gps
-from scenefuse.stage import quantity, read_json
+from scenefuse.stage import quantity, read_json, value
 from scenefuse.transforms import Array, Sim3
 
 # Errors of GPS drift slowly: so many photos that follow each other err alike.
@@ -88,7 +88,7 @@ def pose_by_gps(
     there = target[placed.inliers, :2]
     off = placed.local_from_model.apply(centres[placed.inliers])[:, :2] - there
     each = max(sd_m, float(np.sqrt((off**2).mean())))
-    of_scene = _accuracy_of(scene_photos, accuracy_m)
+    of_scene = float(np.hypot(_accuracy_of(scene_photos, accuracy_m), _off_in_plane(scene_json)))
     turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(ERR_ALIKE)
     # What all positions of a flight have in common is not averaged out by more photos.
     return GpsPose(placed.local_from_model, len(there), float(turn), float(np.hypot(each, of_scene)))
@@ -103,6 +103,13 @@ def _cameras(landmarks: Landmarks) -> tuple[Array, Array]:
 def _extent(points: Array) -> float:
     """Root of the summed squared distances of points (N, 2) from their mean."""
     return max(float(np.sqrt(((points - points.mean(0)) ** 2).sum())), 1e-12)
+
+
+def _off_in_plane(scene_json: Path | None) -> float:
+    """How far the GPS of a scene's flight lies off its control points or scan in the plane, metres: as much may the
+    object's lie off the scene, or not, by another receiver."""
+    content = {} if scene_json is None else read_json(scene_json)
+    return float(np.linalg.norm(value(content, "gps_shift")[:2])) if "gps_shift" in content else 0.0
 
 
 def _accuracy_of(photos: Path | None, otherwise_m: float) -> float:

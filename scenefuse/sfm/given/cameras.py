@@ -1,6 +1,7 @@
 """A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
 
 import shutil
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -143,8 +144,8 @@ def place_of(cameras: Path) -> Place | None:
 
 
 def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> dict[str, PosedPhoto]:
-    """The cameras of photos (paths below their folder): by the whole path, or by the file's name where it is the only
-    one that is called so.
+    """The cameras of photos (paths below their folder): by the whole path, or by the file's name where camera and photo
+    are the only ones that are called so.
 
     Raises:
         StageError: several cameras may be a photo's.
@@ -153,11 +154,15 @@ def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> di
     for photo in given:
         alike.setdefault(photo.file.name, []).append(photo)
     found = dict[str, PosedPhoto]()
+    names = list(names)
+    called = Counter(Path(name).name for name in names)
     for name in names:
-        same = [whole[frame_name(name)]] if frame_name(name) in whole else alike.get(Path(name).name, [])
-        if len(same) > 1:
+        end = Path(name).name
+        same = [whole[frame_name(name)]] if frame_name(name) in whole else alike.get(end, [])
+        if len(same) > 1 or (same and called[end] > 1 and frame_name(name) not in whole):
             raise StageError(
-                f"{cameras}: {len(same)} photos are called {Path(name).name}; give every photo a name of its own"
+                f"{cameras}: {max(len(same), called[end])} photos are called {end}, and it does not say which of them"
+                " its camera is of; give every photo a name of its own"
             )
         if same:
             found[name] = same[0]

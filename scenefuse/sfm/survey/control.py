@@ -101,11 +101,12 @@ def sight(
             if photo not in sizes:
                 raise unknown_photo(control.path, point.name, photo, sizes)
             if photo in images:
-                seen.append((photo, model_pixel(control.path, point.name, photo, pixel, images[photo], sizes)))
+                own = images[photo]
+                seen.append((own.name, model_pixel(control.path, point.name, photo, pixel, own, sizes)))
             else:
                 lost.append(photo)
         notes += [f"{point.name}: {photo} could not be registered, its click is left out" for photo in lost]
-        sighting, dropped = _agreed(replace(point, clicks=seen), images)
+        sighting, dropped = _agreed(replace(point, clicks=seen), {image.name: image for image in images.values()})
         sightings.append(sighting)
         notes += dropped + ([f"{point.name} is left out: {sighting.problem}"] if sighting.problem else [])
     return sightings, notes

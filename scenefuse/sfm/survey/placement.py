@@ -27,6 +27,10 @@ LEAN_DEG, TILT_DEG, HEIGHTS, ALIKE = 3.0, 2.0, 2.0, 5.0
 BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
+# In standard deviations: error of a control point at which it loses half its weight beside exact positions.
+DOUBTED = 3.0
+# Standard deviation of a normal error over the median of its size.
+NORMAL = 1.4826
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 
@@ -149,7 +153,9 @@ def beside_gps(
     """A placement by control points, refined by GPS positions up to a shift that all of them share.
 
     Another datum, heights above a geoid or a base station of its own move all positions alike: the control points say
-    where the model lies, the positions help to turn and scale it: a least-squares fit of both about their own means.
+    where the model lies, the positions help to turn and scale it: a least-squares fit of both about their own means, in
+    which points that the others contradict count for less and less (Cauchy): one wrong point among exact positions
+    would else move all of these.
 
     Args:
         placement: by control points.
@@ -177,12 +183,14 @@ def beside_gps(
         return replace(placement, inliers=inliers, gps_shift=shift)
     start = [np.array([s.x_in_model for s, u in zip(sightings, points) if u]), gps.centres[inliers]]
     wanted = [there[points], target[inliers]]
-    # Clicks add to what was stated of the coordinates.
-    miss_m = float(np.sqrt(np.nanmean((wanted[0] - fitted.apply(start[0])) ** 2)))
-    sd_m = [np.array([max(s.point.sd_m[0], miss_m) for s, u in zip(sightings, points) if u]), gps.sd_m[inliers, 0]]
+    stated = np.array([s.point.sd_m[0] for s, u in zip(sightings, points) if u])
     for _ in range(FILL_ROUNDS):
         here = [fitted.apply(part) for part in start]
         here[1] += shift
+        off = np.abs(wanted[0] - here[0])
+        # Clicks add to what was stated of the coordinates.
+        each = np.maximum(stated, NORMAL * float(np.nanmedian(off)))
+        sd_m = [each * np.hypot(1.0, np.sqrt(np.nansum(off**2, axis=1)) / (DOUBTED * each)), gps.sd_m[inliers, 0]]
         filled = [np.where(np.isfinite(b), b, a) for a, b in zip(here, wanted)]
         means = [
             [np.average(part, axis=0, weights=sd**-2.0) for part, sd in zip(side, sd_m)] for side in (start, filled)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.io.crs import read_crs, to_wgs84
-from scenefuse.io.tables import read_lines
+from scenefuse.io.tables import composed, read_lines
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
 
@@ -97,8 +97,10 @@ def positions_of(names: list[str], positions: dict[str, Position], path: Path) -
     Raises:
         StageError: the file names none of the photos.
     """
-    last = [Path(name).name for name in names]
-    keys = [name if name in positions or last.count(end) > 1 else end for name, end in zip(names, last)]
+    positions = {composed(name): position for name, position in positions.items()}
+    whole = [composed(name) for name in names]
+    last = [Path(name).name for name in whole]
+    keys = [name if name in positions or last.count(end) > 1 else end for name, end in zip(whole, last)]
     if not any(key in positions for key in keys):
         raise StageError(
             f"{path} names none of the photos beside it: it names {next(iter(positions))}, a photo is {names[0]};"
