@@ -82,6 +82,19 @@ def _takes_own_settings() -> bool:
     return OWN_SETTINGS.is_file() and not any(word.startswith("--configfile") for word in sys.argv[1:])
 
 
+def _configfiles() -> list[str]:
+    """The files after --configfile, or --configfiles; its values go on up to the next option."""
+    found, taking = list[str](), False
+    for word in sys.argv[1:]:
+        name, equals, given = word.partition("=")
+        if word.startswith("-"):
+            taking = name in ("--configfile", "--configfiles")
+            found += [given] if taking and equals else []
+        elif taking:
+            found.append(word)
+    return found
+
+
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
     from scenefuse.io.settings import ROOT
@@ -90,6 +103,9 @@ def _run() -> None:
         raise ModuleNotFoundError(name="snakemake")
     # Options of Snakemake that say where the project is, or that none is needed.
     _need_project("--config", "--directory", "-d", "-h", "--help", "--version")
+    for path in _configfiles():
+        if not Path(path).is_file():
+            sys.exit(f"error: the settings file {path} cannot be read; correct its path")
     words = [*(["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []), *sys.argv[1:]]
     # As `python -m snakemake`, but its help and its complaints name the command that was typed.
     start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"

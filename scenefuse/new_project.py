@@ -8,7 +8,7 @@ from typing import Literal
 import tyro
 
 from scenefuse.io.formats import READERS
-from scenefuse.io.photo_files import VIDEO_SUFFIXES, photo_files
+from scenefuse.io.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
 from scenefuse.io.settings import ROOT, schema_of
 from scenefuse.stage import StageError
 
@@ -103,13 +103,15 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
         raise StageError(f"{path} does not exist; give {wanted}")
     suffix = path.suffix.lower()
     is_cloud = path.is_file() and suffix in READERS
+    place, project = path.resolve(), folder.resolve()
     if path.is_dir():
-        photo_files(path)
+        if project.is_relative_to(place):
+            raise StageError(f"the project {folder} would lie among its photos in {path}; give a folder of its own")
+        print(f"{path} holds {in_folders([f.relative_to(path).as_posix() for f in photo_files(path)])}", flush=True)
     elif not (is_cloud or (video and suffix in VIDEO_SUFFIXES)):
         raise StageError(f"{path} is not {wanted.replace('or a', 'nor a')} ({', '.join(READERS)})")
     elif path.stat().st_size == 0:
         raise StageError(f"{path} is empty; export it again")
-    place, project = path.resolve(), folder.resolve()
     cell = place.relative_to(project) if place.is_relative_to(project) else place
     return {"cloud" if is_cloud else "photos": cell.as_posix()}
 

@@ -2,6 +2,7 @@
 workflow lists them often."""
 
 import os
+from collections import Counter
 from pathlib import Path
 
 from scenefuse.stage import StageError
@@ -69,6 +70,14 @@ def photo_files(folder: Path) -> list[Path]:
             f" ({len(files)} other files were found)"
         )
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def in_folders(names: list[str]) -> str:
+    """How many photos (paths below a folder) there are, and where those below its own folders lie."""
+    below = Counter(folder for name in names if (folder := name.rpartition("/")[0]))
+    where = ", ".join(f"{count} of them in {folder}/" for folder, count in sorted(below.items())[:5])
+    more = f", and {len(below) - 5} more folders" if len(below) > 5 else ""
+    return f"{len(names)} photos" + (f", {where}{more}" if below else "")
 
 
 def upright_size(path: Path) -> tuple[int, int]:

@@ -17,14 +17,17 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
 def read_table(path: Path, key: str) -> dict[str, Row]:
     """Rows of a tab-separated table by the column `key`; every cell is text, an empty one is ''.
 
-    Lines that begin with # and empty lines are left out.
+    Lines that begin with #, empty rows and columns, and what else a spreadsheet puts around cells are left out. A cell
+    that begins with ~/ is in the user's folder, as in a shell.
 
     Raises:
         StageError: the file is missing, is no text, has no such column or a column twice, a row has too few or too many
             cells, or two rows have the same key.
     """
-    lines = [line for line in io.StringIO(read_text(path), newline=None) if not line.startswith("#")]
-    header, *cells = [row for row in csv.reader(lines, delimiter="\t") if row] or [[]]
+    lines = [line for line in io.StringIO(read_text(path), newline=None) if not _is_comment(line)]
+    written = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter="\t")]
+    header, *cells = [row for row in written if any(row)] or [[]]
+    header = _cells(header)
     if key not in header:
         tabs = "; separate columns by tabs" if len(header) == 1 and re.search("[;, ]", header[0]) else ""
         raise StageError(f"{path} has no column '{key}'; its first line names: {', '.join(header) or 'nothing'}{tabs}")
@@ -33,11 +36,14 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
         raise StageError(f"{path} has two columns '{twice}'; remove one")
     rows: dict[str, Row] = {}
     for number, row in enumerate(cells, 1):
+        # Cells at the end may be empty, or cut off; a row of one cell is one that spaces separate.
+        row = row[: len(header)] if not any(row[len(header) :]) else row
+        row += [""] * (len(header) - len(row) if len(row) > 1 else 0)
         if len(row) != len(header):
             raise StageError(
                 f"{path}, row {number}: {len(row)} columns, and the header has {len(header)}; separate them by tabs"
             )
-        content = dict(zip(header, row))
+        content = {name: _in_own_folder(cell) for name, cell in zip(header, row)}
         if content[key] in rows:
             raise StageError(f"{path}: '{content[key]}' stands in two rows; names must differ")
         rows[content[key]] = content
@@ -51,7 +57,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
         StageError: the file is missing, or is no text.
     """
     lines = enumerate(read_text(path).splitlines(), 1)
-    return [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
+    return [(number, line) for number, line in lines if line.strip() and not _is_comment(line)]
 
 
 def read_cells(path: Path) -> list[tuple[int, list[str]]]:
@@ -63,12 +69,28 @@ def read_cells(path: Path) -> list[tuple[int, list[str]]]:
     """
     rows = []
     for number, line in read_lines(path):
-        cells = [cell.strip() for cell in next(csv.reader([line], delimiter="\t"))]
-        while cells and not cells[-1]:
-            cells.pop()
+        cells = _cells(next(csv.reader([line], delimiter="\t")))
         if cells:
             rows.append((number, cells))
     return rows
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line begins with #, perhaps in a spreadsheet's quotes."""
+    return line.lstrip('"').startswith("#")
+
+
+def _cells(row: list[str]) -> list[str]:
+    """The cells of a row without blanks around them, and without empty ones at the end."""
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _in_own_folder(cell: str) -> str:
+    """A path below the user's folder, where a cell means that."""
+    return str(Path(cell).expanduser()) if cell.startswith("~/") else cell
 
 
 def comma_advice(cells: list[str]) -> str:

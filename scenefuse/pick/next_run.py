@@ -9,6 +9,8 @@ from pathlib import Path
 from scenefuse.io.settings import ROOT
 
 TIME_LIMIT_S = 300
+OWN_SETTINGS = "config/config.yaml"
+"""What `scenefuse run` reads without being told."""
 
 
 def command(configfiles: tuple[Path, ...], target: str) -> list[str]:
@@ -22,7 +24,12 @@ def command(configfiles: tuple[Path, ...], target: str) -> list[str]:
 
 
 def as_text(words: list[str]) -> str:
-    """A command line to be pasted into a shell."""
+    """A command line of `command` to be pasted into a shell, as who started the page by `scenefuse pick` knows it."""
+    if Path(sys.argv[0]).name.startswith("scenefuse"):
+        shipped = ["--snakefile", str(ROOT / "Snakefile")]
+        own = ["--configfile", OWN_SETTINGS, "--cores"]
+        rest = words[3:] if words[1:3] == shipped else words[1:]
+        words = ["scenefuse", "run", *(rest[2:] if rest[:3] == own else rest)]
     return shlex.join(words)
 
 

@@ -284,9 +284,17 @@ class Page:
             if document is self.board.document or document.unsaved:
                 try:
                     self.attempt(document.save)
+                    self.warn_unlisted(document)
                 except FileChanged as error:
                     self.ask_about_changes(document, str(error))
         self.refresh()
+
+    def warn_unlisted(self, document: Document) -> None:
+        """Say that the workflow does not read what was saved, where the user's table does not name it."""
+        source = self.board.source
+        if document is self.board.document and document.rows and not source.listed:
+            where = f"write {document.path} into the column {source.column} of the table of {source.of}"
+            self.say(f"The workflow does not read it yet: {where}", "warning")
 
     def attempt(self, save: Callable[[], str]) -> None:
         """Save, and say what happened."""

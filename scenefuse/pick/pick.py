@@ -58,16 +58,20 @@ def pick(
     app.on_startup(session.start)
     app.on_startup(announce)
     app.on_shutdown(lambda: [print(sentence, flush=True) for sentence in session.close()])
-    ui.run(
-        host=HOST,
-        port=port,
-        show=False,
-        reload=False,
-        show_welcome_message=False,
-        title="scenefuse",
-        favicon="🖱",
-        timeout_graceful_shutdown=1,
-    )
+    try:
+        ui.run(
+            host=HOST,
+            port=port,
+            show=False,
+            reload=False,
+            show_welcome_message=False,
+            title="scenefuse",
+            favicon="🖱",
+            timeout_graceful_shutdown=1,
+        )
+    except SystemExit as end:
+        session.leave(end.code if isinstance(end.code, int) else 1)
+        raise
 
 
 def _free_port(host: str, wanted: int) -> int:

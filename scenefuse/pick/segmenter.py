@@ -175,6 +175,10 @@ class Segmenter:
         finally:
             self._waiting -= 1
         notes = []
+        if self.method == "GrabCut" and not any(
+            row.photo == picture.name and row.label in ("outside", "box") for row in rows
+        ):
+            notes.append("GrabCut tells colours apart: click beside the object too, or drag a box around it")
         if left_out:
             clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
             notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")

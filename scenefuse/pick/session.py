@@ -1,7 +1,9 @@
 """All that open pages of one object share: its tables, photos, masks and the work in the background."""
 
 import itertools
+import os
 import secrets
+import sys
 import threading
 import time
 from collections import OrderedDict
@@ -59,7 +61,6 @@ class Session:
         configfiles: as given on the command line.
         boards: its tables.
         tiles, thumbnails, segmenter, carried: see their classes.
-        result: the last file that the workflow makes of the object.
         results_state: changes with what the workflow has written.
         key: of this session, for addresses of pictures that the browser may keep.
     """
@@ -73,8 +74,6 @@ class Session:
         project = read_project(read_settings(*configfiles))
         self.name, self.configfiles = name, configfiles
         self.boards = [Board(source) for source in sources_of(project, name)]
-        last = "fused.ply" if project.objects[name].get("scene") else "object.ply"
-        self.result = Path("results/objects") / name / last
         self.tiles, self.thumbnails = Tiles(), Thumbnails(Path("results/pick/thumbnails"))
         own = project.of("object", name)["object"]
         self.segmenter = Segmenter(own["masks"], MASK_SIDE_PX, own["undistort"]["max_size_px"])
@@ -86,6 +85,9 @@ class Session:
         self.key = secrets.token_hex(4)
         self._numbers = itertools.count(1)
         self._closed = False
+        # A download or a network at work does not keep the page from ending.
+        self._network = threading.Thread(target=self.segmenter.compute_ahead, args=(self._ahead,), daemon=True)
+        self._thumbnailer = threading.Thread(target=self._make_thumbnails)
 
     def read_results(self) -> None:
         """Read what the workflow has written since the last time."""
@@ -114,10 +116,18 @@ class Session:
 
     def start(self) -> None:
         """Begin the work in the background: thumbnails, and features of the photos that come first."""
-        threading.Thread(target=self._make_thumbnails).start()
+        self._thumbnailer.start()
         if self.boards[0].document.kind == "labels":
-            # A download or a network at work does not keep the page from ending.
-            threading.Thread(target=self.segmenter.compute_ahead, args=(self._ahead,), daemon=True).start()
+            self._network.start()
+
+    def leave(self, status: int) -> None:
+        """End the process at once where a network is still at work: it would abort while the interpreter ends."""
+        if self._thumbnailer.is_alive():
+            self._thumbnailer.join()
+        if self._network.is_alive():
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(status)
 
     def close(self) -> Iterator[str]:
         """End the background's work and keep what is not saved; a sentence for each table that is not."""

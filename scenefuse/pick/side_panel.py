@@ -126,7 +126,7 @@ class SidePanel:
     async def plan(self) -> None:
         """Ask the workflow what it will run."""
         self._planned.set_text("Asking the workflow; some seconds ...")
-        words = command(self._page.session.configfiles, str(self._page.session.result))
+        words = command(self._page.session.configfiles, str(self._page.board.source.result))
         rules, trouble = await asyncio.to_thread(planned_rules, words)
         jobs = ", ".join(f"{rule}{f' ({count})' if count > 1 else ''}" for rule, count in rules.items())
         self._planned.set_text(trouble or f"Will run: {jobs or 'nothing'}.")

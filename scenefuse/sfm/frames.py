@@ -2,7 +2,6 @@
 
 import shutil
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,8 @@ from scenefuse.io.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
 from scenefuse.io.pictures import write_picture
 from scenefuse.sfm.photos import (
     JPEG_QUALITY,
+    below_folder,
+    each_photo,
     inspect_photo,
     photo_names,
     photo_notes,
@@ -65,7 +66,8 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
         listed = [inspect_photo(temporary, name) for name in sorted(origin)]
     if len(listed) < 3:
         shutil.rmtree(frames)
-        raise StageError(f"{source} yields {len(listed)} frames, at least 3 are needed; lower frame_step")
+        advice = "lower object.frames.frame_step" if kind == "video" else "take more photos around the object"
+        raise StageError(f"{source} yields {len(listed)} frames, at least 3 are needed; {advice}")
     print(f"{len(listed)} frames from {source}", flush=True)
     turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
     more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
@@ -75,7 +77,7 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
         if len(listed) < len(distinct):
             used = f"{len(listed)} of {len(distinct)} photos are used, spread evenly"
             notes.insert(0, f"{used} (object.frames.max_frames, frame_step)")
-        notes += copies
+        notes += copies + below_folder(distinct)
     write_photos(photos, listed, frames, kind, notes, **more)
 
 
@@ -113,8 +115,7 @@ def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[st
             width, height = save_upright(source / name, target, settings.max_width_px)
         return target.name, {"source": name, "width": width, "height": height, "orientation": photo.orientation}
 
-    with ThreadPoolExecutor(threads()) as pool:
-        return dict(pool.map(copy, flat.values()))
+    return dict(each_photo(copy, flat.values()))
 
 
 def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:

@@ -1,18 +1,18 @@
 """Photos as the reconstruction reads them: checked, upright, and what their EXIF says."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps
+from PIL import Image, ImageOps, UnidentifiedImageError
 from PIL.ExifTags import GPS, IFD, Base
 
-from scenefuse.io.photo_files import GEO_FILE, photo_files
+from scenefuse.io.photo_files import GEO_FILE, in_folders, photo_files
 from scenefuse.sfm.survey.positions import positions_of, read_geo, rtk_accuracy
 from scenefuse.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
 
@@ -29,6 +29,9 @@ KEPT_EXIF = {
     IFD.GPSInfo: (GPS.GPSLatitudeRef, GPS.GPSLatitude, GPS.GPSLongitudeRef, GPS.GPSLongitude)
     + (GPS.GPSAltitudeRef, GPS.GPSAltitude),
 }
+
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -87,11 +90,11 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     """
     names, copies = without_copies(folder, photo_names(folder))
     positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
-    with atomic_directory(upright) as temporary, ThreadPoolExecutor(threads()) as pool:
-        stood = list(pool.map(lambda name: _stood_upright(folder, name, temporary), names))
+    with atomic_directory(upright) as temporary:
+        stood = each_photo(lambda name: _stood_upright(folder, name, temporary), names)
     turned = {p.name: orientation for p, orientation in stood if orientation != 1}
     listed = [p for p, _ in stood]
-    notes = copies + photo_notes(listed)
+    notes = copies + below_folder(names) + photo_notes(listed)
     if positions is not None:
         listed = [replace(p, **place) for p, place in zip(listed, positions_of(names, positions, folder / GEO_FILE))]
         notes.append(
@@ -230,14 +233,46 @@ def inspect_photo(folder: Path, name: str) -> Photo:
             width, height = image.size
     except Exception as error:
         raise StageError(
-            f"the photo {path} cannot be decoded ({str(error) or type(error).__name__}); "
-            f"replace it or remove it from the folder"
+            f"the photo {path} cannot be decoded ({_why(error)}); replace it or remove it from the folder"
         ) from None
     # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
     focal_px = equivalent_mm / 36.0 * max(width, height) if equivalent_mm else None
     digest = sha256(path)
     place = (latitude, longitude, altitude)
     return Photo(name, width, height, digest, *place, focal_px, camera, orientation, horizontal, vertical, focal_mm)
+
+
+def _why(error: Exception) -> str:
+    """Why a photo cannot be decoded, in a user's words."""
+    return "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error) or type(error).__name__
+
+
+def each_photo(function: Callable[[str], Result], names: Iterable[str]) -> list[Result]:
+    """What a function gives for each photo, in parallel.
+
+    Raises:
+        StageError: of the first photo that it fails for, which names the others.
+    """
+
+    def tried(name: str) -> Result | StageError:
+        try:
+            return function(name)
+        except StageError as error:
+            return error
+
+    names = list(names)
+    with ThreadPoolExecutor(threads()) as pool:
+        found = list(pool.map(tried, names))
+    bad = [(name, error) for name, error in zip(names, found) if isinstance(error, StageError)]
+    if bad:
+        more = f"; nor can {', '.join(name for name, _ in bad[1:6])}" if len(bad) > 1 else ""
+        raise StageError(f"{bad[0][1]}{more}{f' and {len(bad) - 6} more' if len(bad) > 6 else ''}")
+    return [result for result in found if not isinstance(result, StageError)]
+
+
+def below_folder(names: list[str]) -> list[str]:
+    """A note where photos (paths below their folder) lie in folders below it: previews and masks may be among them."""
+    return [f"{in_folders(names)}"] if any("/" in name for name in names) else []
 
 
 def photo_notes(photos: list[Photo]) -> list[str]:

@@ -186,6 +186,11 @@ def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch,
     said = capsys.readouterr().out
     assert "Häuschen neu.ply is called Hauschen_neu in the tables and results; names hold only" in said
     assert "site.laz is called site in the tables and results\n" in said
+    for name in ("a.jpg", "b.jpg", "small/a.jpg"):
+        Path("shots", name).parent.mkdir(parents=True, exist_ok=True)
+        Path("shots", name).write_bytes(b"photo")
+    init(Path("other"), objects=(Path("shots"),))
+    assert "shots holds 3 photos, 1 of them in small/\n" in capsys.readouterr().out
     assert "Hauschen_neu\tsite\t" in Path("new/config/objects.tsv").read_text()
 
 
@@ -193,6 +198,12 @@ def test_names_are_made_of_what_files_are_called_and_said(tmp_path, monkeypatch,
 def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, words):
     status, output = scenefuse(*words, cwd=tmp_path)
     assert status == 1 and "there is no config/scenes.tsv here" in output and "scenefuse init" in output
+
+
+@pytest.mark.parametrize("option", [["--configfile", "my.yaml"], ["--configfile=my.yaml"]])
+def test_a_settings_file_that_is_not_there_is_one_sentence(tmp_path, option):
+    status, output = scenefuse("run", "-n", *option, cwd=tmp_path)
+    assert status == 1 and output.strip() == "error: the settings file my.yaml cannot be read; correct its path"
 
 
 @pytest.mark.parametrize(
@@ -207,12 +218,14 @@ def test_in_a_folder_without_a_project_nothing_is_made_of_the_demo(tmp_path, wor
         ({"folder": Path("new"), "scene": Path("walk.mp4")}, "walk.mp4 is not a folder of photos nor a cloud"),
         ({"folder": Path("new"), "objects": (Path("code.py"),)}, "code.py is not a folder of photos, a video nor"),
         ({"folder": Path("new"), "objects": (Path("empty.ply"),)}, "empty.ply is empty"),
+        ({"folder": Path("shots/new"), "objects": (Path("shots"),)}, "would lie among its photos in shots"),
     ],
 )
 def test_a_project_that_cannot_be_made_is_one_sentence(tmp_path, monkeypatch, options, words):
     monkeypatch.chdir(tmp_path)
-    for folder in ("taken", "a/x", "b/x"):
+    for folder in ("taken", "a/x", "b/x", "shots"):
         Path(folder).mkdir(parents=True)
+    Path("shots/a.jpg").write_bytes(b"photo")
     Path("taken/README.md").touch()
     for name in ("file", "walk.mp4", "code.py", "empty.ply"):
         Path(name).touch()

@@ -68,6 +68,19 @@ def test_depth_below_sea_level_and_missing_altitude(tmp_path):
     np.testing.assert_allclose(positions, [[31, 35, -400], [31, 35, np.nan]])
 
 
+def test_all_bad_photos_are_named_at_once(tmp_path):
+    save(tmp_path / "p" / "a.jpg")
+    for name in ("b.jpg", "c.jpg"):
+        (tmp_path / "p" / name).write_text(f"<html>{name}")
+    Image.fromarray(np.ones((9, 9), np.float32)).save(tmp_path / "p" / "d.tif")
+    with pytest.raises(StageError, match=r"b.jpg cannot be decoded \(it is no picture\).*; nor can c.jpg, d.tif$"):
+        listed(tmp_path, tmp_path / "p")
+    for name in ("b.jpg", "c.jpg"):
+        (tmp_path / "p" / name).unlink()
+    with pytest.raises(StageError, match="d.tif cannot be decoded .its pixels are 32-bit measurements"):
+        listed(tmp_path, tmp_path / "p")
+
+
 def test_copies_and_rotations_are_noted(tmp_path):
     save(tmp_path / "p" / "a.jpg")
     save(tmp_path / "p" / "b.jpg")

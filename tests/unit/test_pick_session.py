@@ -198,6 +198,8 @@ def test_a_box_gives_a_mask_and_a_click_that_contradicts_it_is_counted(ball):
     rows = (*box, Click("inside", "ball.png", 1100, 700))
     _, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, rows)
     assert any("1 click lies on the wrong side" in note for note in notes)
+    alone = (Click("inside", "ball.png", 500, 360), Click("outside", "other.png", 3, 3))
+    assert any("click beside the object too" in note for note in Segmenter(GRABCUT, 600, 1600).mask(picture, alone)[1])
 
 
 def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path):
@@ -221,5 +223,9 @@ def test_the_next_command_is_the_one_to_type(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = command((tmp_path / "my settings.yaml", Path("few.yaml")), "results/objects/shed/masks.png")
     assert as_text(words).endswith("my settings.yaml' few.yaml --cores 2 results/objects/shed/masks.png")
+    monkeypatch.setattr("sys.argv", ["scenefuse pick"])
+    own = command((Path("config/config.yaml"),), "masks.png"), command((Path("few.yaml"),), "masks.png")
+    assert as_text(own[0]) == "scenefuse run --cores 2 masks.png"
+    assert as_text(own[1]) == "scenefuse run --configfile few.yaml --cores 2 masks.png"
     (tmp_path / "Snakefile").touch()
     assert "--snakefile" not in command((), "all")

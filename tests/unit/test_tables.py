@@ -35,6 +35,20 @@ def test_comments_empty_lines_and_line_ends_of_all_systems_do_no_harm(table):
         assert list(read_table(table(end.join(lines)), "object").values()) == [{"object": "shed", "photos": "close"}]
 
 
+def test_what_a_spreadsheet_puts_around_cells_does_no_harm(table, monkeypatch):
+    monkeypatch.setenv("HOME", "/home/ann")
+    lines = [
+        '"# photos: a folder, or a video"',
+        "object\tphotos \tmasks\t\t",
+        "\t\t\t\t",
+        "shed\t~/close up\t\t\t",
+        "barn\tb",
+    ]
+    rows = read_table(table("\r\n".join(lines)), "object")
+    assert rows["shed"] == {"object": "shed", "photos": "/home/ann/close up", "masks": ""}
+    assert rows["barn"] == {"object": "barn", "photos": "b", "masks": ""}
+
+
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
 def test_unicode_with_and_without_a_mark_is_read(table, encoding):
     path = table("object\tphotos\nshed\tGärten\n", encoding)

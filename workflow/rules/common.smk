@@ -292,6 +292,11 @@ def photos_in(path, where):
     path = str(Path(path))
     if made_here(path) or Path(path).is_file():
         return [path]
+    if Path.cwd().is_relative_to(Path(path).resolve()):
+        raise WorkflowError(
+            f"{where}: the project lies in its folder of photos, {path}, whose files would count as photos; put the"
+            " photos, or the project, into a folder of its own"
+        )
     try:
         return [str(file) for file in photo_files(Path(path))]
     except StageError as error:
