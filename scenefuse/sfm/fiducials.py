@@ -98,7 +98,8 @@ def read_points(path: Path) -> Clicks | ScenePoints | Labels:
             f"'label photo x_px y_px', not with '{' '.join(header)}'{comma_advice(loose[0][1] if loose else [])}"
         )
     if len(rows) == 1:
-        raise StageError(f"{path} holds no points below its header; mark at least four points on the object")
+        wanted = "click on the object" if header == LABEL_COLUMNS else "mark at least four points on the object"
+        raise StageError(f"{path} holds no points below its header; {wanted}")
     names, numbers = _split(path, header, rows[1:])
     if header == LABEL_COLUMNS:
         return _labels(path, names, numbers)
