@@ -71,12 +71,14 @@ class Recipe:
         warmup_epochs: epochs of linear rise of the learning rate before the cosine.
         batch_photos: target photos per step.
         coarse_share: share of the steps, the first ones, that compare photos at half size.
+        even: whether an epoch's batches are as large as each other, not all but the last one full.
     """
 
     epochs: int
     warmup_epochs: int
     batch_photos: int
     coarse_share: float
+    even: bool = True
 
     def steps(self, photos: DepthPhotos) -> int:
         """Steps of the whole training."""
@@ -323,7 +325,8 @@ def _batches(photos: NDArray[np.int64], recipe: Recipe, seed: int) -> list[NDArr
     """Indices of the photos of each step: every epoch shows all of them in a new order."""
     rng = np.random.default_rng(seed)
     number = -(-len(photos) // recipe.batch_photos)
-    return [batch for _ in range(recipe.epochs) for batch in np.array_split(rng.permutation(photos), number)]
+    parts = number if recipe.even else recipe.batch_photos * np.arange(1, number)
+    return [batch for _ in range(recipe.epochs) for batch in np.array_split(rng.permutation(photos), parts)]
 
 
 def _by_epoch(losses: list[dict[str, float]], epochs: int) -> list[dict[str, float]]:

@@ -48,7 +48,7 @@ class MonocularSettings:
 
 def recipe_of(settings: MonocularSettings) -> Recipe:
     """The paper's batches and warm-up."""
-    return Recipe(settings.epochs, WARMUP_EPOCHS, BATCH_PHOTOS, coarse_share=0.0)
+    return Recipe(settings.epochs, WARMUP_EPOCHS, BATCH_PHOTOS, coarse_share=0.0, even=False)
 
 
 def frames_of(views: Views, device: torch.device) -> DepthPhotos:

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.io.alignment_picture import draw_alignment
 from scenefuse.io.clouds import Cloud
@@ -35,7 +36,7 @@ from scenefuse.registration.scale import Estimate, estimates, rms, scale_quantit
 from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, score
 from scenefuse.registration.uncertainty import uncertainty_quantities
 from scenefuse.stage import quantity, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, fit_sim3
 
 # The paper's: the voxel as a share of the diagonal.
 VOXEL_FRACTION = 0.04
@@ -51,8 +52,8 @@ ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
 MUTUAL_SHARE = 0.1
 # Matches that determine a similarity, and how much the sizes of object and crop, which is cut to it, may differ then:
-# matches that are wrong shrink the object into a spot.
-LEAST_MATCHES, LARGEST_FACTOR = 3, 2.0
+# matches that are wrong shrink the object into a spot. Triples that are drawn at once.
+LEAST_MATCHES, LARGEST_FACTOR, AT_ONCE = 3, 2.0, 1 << 14
 
 
 def register_as_paper(
@@ -138,24 +139,52 @@ def _report(best: Hypothesis, problem: Problem, length: str, scale: str, seconds
 def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, list[str]]:
     """Scene units per object unit from matched points, and notes: None where too few agree.
 
-    FPFH matches of both clouds at a diagonal of 1 (R4), RANSAC with a similarity by SVD, then the ratio of the RMS
-    distances of the matches that agree to their centroids. Matched edges have to be about as long as each other:
-    otherwise the similarity shrinks the object into a spot where all matches agree.
+    Mutual FPFH matches of both clouds at a diagonal of 1 (R4), RANSAC with a similarity by SVD, then the ratio of the
+    RMS distances of the matches that agree to their centroids. Open3D's RANSAC does not say which matches agree, but
+    which points then lie near each other, whatever they match.
     """
+    import open3d as o3d
+
     unit = [Cloud(c.points / c.diagonal) for c in (cloud, scene)]
     (source, of_source), (target, of_target) = (_features(c.points, VOXEL_FRACTION) for c in unit)
-    result = _ransac((source, target), (of_source, of_target), RANSAC_DISTANCE * VOXEL_FRACTION, True, seed)
-    pairs = np.asarray(result.correspondence_set)
+    # A ratio of 0: no one-way matches in the place of too few mutual ones.
+    pairs = np.asarray(o3d.pipelines.registration.correspondences_from_features(of_source, of_target, True, 0.0))
     matched = np.asarray(source.points)[pairs[:, 0]], np.asarray(target.points)[pairs[:, 1]]
-    ratio = rms(matched[1]) / rms(matched[0]) if len(pairs) >= LEAST_MATCHES else 0.0
-    if not 1 / LARGEST_FACTOR < ratio < LARGEST_FACTOR:
-        note = (
-            f"{len(pairs)} matches make the object {ratio:.2g} times as large as the crop, more than a factor of"
-            f" {LARGEST_FACTOR:g} off: the scale is the RMS ratio of the whole clouds"
-        )
-        print(note, flush=True)
-        return None, [note]
-    return ratio * scene.diagonal / cloud.diagonal, []
+    agree = agreeing(*matched, RANSAC_DISTANCE * VOXEL_FRACTION, seed)
+    said = f"{agree.sum()} of {len(pairs)} mutual matches agree"
+    print(said, flush=True)
+    if agree.sum() < LEAST_MATCHES:
+        return None, [f"{said}, too few: the scale is the RMS ratio of the whole clouds"]
+    ratio = rms(matched[1][agree]) / rms(matched[0][agree])
+    return ratio * scene.diagonal / cloud.diagonal, [said]
+
+
+def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArray[np.bool_]:
+    """Which matches (N, 3) and (N, 3) a similarity explains within `distance`: the most that RANSAC finds.
+
+    Triples of different matches, on either side as in space, of which every edge is by the same factor longer or
+    shorter than its match, but for the ratio that Open3D asks of edges, and by a factor of `LARGEST_FACTOR` at most:
+    a similarity that shrinks the object into a spot explains everything.
+    """
+    best = np.zeros(len(source), dtype=bool)
+    if len(source) < RANSAC_POINTS:
+        return best
+    rng, drawn, wanted = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES)
+    while drawn < wanted:
+        triples = rng.integers(0, len(source), (AT_ONCE, RANSAC_POINTS))
+        drawn += AT_ONCE
+        a, b = source[triples], target[triples]
+        edges = [np.linalg.norm(side - np.roll(side, 1, axis=1), axis=2) for side in (a, b)]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            factor = edges[1] / edges[0]
+            alike = factor.min(1) / factor.max(1) >= EDGE_LENGTH  # not so where an edge has no length
+        likely = alike & (factor.min(1) > 1 / LARGEST_FACTOR) & (factor.max(1) < LARGEST_FACTOR)
+        for one, other in zip(a[likely], b[likely]):
+            found = np.linalg.norm(fit_sim3(one, other).apply(source) - target, axis=1) <= distance
+            if found.sum() > best.sum():
+                best = found
+                wanted = np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** RANSAC_POINTS, CONFIDENCE))
+    return best
 
 
 def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
@@ -180,11 +209,11 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
         )
         print(notes[-1], flush=True)
     features = source_features, target_features
-    result = _ransac((source, target), features, RANSAC_DISTANCE * voxel, False, problem.seed)
+    result = _ransac((source, target), features, RANSAC_DISTANCE * voxel, problem.seed)
     return Sim3.from_matrix(np.asarray(result.transformation)) @ scaled, notes
 
 
-def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float, with_scale: bool, seed: int) -> Any:
+def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float, seed: int) -> Any:
     """Open3D's RANSAC over mutual matches of two clouds by their features, seeded and on one thread."""
     import open3d as o3d
 
@@ -200,7 +229,7 @@ def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float,
             *features,
             True,
             distance,
-            registration.TransformationEstimationPointToPoint(with_scale),
+            registration.TransformationEstimationPointToPoint(False),
             RANSAC_POINTS,
             checks,
             registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),

@@ -36,6 +36,7 @@ POSES = {
     TRAJECTORY: "trajectory_error_chain_over_extent",
     TURNED: "rotation_error_chain_deg",
     "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
+    "shift error of one motion over its length": "pose_network_translation_error",
 }
 CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", SCENEFUSE
 # Of the true depth maps that the null is measured on.

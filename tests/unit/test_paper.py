@@ -5,11 +5,12 @@ from types import SimpleNamespace
 import numpy as np
 import open3d as o3d
 import pytest
+from scipy.spatial.transform import Rotation
 from support.planted import plant
 
 from scenefuse.io.clouds import Cloud, write_cloud
 from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.paper import matched_scale, paper_coarse, paper_fine, register_as_paper
+from scenefuse.registration.paper import agreeing, matched_scale, paper_coarse, paper_fine, register_as_paper
 from scenefuse.registration.problem import Evidence, Inputs, Problem
 from scenefuse.stage import quantity, read_json, value, write_json
 from scenefuse.transforms import Sim3, rotation_angle_deg, rotation_between
@@ -90,18 +91,35 @@ def copied():
 def test_the_scale_of_matches_is_that_of_a_copy(copied, seed):
     obj, scene, pose = copied
     scale, notes = matched_scale(obj, scene, seed)
-    assert scale == pytest.approx(pose.scale, rel=0.05) and notes == []
+    assert scale == pytest.approx(pose.scale, rel=0.05) and "mutual matches agree" in notes[0]
 
 
-def test_matches_that_shrink_the_object_give_no_scale_and_say_so(copied, monkeypatch, capsys):
-    ball = np.random.default_rng(0).normal(size=(3000, 3))
-    ball /= np.linalg.norm(ball, axis=1, keepdims=True)
-    found = SimpleNamespace(correspondence_set=np.array([[0, 5], [9, 5], [20, 5], [30, 6]]))
-    name = "registration_ransac_based_on_feature_matching"
-    monkeypatch.setattr(o3d.pipelines.registration, name, lambda *_: found)
-    scale, notes = matched_scale(Cloud(ball), copied[1], 0)
-    assert scale is None and "the scale is the RMS ratio of the whole clouds" in notes[0]
-    assert notes[0] in capsys.readouterr().out
+def test_the_scale_of_matches_does_not_go_by_the_size_of_what_is_there(copied):
+    obj, scene, pose = copied
+    turned = obj.points - obj.points.mean(0)
+    part = obj[np.flatnonzero(turned[:, 0] < np.quantile(turned[:, 0], 0.4))]
+    ratio = diagonal(scene.points) / diagonal(part.points)
+    assert abs(np.log(ratio / pose.scale)) > 0.15  # what the diagonals say
+    scale, _ = matched_scale(part, scene, 0)
+    assert scale == pytest.approx(pose.scale, rel=0.1)
+
+
+def test_matches_that_agree_are_told_from_those_that_only_lie_near():
+    rng = np.random.default_rng(0)
+    source = rng.uniform(-0.5, 0.5, (200, 3))
+    pose = Sim3(0.8, Rotation.from_euler("xyz", [40, 20, -70], degrees=True).as_matrix(), np.array([0.1, 0.2, 0.3]))
+    target = pose.apply(source)
+    wrong = rng.random(200) < 0.7
+    target[wrong] = target[rng.permutation(200)[: wrong.sum()]]
+    found = agreeing(source, target, 0.01, 0)
+    assert np.array_equal(found, np.linalg.norm(pose.apply(source) - target, axis=1) <= 0.01)
+
+
+def test_too_few_matches_give_no_scale_and_say_so(copied, capsys):
+    ball = np.random.default_rng(0).normal(size=(30, 3))
+    scale, notes = matched_scale(Cloud(ball / np.linalg.norm(ball, axis=1, keepdims=True)), copied[1], 0)
+    assert scale is None and "too few: the scale is the RMS ratio of the whole clouds" in notes[0]
+    assert "mutual matches agree" in capsys.readouterr().out
 
 
 def test_the_papers_recipe_finds_the_pose_of_a_copy(copied):
