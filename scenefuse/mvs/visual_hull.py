@@ -20,7 +20,7 @@ Counts = NDArray[np.int32]
 
 BATCH = 4
 """Photos after which `carve` leaves out the voxels that are decided: most are, early."""
-LEAST_FRAMING, RARELY_FRAMED, LEAST_PHOTOS = 0.3, 10, 2
+LEAST_FRAMING, RARELY_FRAMED, LEAST_PHOTOS = 0.25, 10, 2
 """Of `least_framing`: the share; the percentile of the own points; never fewer photos."""
 LEAST_OWN, LEAST_WHOLE = 20, 1 / 3
 """Own points that say how many photos have a part; else those with all of it, or so large a share of all photos."""
@@ -139,7 +139,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
         usual = float(np.percentile(framed, RARELY_FRAMED))
     else:
         usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
-    return max(LEAST_PHOTOS, int(np.ceil(LEAST_FRAMING * usual)))
+    return max(LEAST_PHOTOS, int(LEAST_FRAMING * usual))
 
 
 def is_whole(mask: Mask) -> bool:

