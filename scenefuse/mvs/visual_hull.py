@@ -139,7 +139,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
         usual = float(np.percentile(framed, RARELY_FRAMED))
     else:
         usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
-    return max(LEAST_PHOTOS, int(LEAST_FRAMING * usual))
+    return max(LEAST_PHOTOS, int(np.ceil(LEAST_FRAMING * usual)))
 
 
 def is_whole(mask: Mask) -> bool:

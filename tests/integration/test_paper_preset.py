@@ -1,5 +1,6 @@
 """config/paper.yaml: which rules run with it, and none of them without it."""
 
+import re
 from pathlib import Path
 
 import yaml
@@ -24,6 +25,19 @@ def test_the_papers_stages_run_in_the_place_of_the_shipped_ones_and_only_when_as
         for file in files:
             for key, part in yaml.safe_load((ROOT / "config" / file).read_text()).items():
                 project.config[key] = project.config.get(key, {}) | part
-        by_paper = snakemake(project.path, "-n", config=project.write())
+        by_paper = snakemake(project.path, "-n", "-p", config=project.write())
         assert by_paper.returncode == 0, by_paper.stdout[-3000:]
         assert planned(by_paper.stdout) >= OF_PAPER and not SHIPPED & planned(by_paper.stdout)
+        # What each job is given, by its command line.
+        jobs = re.findall(r"exec python \S*/scripts/(\S+)\.py\b(.*)", by_paper.stdout)
+        stages = [words for script, words in jobs if script == "paper/train_nerf_as_paper"]
+        given = {re.search(r"--stage \S+/(stage\d)", words)[1]: words for words in stages}
+        for stage, prior, poses in (("stage2", "stage1", "poses"), ("stage4", "stage3", "refined_poses")):
+            assert re.search(rf"--workspace \S+/{poses} .*--prior \S+/{prior} ", given[stage])
+            assert "--previous" not in given[stage]
+        assert all("--match-reach-px 0" in words for script, words in jobs if script == "nerf/make_object_cloud")
+        assert all("--minimal True" in words for script, words in jobs if script == "registration/crop_scene")
+        scales = [
+            re.search(r"--scale (\w+)", words)[1] for script, words in jobs if script.endswith("register_as_paper")
+        ]
+        assert sorted(scales) == ["none", "ransac_svd", "ransac_svd"]

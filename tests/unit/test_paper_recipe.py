@@ -18,8 +18,9 @@ from scenefuse.depth.refine_depth import EarlierStages
 from scenefuse.depth.training import Recipe, load_networks, optimise, predict
 from scenefuse.io.settings import ROOT, read_settings
 from scenefuse.nerf.field import FieldSettings
+from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.train_object_nerf import NerfSettings
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import recipe
 from scenefuse.paper import train_nerf_as_paper as nerf_stage
 from scenefuse.paper.chain import chained, place_chain
@@ -49,16 +50,15 @@ def test_the_constants_are_the_papers():
     nerf, depth = recipe.NERF, recipe_of(MonocularSettings(15))
     assert (nerf.learning_rate, nerf.grid_learning_rate, training.LEARNING_RATE) == (1e-3, 1e-3, 1e-3)
     assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
-    assert (nerf.images_per_batch, depth.batch_photos) == (24, 24)
-    assert (recipe.FIELD.levels, recipe.FIELD.log2_table, recipe.FIELD.width) == (16, 19, 64)
-    assert (
-        nerf.order_of_all
-        and nerf.prior_of_all
-        and nerf.edge_rate > 0
-        and recipe.LOSSES.rank_weight > 0
-        and recipe.LOSSES.depth_weight > 0
-    )
-    assert nerf.prior_share == 0 and not nerf.appearance and recipe.LOSSES.distortion_weight == 0
+    assert (nerf.images_per_batch, depth.batch_photos, depth.even) == (24, 24, False)
+    assert FieldSettings(levels=16, log2_table=19, finest=2048, width=64) == recipe.FIELD
+    assert nerf == NerfRecipe(
+        images_per_batch=24, rays_per_image=170, warmup_epochs=2, learning_rate=1e-3, grid_learning_rate=1e-3,
+        coarse_until=0.0, edge_boost=0.0, edge_rate=1.0, order_of_all=True, prior_of_all=True, prior_share=0.0,
+        turned_share=0.0, appearance=False,
+    )  # fmt: skip
+    assert replace(LossWeights(), distortion_weight=0.0) == recipe.LOSSES
+    assert recipe.LOSSES.rank_weight > 0 and recipe.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
     preset = read_settings(ROOT / "config/paper.yaml")
     assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == recipe.EPOCHS == 60
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
@@ -87,6 +87,35 @@ def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_
     assert (on_cpu.field, on_cpu.schedule.rays_per_epoch) == (settings.field, settings.schedule.rays_per_epoch)
     assert as_paper(settings, 500, "cpu").schedule.rays_per_epoch == 500
     assert on_cpu.recipe is recipe.NERF and on_cpu.refinement.match_reach_px == 0
+
+
+def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
+    frames, sizes = frames_of(sideways_video(60), CPU), []
+
+    def losses(chosen, step, generator):
+        sizes.append(len(chosen))
+        nothing = sum(p.sum() for p in networks.depth.parameters()) * 0
+        return {"photometric": nothing, "smoothness": nothing}
+
+    networks = new_monocular_networks(CPU)
+    optimise(networks, frames, losses, recipe_of(MonocularSettings(2)), tmp_path / "state.pt", 0)
+    assert sizes == [24, 24, 11] * 2  # of 60, one is held out
+
+
+def test_where_nothing_moves_with_the_camera_nothing_is_learned():
+    """The auto-mask: what looks the same in the next frame as it stands is left out, at full size."""
+    video = sideways_video()
+    stuck = video.images.copy()
+    stuck[:, :, :32] = stuck[0, :, :32]  # as a sticker on the lens
+    frames = frames_of(replace(video, images=stuck), CPU)
+    networks, length = new_monocular_networks(CPU), Recipe(3, 1, 24, 0.0)
+    objective, chosen = monocular_losses(networks, frames, supervision_of(frames), length), torch.arange(3)
+    last = length.steps(frames) - 1  # the full size
+    masked = objective(chosen, last, torch.Generator())["photometric"]
+    beside = replace(frames, masks=frames.masks.clone())
+    beside.masks[..., :32] = 0
+    alone = monocular_losses(networks, beside, supervision_of(beside), length)(chosen, last, torch.Generator())
+    assert float(masked) == pytest.approx(float(alone["photometric"]), rel=0.15)
 
 
 def _trained(frames, path, epochs=50, **target):
@@ -282,6 +311,13 @@ def test_all_stages_run_from_sfm_poses_and_stage_3_refines_both_networks(ball, t
     assert value(first, "pose_source") == value(refined, "pose_source") == "sfm"
     assert "9 frames are fewer" in value(first, "notes")[0] and value(refined, "rendered_share") > 0
     assert value(refined, "chain_moved_over_extent") > 0
+    refine_as_paper(
+        poses=tmp_path / "poses", earlier=EarlierStages(tmp_path / "stage1", tmp_path / "stage2"),
+        outputs=outputs("none", "none_poses"), settings=MonocularSettings(0), **common, **given,
+    )  # fmt: skip
+    start, before = (load_networks(tmp_path / stage / "networks.pt") for stage in ("none", "stage1"))
+    for name in ("depth", "pose"):  # stage 3 goes on from stage 1
+        assert all(torch.equal(start[name][key], before[name][key]) for key in before[name])
     before, after = (load_networks(tmp_path / stage / "networks.pt") for stage in ("stage1", "stage3"))
     for name in ("depth", "pose"):
         assert any(not torch.equal(before[name][key], after[name][key]) for key in before[name])
