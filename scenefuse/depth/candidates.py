@@ -8,6 +8,7 @@ from scenefuse.depth.consistency import consistency_between_views, residuals_at_
 from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.maps import tolerance_of
 from scenefuse.depth.self_supervision import minimum_reprojection, photometric_error, warp
+from scenefuse.mvs.views import chosen_by
 
 Scores = dict[str, dict[str, float | None]]
 
@@ -19,9 +20,9 @@ def score_candidates(candidates: dict[str, Tensor], photos: DepthPhotos) -> Scor
     """Three measures of each set of depth maps, smaller is better, on trained photos and pixels that all sets have.
 
     Returns:
-        For each candidate: `photometric` (minimum reprojection error of the two nearest held-out photos, or of the
-        sources where none is held out), `inconsistency` (one minus the mean confidence), `residual` (median relative
-        residual at the SfM points kept for checking), None where it cannot be measured.
+        For each candidate: `photometric` (minimum reprojection error of the two nearest of every other held-out photo,
+        `chosen_by`, or of the sources where none is held out), `inconsistency` (one minus the mean confidence),
+        `residual` (median relative residual at the SfM points kept for checking), None where it cannot be measured.
     """
     common = torch.stack([d > 0 for d in candidates.values()]).all(0) & (photos.masks > 0)
     common[~torch.as_tensor(photos.trained)] = False
@@ -53,7 +54,7 @@ def best_candidate(scores: Scores) -> str:
 @torch.no_grad()
 def _photometric(depth: Tensor, photos: DepthPhotos, common: Tensor) -> float | None:
     """Mean error over the pixels in `common` of the photos that come closest to each photo."""
-    held_out = torch.as_tensor(np.flatnonzero(~photos.trained), device=depth.device)
+    held_out = torch.as_tensor(np.flatnonzero(chosen_by(~photos.trained)), device=depth.device)
     centres = photos.object_from_cam[:, :3, 3]
     total, number = 0.0, 0
     for index in np.flatnonzero(photos.trained):

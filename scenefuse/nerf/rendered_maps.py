@@ -12,7 +12,7 @@ from torch import Tensor
 from scenefuse.io.maps import write_depth, write_normals
 from scenefuse.io.pictures import write_picture
 from scenefuse.mvs.consistency import compare, extent, normals_from_depth, surface_points
-from scenefuse.mvs.views import Views
+from scenefuse.mvs.views import Views, chosen_by
 from scenefuse.nerf.appearance import falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
@@ -173,7 +173,8 @@ def read_nerf(stage: Path) -> dict[str, Any]:
 def measure_quality(
     views: Views, rendered: list[RenderedView], measured: NDArray[np.bool_], exact: bool
 ) -> dict[str, Any]:
-    """Mean quality on the photos `measured` (V,), for the report.
+    """Mean quality on the photos `measured` (V,), for the report; `psnr_unused` on held-out ones by which stage 3 chose
+    nothing.
 
     Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background. The
     quality of the right half is given twice: as rendered, and with gains fitted to the left half, as in NeRF in the
@@ -192,9 +193,11 @@ def measure_quality(
         fitted = fitted_to_left_half(rendered[index].color, masked, mask).clamp(0, 1)
         halves.append([rate(p, masked, right) for rate in (psnr, ssim) for p in (picture, fitted)])
     inside, whole, structure, outline = np.mean(rows, axis=0)
+    unused = np.array(rows)[~chosen_by(views.held_out)[measured], 0] if views.held_out.any() else np.zeros(0)
     half = np.mean(halves, axis=0)
     return {
         "psnr_held_out": quantity(float(inside), "dB"),
+        "psnr_unused": quantity(float(unused.mean()) if len(unused) else None, "dB"),
         "psnr_held_out_masked_photo": quantity(float(whole), "dB"),
         "ssim": quantity(float(structure), "1"),
         "psnr_right_half": quantity(float(half[0]), "dB"),

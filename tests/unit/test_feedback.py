@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,8 +11,10 @@ from support.textured_plane import plane_views
 
 from scenefuse.depth import refine_depth as feedback
 from scenefuse.depth import train_depth as depth
-from scenefuse.depth.candidates import best_candidate
+from scenefuse.depth.candidates import best_candidate, score_candidates
+from scenefuse.depth.inputs import depth_photos
 from scenefuse.io.maps import read_depth, write_depth
+from scenefuse.mvs.views import chosen_by
 from scenefuse.stage import StageError
 
 SETTINGS = feedback.FeedbackSettings(epochs=1, batch_photos=4, warmup_epochs=1)
@@ -82,6 +85,23 @@ def test_good_rendered_depth_is_accepted_and_the_result_is_no_worse(tmp_path, st
     assert report["kept"]["value"] in ("rendered", "refined")
     assert report["accepted_share"]["value"] > 0.9
     assert _error(tmp_path / "stage3", views, truth) <= _error(tmp_path / "stage1", views, truth)
+
+
+def test_every_other_held_out_photo_chooses_and_the_others_have_no_say():
+    views, truth = plane_views()
+    held_out = np.arange(len(views.names)) % 3 == 0
+    assert np.flatnonzero(chosen_by(held_out)).tolist() == np.flatnonzero(held_out)[::2].tolist()
+    candidates = {"rendered": torch.as_tensor(truth, dtype=torch.float32)[:, None]}
+
+    def error(spoilt):
+        images = views.images.copy()
+        images[spoilt] = 0
+        photos = depth_photos(replace(views, held_out=held_out, images=images), 4, torch.device("cpu"))
+        return score_candidates(candidates, photos)["rendered"]["photometric"]
+
+    right = error(np.zeros(len(views.names), bool))
+    assert error(held_out & ~chosen_by(held_out)) == right
+    assert error(chosen_by(held_out)) > 2 * right
 
 
 def test_bad_rendered_depth_is_not_kept(tmp_path, stage1):

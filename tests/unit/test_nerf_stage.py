@@ -154,6 +154,8 @@ def test_the_report_names_gains_and_both_qualities_of_the_right_half(workspace, 
     assert value(report, "vignetting_at_corner") == pytest.approx(1.0, abs=0.3)
     for name in ("psnr_right_half", "psnr_right_half_fitted_on_left", "ssim_right_half_fitted_on_left"):
         assert np.isfinite(value(report, name))
+    assert value(report, "photos_measured") == 2 and np.isfinite(value(report, "psnr_unused"))  # the second one
+    assert value(report, "psnr_unused") != value(report, "psnr_held_out")
 
 
 def test_gains_are_taken_out_of_the_cloud_s_colours(workspace, stage2, tmp_path):
