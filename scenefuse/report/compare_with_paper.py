@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 
 from scenefuse.job_records import JobRecords
 from scenefuse.paper.published import published
 from scenefuse.report.collected import Collected, RunInputs, collect_run, status_of
 from scenefuse.report.paper_tables import (
+    COMMON,
     HERE,
     NULL,
     PAPER,
@@ -19,11 +21,14 @@ from scenefuse.report.paper_tables import (
     Column,
     column_of,
     null_of,
+    on_crop_of,
     paper_rows,
     without,
 )
 from scenefuse.report.values import find, load
 from scenefuse.stage import StageError, atomic_file, read_json, setting
+from scenefuse.transforms import Sim3, fit_sim3
+from scenefuse.workspace import posed_images, read_model
 
 ON_DEMAND = ("fused_scene.json",)
 """Files of an object that no run makes unless they are asked for, at any time."""
@@ -72,7 +77,10 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
             PAPER: Column(published(item.name), measured=False),
             HERE: column_of(item),
             SCENEFUSE: without(why) if why else column_of(other),
+            COMMON: Column(measured=False),
         }
+        if not why and (between := between_scenes(run.scenes[scene], beside.scenes[scene])) is not None:
+            columns[COMMON] = on_crop_of(folder, item, its_folder, between)
         null = null_of(folder, item, seed)
         if null is None and not why and (null := null_of(its_folder, other, seed)) is not None:
             null = replace(null, notes=dict.fromkeys(VARIANTS, "on the crop of the run scenefuse"))
@@ -151,6 +159,25 @@ def why_not_comparable(pairs: list[tuple[Path, Path]], item: Collected, other: C
     if here is not None and there is not None and not math.isclose(here, there, rel_tol=1e-6):
         return f"{pairs[0][1]} is measured at another tau ({there:.4g} of the crop's diagonal, here {here:.4g})"
     return ""
+
+
+def between_scenes(own: Path, other: Path) -> Sim3 | None:
+    """From another run's scene to this run's, of the same photos, by their cameras; of the same cloud, nothing moves.
+    None where there are too few cameras.
+
+    Args:
+        own: this run's folder of the scene.
+        other: the other run's.
+    """
+    models = [folder / "georeferenced" for folder in (own, other)]
+    if not all(model.is_dir() for model in models):
+        return None if any(model.is_dir() for model in models) else Sim3.identity()
+    here, there = ({image.name: image.projection_center() for image in posed_images(read_model(m))} for m in models)
+    names = sorted(here.keys() & there.keys())
+    try:
+        return fit_sim3(np.array([there[name] for name in names]), np.array([here[name] for name in names]))
+    except ValueError:
+        return None
 
 
 def _taken_from(folder: Path) -> Any:

@@ -2,10 +2,10 @@
 
 from html import escape
 
-from scenefuse.report.paper_tables import HERE, NULL, PAPER, SCENEFUSE
+from scenefuse.report.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
 from scenefuse.report.values import number
 
-_HEADINGS = (PAPER, HERE, SCENEFUSE, NULL)
+_HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
 _TITLES = {
     "2": "registration",
     "3": "completion",
@@ -14,6 +14,7 @@ _TITLES = {
 _ABOUT = (
     f"{PAPER}: what it states for its own captures of such objects; its thresholds are not known. {HERE}: this run."
     f" {SCENEFUSE}: a run of the shipped recipe on the same photos, by the same definitions, on its own crop."
+    f" {COMMON}: its pose on this run's crop, which may hold ground, as the fiducials' box has it (Table 2)."
     f" {NULL}: the same for a random cloud in the place of the object (Tables 2, 4) or of the added points (Table 3);"
     " only a clear distance from it says something. Labels like R10 are those of docs/method.md."
 )

@@ -11,9 +11,11 @@ from scenefuse.io.clouds import Cloud, read_cloud
 from scenefuse.registration.agreement import registration_metrics
 from scenefuse.report.collected import Collected, reason_of, status_of
 from scenefuse.report.values import Fields, find
+from scenefuse.stage import read_json, value
 from scenefuse.transforms import Sim3
 
 PAPER, HERE, SCENEFUSE = "paper (published, its own data)", "paper preset (here)", "scenefuse"
+COMMON = "scenefuse, on the preset's crop"
 NULL = "null"
 VARIANTS = ("full", "no_scale", "no_crop")
 """The registration of the paper's Tables 2 and 3, and those of its ablation, Table 4."""
@@ -146,6 +148,26 @@ def null_of(folder: Path, item: Collected, seed: int) -> Column | None:
     return Column(_cells(dict.fromkeys(VARIANTS, found | _measured(fields, "_null"))))
 
 
+def on_crop_of(folder: Path, item: Collected, its_folder: Path, here_from_there: Sim3) -> Column:
+    """What another run's pose gives on this run's crop, by this run's tau: the same part of the scene for both.
+
+    Args:
+        folder: this run's results of the object, with registration/full/crop.ply.
+        item: what was collected of them.
+        its_folder: the other run's, with object.ply and a pose in registration/full/fine.json.
+        here_from_there: from the other run's scene to this run's.
+    """
+    fields = item.variants.get("full", {})
+    tau, diagonal = find(fields, "metrics.registration.tau"), fields.get("crop.diagonal")
+    pose = value(read_json(its_folder / "registration/full/fine.json"), "scene_from_object")
+    if tau is None or diagonal is None or pose is None:
+        return Column(measured=False)
+    crop, obj = read_cloud(folder / "registration/full/crop.ply"), read_cloud(its_folder / "object.ply")
+    moved = here_from_there @ Sim3.from_matrix(np.array(pose))
+    found = registration_metrics(obj, crop, moved, tau, diagonal["value"], diagonal["unit"])
+    return Column(_cells({"full": found}), measured=False)
+
+
 def _measured(fields: Fields, ending: str = "") -> Fields:
     """The paper's measures of a variant, or those of an ending, by their names."""
     keys = {m.name: f"metrics.{m.group}.{m.name}{ending}" for m in (*REGISTRATION, *COMPLETION)}
@@ -154,7 +176,7 @@ def _measured(fields: Fields, ending: str = "") -> Fields:
 
 def _cells(found: Mapping[str, Fields]) -> dict[tuple[str, str], tuple[float, str]]:
     """The cells of a column from the measures of each variant."""
-    there = [(m.name, v, found[v][m.name]) for _, v, m in ROWS if m.name in found[v]]
+    there = [(m.name, v, found[v][m.name]) for _, v, m in ROWS if m.name in found.get(v, {})]
     return {(name, v): (float(x["value"]), str(x["unit"])) for name, v, x in there if x["value"] is not None}
 
 
@@ -177,12 +199,12 @@ def paper_rows(name: str, columns: Mapping[str, Column]) -> list[dict[str, Any]]
         row |= {"in_paper": measure.paper, "definition": measure.definition, "unit": unit}
         notes = []
         for heading, column in columns.items():
-            value, own = column.cells.get(key, (None, unit))
-            row[heading] = value if own == unit else None
+            cell, own = column.cells.get(key, (None, unit))
+            row[heading] = cell if own == unit else None
             why = column.notes.get(variant, "")
             if own != unit:
-                why = f"{value:.4g} {own}, in another unit"
-            elif value is None and column.measured:
+                why = f"{cell:.4g} {own}, in another unit"
+            elif cell is None and column.measured:
                 why = why or _NOTHING[measure.group]
             notes += [f"{heading}: {why}"] if why else []
         rows.append(row | {"preset": columns[HERE].told or None, "note": "; ".join(notes) or None})

@@ -2,26 +2,31 @@
 
 import os
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.job_records import JobRecords
 from scenefuse.paper.published import OBJECTS, published
+from scenefuse.registration.agreement import registration_metrics
 from scenefuse.report.collected import RunInputs
-from scenefuse.report.compare_with_paper import ComparisonSettings, compare_with_paper
+from scenefuse.report.compare_with_paper import ComparisonSettings, between_scenes, compare_with_paper
 from scenefuse.report.paper_section import paper_section
-from scenefuse.report.paper_tables import HERE, NULL, PAPER, SCENEFUSE
+from scenefuse.report.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
 from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report
-from scenefuse.stage import quantity, write_json
+from scenefuse.stage import quantity, value, write_json
+from scenefuse.transforms import Sim3, rotation_between
+from scenefuse.workspace import View, write_model
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("house", "shed")
 OWN, SHIPPED = "paper/results", "results"
+OBJECT_AND_CROP = f"{SHIPPED}/objects/house/object.ply", f"{OWN}/objects/house/registration/full/crop.ply"
 STAGES = ("matches", "sparse", "undistorted", "masks", "stage2", "stage3", "stage4", "object", "alignment")
 COMPLETION = {"surface_variation": 0.1, "nue": 1.5, "nue_density_invariant": 1.2, "primitive_fitting_score": 0.8}
 
@@ -54,7 +59,8 @@ def write_object(folder, recipe, fitness, unit="m", tau_share=0.016):
         write_json(registered / "crop.json", {"diagonal": quantity(10.0, unit)})
         for stage in ("scale", "coarse"):
             write_json(registered / f"{stage}.json", {})
-        write_json(registered / "fine.json", {"status": status, "reason": quantity("", "")})
+        pose = quantity(np.diag([8.0, 8, 8, 1]), "")
+        write_json(registered / "fine.json", {"status": status, "reason": quantity("", ""), "scene_from_object": pose})
         measured = {"registration": registration_of(fitness / share, unit, tau_share=tau_share)}
         if variant == "full":
             write_cloud(registered / "crop.ply", Cloud(rng.uniform(0, 1, (500, 3)) * [8, 6, 0]))
@@ -135,6 +141,36 @@ def test_each_number_stands_in_its_column_and_row(folder):
     said = "poses are SfM's; 60000 rays an epoch of stages 2 and 4, where every pixel of the object once is 519951;"
     assert table["preset"].eq(f"{said} stage 2 has a depth for 93 % of the masks").all()
     assert table.groupby("measure")["definition"].nunique().eq(1).all() and table["definition"].str.len().min() > 20
+
+
+def test_the_shipped_pose_is_also_measured_on_the_preset_s_crop(folder):
+    obj, crop = (read_cloud(folder / place) for place in OBJECT_AND_CROP)
+    expected = registration_metrics(obj, crop, Sim3(8.0, np.eye(3), np.zeros(3)), 0.16, 10.0, "m")
+    table = compared(folder)
+    for name in ("fitness", "inlier_rmse", "normal_consistency"):
+        row = table.loc[("house", 2, "full", name)]
+        assert row[COMMON] == pytest.approx(value(expected, name), rel=1e-4) and row[COMMON] != row[SCENEFUSE]
+    assert table.loc[("house", 4), COMMON].isna().all() and table.loc[("house", 3), COMMON].isna().all()
+
+
+def test_the_scenes_of_two_runs_are_brought_together_by_their_cameras(folder):
+    between = Sim3(1.01, rotation_between(np.array([0, 0, 1.0]), np.array([0, 0.1, 1.0])), np.array([3.0, -2, 0.5]))
+    for results, moved in ((OWN, between), (SHIPPED, Sim3.identity())):
+        views = []
+        for k, centre in enumerate(np.random.default_rng(0).normal(size=(5, 3))):
+            pose = np.eye(4)
+            pose[:3, 3] = -moved.apply(centre[None])[0]
+            views.append(View(f"{k}.jpg", np.diag([50.0, 50, 1]), pose, 80, 60))
+        (folder / results / "scenes/yard/georeferenced").mkdir()
+        write_model(folder / results / "scenes/yard/georeferenced", views)
+    scenes = [folder / results / "scenes/yard" for results in (OWN, SHIPPED)]
+    found = between_scenes(*scenes)
+    assert np.allclose(found.matrix, between.matrix, atol=1e-9)
+    obj, crop = (read_cloud(folder / place) for place in OBJECT_AND_CROP)
+    expected = registration_metrics(obj, crop, between @ Sim3(8.0, np.eye(3), np.zeros(3)), 0.16, 10.0, "m")
+    assert compared(folder).loc[("house", 2, "full", "fitness"), COMMON] == pytest.approx(value(expected, "fitness"))
+    shutil.rmtree(scenes[0] / "georeferenced")
+    assert between_scenes(*scenes) is None and np.isnan(compared(folder).loc[("house", 2, "full", "fitness"), COMMON])
 
 
 def test_only_objects_of_the_paper_have_published_numbers(folder):
@@ -228,8 +264,10 @@ def test_an_object_that_cannot_be_compared_gives_no_number_and_leaves_the_others
 
 
 def test_a_pose_that_was_refused_is_said_beside_its_numbers(folder):
-    fine = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit", "")}
-    write_json(folder / SHIPPED / "objects/house/registration/full/fine.json", fine)
+    why = {"status": quantity("unregistered", ""), "reason": quantity("two poses fit", "")}
+    write_json(
+        folder / SHIPPED / "objects/house/registration/full/fine.json", why | {"scene_from_object": quantity(None, "")}
+    )
     finish(folder / SHIPPED)
     table = compared(folder)
     assert table.loc[("house", 2, "full"), SCENEFUSE].notna().all()
@@ -300,7 +338,16 @@ def test_the_page_says_that_the_table_could_not_be_made(folder):
 
 
 def test_the_page_says_which_rows_a_note_is_about():
-    row = {"in_paper": "x", "definition": "y", "unit": "1", PAPER: "-", HERE: "1", SCENEFUSE: "2", NULL: "-"}
+    row = {
+        "in_paper": "x",
+        "definition": "y",
+        "unit": "1",
+        PAPER: "-",
+        HERE: "1",
+        SCENEFUSE: "2",
+        COMMON: "-",
+        NULL: "-",
+    }
     places = [("2", "full", "fitness"), ("3", "full", "nue"), ("4", "no_crop", "fitness"), ("4", "no_crop", "tau")]
     notes = ["a", "a", "b", "-"]
     rows = [
