@@ -122,7 +122,7 @@ def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond:
     return counts
 
 
-def least_framing(views: Sequence[View], own: Array) -> int:
+def least_framing(views: Sequence[View], own: Array, share: float = LEAST_FRAMING) -> int:
     """How many photos must have a place in their frame for it to be the object's, whatever they show there.
 
     A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
@@ -131,6 +131,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
     Args:
         views: the photos, with masks as `pixels`.
         own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
+        share: of these photos.
     """
     if len(own) >= LEAST_OWN:
         framed = np.zeros(len(own), dtype=np.int64)
@@ -139,7 +140,7 @@ def least_framing(views: Sequence[View], own: Array) -> int:
         usual = float(np.percentile(framed, RARELY_FRAMED))
     else:
         usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
-    return max(LEAST_PHOTOS, int(np.ceil(LEAST_FRAMING * usual)))
+    return max(LEAST_PHOTOS, int(np.ceil(share * usual)))
 
 
 def is_whole(mask: Mask) -> bool:

@@ -31,6 +31,8 @@ ROUGH_FACTOR = 1.5
 LEAST_PIXELS = 16
 # Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
 HALF_DIAGONAL = 0.87
+# Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
+FRAMED = 0.3
 # The rough cube around the object's own points is wider than these by this share of their diagonal on each side.
 REACH = 0.25
 # Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
@@ -198,7 +200,7 @@ def visual_hull(
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
-    quorum = least_framing([outline.view for outline in outlines], own)
+    quorum = least_framing([outline.view for outline in outlines], own, FRAMED)
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
