@@ -180,7 +180,11 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
             alike = factor.min(1) / factor.max(1) >= EDGE_LENGTH  # not so where an edge has no length
         likely = alike & (factor.min(1) > 1 / LARGEST_FACTOR) & (factor.max(1) < LARGEST_FACTOR)
         for one, other in zip(a[likely], b[likely]):
-            found = np.linalg.norm(fit_sim3(one, other).apply(source) - target, axis=1) <= distance
+            try:
+                pose = fit_sim3(one, other)
+            except ValueError:  # along one line
+                continue
+            found = np.linalg.norm(pose.apply(source) - target, axis=1) <= distance
             if found.sum() > best.sum():
                 best = found
                 wanted = np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** RANSAC_POINTS, CONFIDENCE))

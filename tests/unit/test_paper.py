@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 from support.planted import plant
 
 from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.registration import paper
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.paper import agreeing, matched_scale, paper_coarse, paper_fine, register_as_paper
 from scenefuse.registration.problem import Evidence, Inputs, Problem
@@ -113,6 +114,12 @@ def test_matches_that_agree_are_told_from_those_that_only_lie_near():
     target[wrong] = target[rng.permutation(200)[: wrong.sum()]]
     found = agreeing(source, target, 0.01, 0)
     assert np.array_equal(found, np.linalg.norm(pose.apply(source) - target, axis=1) <= 0.01)
+
+
+def test_matches_along_one_line_agree_on_nothing(monkeypatch):
+    monkeypatch.setattr(paper, "RANSAC_SAMPLES", 100)
+    line = np.outer(np.arange(9.0), [1, 2, 3])
+    assert not agreeing(line, 1.1 * line, 0.1, 0).any()
 
 
 def test_too_few_matches_give_no_scale_and_say_so(copied, capsys):
