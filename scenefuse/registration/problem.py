@@ -77,15 +77,15 @@ class Alignment:
     shared_points: int
     scale_from_centres: float | None
 
-    def agrees(self, pose: Sim3, centre: Array, diagonal: float) -> bool:
-        """Whether a pose lies within three standard deviations, or within 3 %, 3 degrees and 3 % of the diagonal."""
+    def agrees(self, pose: Sim3, centre: Array, diagonal: float, times: float = 1.0) -> bool:
+        """Whether a pose lies within `times` three standard deviations, or 3 %, 3 degrees and 3 % of the diagonal."""
         scale = abs(np.log(pose.scale / self.pose.scale))
         angle = rotation_angle_deg(pose.rotation @ self.pose.rotation.T)
         shift = float(np.linalg.norm(pose.apply(centre) - self.pose.apply(centre)))
         return bool(
-            scale <= max(0.03, 3 * self.uncertainty.scale_sd_log)
-            and angle <= max(3.0, 3 * self.uncertainty.rotation_sd_deg)
-            and shift <= max(0.03 * diagonal, 3 * self.uncertainty.translation_sd)
+            scale <= times * max(0.03, 3 * self.uncertainty.scale_sd_log)
+            and angle <= times * max(3.0, 3 * self.uncertainty.rotation_sd_deg)
+            and shift <= times * max(0.03 * diagonal, 3 * self.uncertainty.translation_sd)
         )
 
 

@@ -7,7 +7,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.coarse import Candidate
-from scenefuse.registration.decision import DecidedBy, Decision, FineSettings, decide, unless_torn
+from scenefuse.registration.decision import (
+    MAX_FREE_SPACE_VIOLATION,
+    DecidedBy,
+    Decision,
+    FineSettings,
+    decide,
+    unless_torn,
+)
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
@@ -35,6 +42,9 @@ OFF_SCALE = 1.06
 BEYOND_PRIOR = 0.15
 # The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
 ASTRAY = 0.9
+# A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
+# times that.
+NEAR_ALIGNMENT = 2.0
 # Halves of the surface that are registered again for the uncertainty.
 RESAMPLINGS = 8
 
@@ -206,7 +216,8 @@ class _Work:
         alignment's own the less uncertain one is taken; the worse the clouds score at the alignment's pose, the less
         uncertain that must be. Where they score as well there, what they differ by beyond the alignment's uncertainty
         counts as theirs: surfaces err alike, which their scatter does not show. A refinement that leaves the
-        alignment's valley is dropped.
+        alignment's valley is dropped, unless it stays near and the scene's photos refute the alignment's own pose: both
+        models may be bent. Then it has to pass as a pose that no photos support.
         """
         alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
         if alignment is None:
@@ -218,6 +229,9 @@ class _Work:
         by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        near = alignment.agrees(ranked[0].pose, self.centre, diagonal, NEAR_ALIGNMENT)
+        if strays and near and _refuted(by_photos) and not _refuted(ranked[0]):
+            return ranked, own, "geometry"
         if own is not None and worth > ASTRAY:
             own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
         if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
@@ -228,6 +242,12 @@ class _Work:
         """How well a pose explains both clouds."""
         tau = self.settings.score_fraction * self.problem.scene.diagonal
         return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.evidence.free_space)
+
+
+def _refuted(h: Hypothesis) -> bool:
+    """Whether a pose puts too much of the object where the scene's photos see something behind it."""
+    violation = h.score.free_space_violation
+    return violation is not None and violation > MAX_FREE_SPACE_VIOLATION
 
 
 def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:

@@ -1,6 +1,7 @@
 """Registration on planted trials: the truth is found, or the object is refused."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -384,6 +385,23 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     assert outcome.decision.registered and outcome.decision.decided_by == "photos"
     scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
     assert abs(scale) < 2 and angle < 2 and shift < 0.01
+
+
+@pytest.mark.parametrize(("lift", "registered"), [(0.05, True), (0.3, False)])
+def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_the_clouds_find(house, lift, registered):
+    truth, up = house.scene_from_object, lift * house.diagonal
+    lifted = Sim3(truth.scale, truth.rotation, truth.translation + [0, 0, up])
+    empty = SimpleNamespace(
+        violation=lambda points: float(points[:, 2].min() > house.scene.points[:, 2].min() + up / 2)
+    )
+    sure = Alignment(lifted, Uncertainty.even(1e-4, 0.01, 1e-4), 40, None)  # of models that are bent
+    outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), empty, sure))
+    assert outcome.decision.registered == registered, outcome.decision.reason
+    assert outcome.decision.decided_by == ("geometry" if registered else "photos")
+    if registered:
+        centre = house.object.points.mean(0)
+        scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
+        assert abs(scale) < 2 and angle < 2 and shift < 0.02
 
 
 def test_an_object_in_the_scenes_free_space_is_refused(house):
