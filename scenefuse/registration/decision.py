@@ -14,7 +14,7 @@ from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.stage import setting
 from scenefuse.transforms import Array, Sim3
 
-DecidedBy = Literal["geometry", "photos", "both"]
+DecidedBy = Literal["geometry", "near", "photos", "both"]
 
 # The gate's further thresholds. Right poses of the planted trials pass them with room to spare.
 MIN_RECALL = 0.4  # share of the scene crop that the object explains
@@ -58,8 +58,8 @@ class Decision:
     Attributes:
         registered: whether the pose may be used.
         reason: one sentence why.
-        decided_by: `geometry`, `photos` (the alignment from shared features replaced the clouds' pose) or `both` (they
-            agree).
+        decided_by: `geometry`, `near` (that, near an alignment whose own pose the scene's photos refute), `photos` (the
+            alignment from shared features replaced the clouds' pose) or `both` (they agree).
         margin: relative lead over the best rival, 0..1.
         rival: the best pose that differs and would leave the object elsewhere, or None.
         free_axis: unit vector (3,) in the scene about which the object can turn and stay the same, or None.
@@ -101,11 +101,14 @@ def decide(
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
-    of_clouds = _reasons_of_clouds(best, margin, problem, settings) if decided_by == "geometry" else ()
+    by_clouds = decided_by in ("geometry", "near")
+    of_clouds = _reasons_of_clouds(best, margin, problem, settings) if by_clouds else ()
     of_spread = _reasons_of_spread(free_axis, uncertainty, problem.scene.diagonal, settings)
     reason = next(_reasons(best, (*of_clouds, *of_spread), problem), None)
+    fit = f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose{_freely(free_axis)}"
     words = {
-        "geometry": f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose{_freely(free_axis)}",
+        "geometry": fit,
+        "near": f"by the clouds, near the alignment, whose own pose the scene's photos refute: {fit}",
         "both": f"alignment and clouds agree, F-score {best.score.f_score:.2f}",
         "photos": f"by the alignment, against the clouds' best fit, F-score {best.score.f_score:.2f}",
     }[decided_by]

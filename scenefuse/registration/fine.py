@@ -190,7 +190,8 @@ def scale_ledger(
     by_photos = alignment is not None and best.pose is alignment.pose
     if alignment is not None:
         relation = "and the clouds agree" if decided_by == "both" else "the clouds' best fit is another pose"
-        use = f"taken: less uncertain than the clouds; {relation}" if by_photos else "confirms"
+        otherwise = "none: its pose lies in free space" if decided_by == "near" else "confirms"
+        use = f"taken: less uncertain than the clouds; {relation}" if by_photos else otherwise
         rows.append(ledger_row("shared points", alignment.pose.scale, alignment.uncertainty.scale_sd_log, use))
         if alignment.scale_from_centres is not None:
             rows.append(ledger_row("camera centres", alignment.scale_from_centres, None, "none"))

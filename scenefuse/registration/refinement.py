@@ -231,7 +231,7 @@ class _Work:
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
         near = alignment.agrees(ranked[0].pose, self.centre, diagonal, NEAR_ALIGNMENT)
         if strays and near and _refuted(by_photos) and not _refuted(ranked[0]):
-            return ranked, own, "geometry"
+            return ranked, own, "near"
         if own is not None and worth > ASTRAY:
             own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
         if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):

@@ -194,6 +194,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
 
 _DECIDED = {
     "geometry": "by the clouds alone: no photos link object and scene",
+    "near": "by the clouds, near the alignment from shared features, whose own pose the scene's photos refute",
     "both": "clouds and the alignment from shared features agree",
     "photos": "by the alignment from shared features, against the clouds",
 }

@@ -397,7 +397,7 @@ def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_th
     sure = Alignment(lifted, Uncertainty.even(1e-4, 0.01, 1e-4), 40, None)  # of models that are bent
     outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), empty, sure))
     assert outcome.decision.registered == registered, outcome.decision.reason
-    assert outcome.decision.decided_by == ("geometry" if registered else "photos")
+    assert outcome.decision.decided_by == ("near" if registered else "photos")
     if registered:
         centre = house.object.points.mean(0)
         scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
