@@ -7,16 +7,18 @@ the precision of the file. Libraries are loaded when a file needs them.
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.io.readers.columns import COLOR, POSITION, Columns, common_name, positions
 from scenefuse.io.readers.meshes import Mesh, read_glb, read_obj, sampled_columns, triangles
+from scenefuse.io.readers.pcd import pcd_parts
 from scenefuse.io.readers.text import TEXTS, text_parts
-from scenefuse.io.tiles.ply_header import read_header
+from scenefuse.io.tiles.ply_header import read_header, read_text_header
 from scenefuse.stage import StageError
 
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
@@ -27,6 +29,10 @@ NOISE, WITHHELD = (7, 18), "withheld"
 LOOKED_AT = 1_000_000
 # Narrower than this share of its height, a cloud at coordinates like longitude and latitude is in degrees.
 DEGREES_BELOW = 1e-3
+# More points than any file has.
+EVERYTHING = 1 << 62
+# Lines of a PLY of text that are taken at once: they take several times the memory of their numbers.
+LINES_AT_ONCE = 1_000_000
 
 
 def read_columns(path: Path) -> Columns:
@@ -155,6 +161,9 @@ def las_dimensions(path: Path) -> list[str]:
 
 
 def _ply(path: Path) -> Columns:
+    """Points, or points drawn from the faces where there are any."""
+    if reader := part_reader(path):
+        return _joined(reader(path, EVERYTHING))
     from plyfile import PlyData
 
     content = PlyData.read(path)
@@ -176,20 +185,28 @@ def _ply(path: Path) -> Columns:
 
 
 def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
-    """The columns of a binary PLY whose points come first, so many rows at a time."""
-    elements, offset = read_header(path) or ([], 0)
-    row = elements[0].row
+    """The columns of a PLY whose points come first, without lists, so many rows at a time."""
+    binary = read_header(path)
+    elements, offset = binary or read_text_header(path) or ([], 0)
+    row, left = elements[0].row, elements[0].count
     assert row is not None and row.names is not None
-    names = [name for name in row.names if row[name].kind in "iuf"]
+    kinds = {name: row[name] for name in row.names if row[name].kind in "iuf"}
     with open(path, "rb") as file:
         file.seek(offset)
-        left = elements[0].count
         while left:
-            rows = np.fromfile(file, row, min(left, at_once))
+            rows: Any = np.fromfile(file, row, min(left, at_once)) if binary else _rows_of_text(file, row, left, at_once)
             if not len(rows):
                 raise StageError(f"{path} is cut short: its last {left} points are missing; copy it again")
             left -= len(rows)
-            yield {name: np.ascontiguousarray(rows[name]) for name in names}
+            yield {name: np.ascontiguousarray(rows[name]) for name in kinds}
+
+
+def _rows_of_text(file: BinaryIO, row: np.dtype[Any], left: int, at_once: int) -> NDArray[Any]:
+    """The next rows of a PLY of text; what the header calls single precision has the digits of the text."""
+    assert row.names is not None
+    lines = list(islice(file, min(left, at_once, LINES_AT_ONCE)))
+    wide = np.dtype([(name, "f8" if row[name].kind == "f" else row[name]) for name in row.names])
+    return np.loadtxt((line.decode("ascii") for line in lines), wide, ndmin=1) if lines else np.empty(0, wide)
 
 
 def _las(path: Path) -> Columns:
@@ -243,7 +260,7 @@ def _crs(header: Any) -> Any:
 
 def _e57(path: Path) -> Columns:
     """All scans of the file, each moved by its pose; points marked as invalid are left out."""
-    return _joined(_e57_parts(path, 1 << 62))
+    return _joined(_e57_parts(path, EVERYTHING))
 
 
 def _e57_parts(path: Path, at_once: int) -> Iterator[Columns]:
@@ -305,89 +322,15 @@ def _e57_pose(header: Any) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return turn, np.array([translation[part].value() for part in "xyz"])
 
 
-def _pcd(path: Path) -> Columns:
-    """PCD 0.7, ASCII, binary and compressed. Open3D misreads positions that are binary doubles, without a word."""
-    header: dict[str, list[str]] = {}
-    with open(path, "rb") as file:
-        while "DATA" not in header:
-            line = file.readline()
-            words = line.decode("ascii").split()
-            header |= {words[0]: words[1:]} if words else {}
-            if not line:
-                raise ValueError("it has no PCD header")
-        body = file.read()
-    names, kinds, sizes = header["FIELDS"], header["TYPE"], header["SIZE"]
-    repeats = [int(n) for n in header.get("COUNT", ["1"] * len(names))]
-    count = int(header["WIDTH"][0]) * int(header["HEIGHT"][0])
-    types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(kinds, sizes)]
-    if count == 0:
-        arrays = [np.empty((0, n)) for n in repeats]
-    elif header["DATA"] == ["ascii"]:
-        rows = np.loadtxt(body.decode("ascii").splitlines(), ndmin=2)
-        cuts = np.cumsum(repeats)[:-1]
-        arrays = [part.astype(kind) for part, kind in zip(np.split(rows, cuts, axis=1), types)]
-    elif header["DATA"] == ["binary"]:
-        row = np.dtype([(str(k), kind, (n,)) for k, (kind, n) in enumerate(zip(types, repeats))])
-        table = np.frombuffer(body, row, count)
-        arrays = [table[str(k)] for k in range(len(names))]
-    else:
-        packed, size = np.frombuffer(body, "<u4", 2)
-        raw = _lzf(np.frombuffer(body, np.uint8, packed, 8), size).tobytes()
-        ends = np.cumsum([0] + [kind.itemsize * n * count for kind, n in zip(types, repeats)])
-        arrays = [
-            np.frombuffer(raw, kind, count * n, at).reshape(count, n) for kind, n, at in zip(types, repeats, ends)
-        ]
-    columns = {name: array[:, 0] for name, array, n in zip(names, arrays, repeats) if n == 1 and name != "_"}
-    for name in {"rgb", "rgba"} & set(columns):
-        bits = np.ascontiguousarray(columns.pop(name).astype(types[names.index(name)])).view(np.uint32)
-        columns |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
-    return columns
-
-
-def _lzf(packed: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
-    """Undo LZF, the compression of PCD: runs of literal bytes, and copies of bytes that came before."""
-    from numba import njit
-
-    @njit
-    def unpack(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
-        at, end = 0, 0
-        while at < len(source):
-            control = int(source[at])
-            at += 1
-            if control < 32:
-                length, start = control + 1, -1
-            else:
-                length = (control >> 5) + 2
-                if length == 9:
-                    length += int(source[at])
-                    at += 1
-                start = end - ((control & 31) << 8) - int(source[at]) - 1
-                at += 1
-                if start < 0:
-                    return -1
-            if end + length > len(target) or (start < 0 and at + length > len(source)):
-                return -1
-            for k in range(length):
-                target[end + k] = source[at + k] if start < 0 else target[start + k]
-            end += length
-            at += length if start < 0 else 0
-        return end
-
-    target = np.zeros(size, np.uint8)
-    if unpack(packed, target) != size:
-        raise ValueError("its compressed part is damaged")
-    return target
-
-
 def part_reader(path: Path) -> Callable[[Path, int], Iterator[Columns]] | None:
     """What reads so many points of a file at a time; None where it has to be read whole."""
     ending = path.suffix.lower()
-    if ending != ".ply":
-        in_parts = {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts, **dict.fromkeys(TEXTS, text_parts)}
-        return in_parts.get(ending)
-    elements = (read_header(path) or ([], 0))[0]
-    plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
-    return _ply_parts if plain and not any(element.name == "face" for element in elements) else None
+    if ending == ".ply":
+        elements = (read_header(path) or read_text_header(path) or ([], 0))[0]
+        plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
+        return _ply_parts if plain and not any(element.name == "face" and element.count for element in elements) else None
+    in_parts = {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts, ".pcd": pcd_parts}
+    return (in_parts | dict.fromkeys(TEXTS, text_parts)).get(ending)
 
 
 READERS = {
@@ -397,6 +340,6 @@ READERS = {
     ".las": _las,
     ".laz": _las,
     ".e57": _e57,
-    ".pcd": _pcd,
+    ".pcd": lambda path: _joined(pcd_parts(path)),
     **dict.fromkeys(TEXTS, lambda path: _joined(text_parts(path))),
 }

@@ -7,7 +7,7 @@ import pye57
 import pytest
 from pye57 import libe57
 from scipy.spatial.transform import Rotation
-from support.cloud_files import UTM, write_e57
+from support.cloud_files import UTM, write_e57, write_pcd
 
 from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
 from scenefuse.io.formats import bytes_of, las_crs
@@ -25,29 +25,22 @@ def cloud() -> Cloud:
     return Cloud(rng.uniform(0, 1, (40, 3)) + UTM, normals.astype(np.float32), colors)
 
 
-def write_pcd(path, cloud, data, kind="U"):
-    """PCD with double positions and packed colours, as PCL writes it."""
-    names = "x y z rgb normal_x normal_y normal_z"
-    header = (
-        f"# .PCD v0.7\nVERSION 0.7\nFIELDS {names}\nSIZE 8 8 8 4 4 4 4\nTYPE F F F {kind} F F F\nCOUNT 1 1 1 1 1 1 1\n"
-    )
-    header += f"WIDTH {len(cloud)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(cloud)}\nDATA {data}\n"
-    table = np.empty(len(cloud), [(n, "<f8" if n in "xyz" else "<u4" if n == "rgb" else "<f4") for n in names.split()])
-    table["x"], table["y"], table["z"] = cloud.points.T
-    table["rgb"] = cloud.colors.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-    table["normal_x"], table["normal_y"], table["normal_z"] = cloud.normals.T
-    body = (
-        table.tobytes() if data == "binary" else "\n".join(" ".join(map(repr, row)) for row in table.tolist()).encode()
-    )
-    path.write_bytes(header.encode() + body)
-
-
 @pytest.mark.parametrize("data", ["binary", "ascii"])
 def test_pcd_keeps_doubles_colours_and_normals(tmp_path, cloud, data):
     write_pcd(tmp_path / "a.pcd", cloud, data)
     found = read_cloud(tmp_path / "a.pcd")
     assert np.array_equal(found.points, cloud.points) and np.array_equal(found.colors, cloud.colors)
     assert np.allclose(found.normals, cloud.normals, atol=1e-7)
+
+
+def test_a_ply_of_text_keeps_the_digits_that_it_shows(tmp_path, cloud):
+    """Many programs call a position of metres in UTM a float, and print it whole."""
+    rows = "\n".join(f"{x:.4f} {y:.4f} {z:.4f} {k % 256}" for k, (x, y, z) in enumerate(cloud.points))
+    names = "".join(f"property float {name}\n" for name in "xyz") + "property uchar label\n"
+    (tmp_path / "a.ply").write_text(f"ply\nformat ascii 1.0\nelement vertex 40\n{names}end_header\n{rows}\n")
+    found = read_cloud(tmp_path / "a.ply")
+    assert np.abs(found.points - cloud.points).max() < 1e-4
+    assert found.fields["label"].tolist() == list(range(40)) and found.fields["label"].dtype == np.uint8
 
 
 def test_compressed_pcd_reads_as_its_writer_reads_it(tmp_path):

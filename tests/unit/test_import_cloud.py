@@ -6,7 +6,8 @@ import laspy
 import numpy as np
 import pyproj
 import pytest
-from support.cloud_files import UTM, write_e57
+from plyfile import PlyData
+from support.cloud_files import UTM, write_e57, write_pcd
 from support.copc_file import write_copc
 
 from scenefuse.fusion.fuse_object import possible
@@ -47,8 +48,12 @@ def write_as(path, cloud):
         write_laz(path, Cloud(cloud.points - UTM, None, cloud.colors), UTM, "EPSG:32632")
     elif path.suffix == ".e57":
         write_e57(path, [(cloud.points, cloud.colors, np.array([1.0, 0, 0, 0]), np.zeros(3))])
+    elif path.suffix == ".pcd":
+        write_pcd(path, cloud, "ascii" if "text" in path.name else "binary")
     elif path.suffix == ".ply":
         write_cloud(path, cloud)
+        if "text" in path.name:
+            PlyData(PlyData.read(path, mmap=False).elements, text=True).write(path)
     else:
         np.savetxt(path, np.c_[cloud.points, cloud.colors], fmt=["%.6f"] * 3 + ["%d"] * 3)
     return path
@@ -64,7 +69,7 @@ def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path
     assert value(report, "points") == 500 and value(report, "source") == name
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.xyz", "a.copc.laz"])
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.xyz", "a.copc.laz"])
 def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkeypatch):
     turned = np.random.default_rng(1).normal(size=(500, 3))
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
@@ -74,7 +79,7 @@ def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkey
     found, *others = imported_scene(tmp_path, source)
     assert jsons == others and np.array_equal(found.points, whole.points)
     assert np.array_equal(found.colors, cloud.colors)
-    assert (found.normals is None) == (name != "a.ply") and np.array_equal(found.normals, whole.normals)
+    assert (found.normals is None) == (not name.endswith((".ply", ".pcd"))) and np.array_equal(found.normals, whole.normals)
 
 
 def test_a_copc_of_many_nodes_is_read_whole(tmp_path, monkeypatch):
@@ -98,7 +103,7 @@ def test_colors_of_16_bits_are_told_from_bytes_by_the_whole_file(tmp_path, cloud
     assert imported_scene(tmp_path, tmp_path / "a.ply")[0].colors[-1].tolist() == [255, 1, 0]
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "a.copc.laz"])
+@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.copc.laz"])
 def test_a_file_that_is_cut_short_is_one_sentence(tmp_path, cloud, name, monkeypatch):
     monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", 64)
     source = write_as(tmp_path / name, cloud)

@@ -13,8 +13,8 @@ ColumnParts = Callable[[], Iterator[Columns]]
 def columns_in_parts(path: Path, degrees: bool = False) -> ColumnParts:
     """The columns of a cloud file, as `read_columns` has them, AT_ONCE rows at a time each time this is called.
 
-    LAS, LAZ (COPC too), E57, text and binary PLY are read anew each time; PCD and meshes once, and held. Here colours
-    of a LAS file may all be black.
+    Clouds are read anew each time, meshes once, and held; of a compressed PCD all columns are held while it is read.
+    Here colours of a LAS file may all be black.
 
     Args:
         path: of the file.

@@ -37,16 +37,24 @@ def read_header(path: Path) -> tuple[list[Element], int] | None:
     Raises:
         StageError: the file does not exist.
     """
+    return _header(path, {"binary_little_endian": "<", "binary_big_endian": ">"})
+
+
+def read_text_header(path: Path) -> tuple[list[Element], int] | None:
+    """The same of a PLY of text; None where it is binary or no PLY."""
+    return _header(path, {"ascii": "="})
+
+
+def _header(path: Path, orders: dict[str, str]) -> tuple[list[Element], int] | None:
+    """The same of the formats that are keys of `orders`, whose values are NumPy's byte orders."""
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the stage that writes it first")
     with open(path, "rb") as file:
         lines = _lines(file)
         if lines[:1] != ["ply"] or lines[-1] != "end_header":
             return None
-        order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get((lines[1].split() + ["", ""])[1])
-        if order is None:
-            return None
-        return _elements(lines[2:], order), file.tell()
+        order = orders.get((lines[1].split() + ["", ""])[1])
+        return None if order is None else (_elements(lines[2:], order), file.tell())
 
 
 def header_of(elements: list[Element]) -> bytes:
