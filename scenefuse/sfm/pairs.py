@@ -20,6 +20,10 @@ Pair = tuple[str, str]
 # GPS positions that spread less (RMS, metres) than this do not tell neighbours from others: five times the standard
 # error of a plain receiver.
 MIN_GPS_SPREAD_M = 15.0
+# Positions so near each other are one: a phone writes its last fix into dozens of photos.
+SAME_POSITION_M = 0.1
+# Share of the photos that may stand at one position with more photos than each is compared with.
+MOST_REPEATED = 0.1
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,7 @@ def choose_pairs(photos: list[Photo], is_video: bool, settings: MatchSettings) -
     kind, reason = settings.pairs, "as configured"
     if kind == "auto":
         kind, reason = _automatic(photos, is_video, settings)
-    if kind == "spatial" and not _gps_usable(photos):
+    if kind == "spatial" and not _gps_usable(photos, settings.neighbours):
         kind, reason = "exhaustive", "pairs are set to spatial, but too few photos have a useful GPS position"
     if kind == "exhaustive":
         return kind, reason, list(combinations(names, 2))
@@ -78,12 +82,13 @@ def spatial_pairs(photos: list[Photo], neighbours: int) -> list[Pair]:
     known, positions = gps_positions(photos)
     at = {name: row for row, name in enumerate(known)}
     order = {name: index for index, name in enumerate(names)}
-    metric = local_frame(positions).apply(positions)
-    heights = metric[:, 2][np.isfinite(metric[:, 2])]
-    metric[:, 2] = np.nan_to_num(metric[:, 2], nan=np.median(heights) if len(heights) else 0.0)
+    metric = _metric(positions)
     chosen = {_ordered(a, b, order) for a in names if a not in at for b in names if a != b}
     distance = cdist(metric[:, :2], metric[:, :2])
-    by_ground, by_space = (np.argsort(d, axis=1, kind="stable") for d in (distance, cdist(metric, metric)))
+    # Of photos at one position those next to each other in the order of their names.
+    rows = np.arange(len(known))
+    apart = np.abs(rows[:, None] - rows)
+    by_ground, by_space = (np.lexsort((apart, d)) for d in (distance, cdist(metric, metric)))
     for row, name in enumerate(known):
         others = [c for c in by_ground[row] if c != row][: neighbours // 2]
         others += [c for c in by_space[row] if c != row and c not in others][: neighbours - len(others)]
@@ -112,7 +117,7 @@ def _automatic(
     photos: list[Photo], is_video: bool, settings: MatchSettings
 ) -> tuple[Literal["exhaustive", "spatial", "sequential"], str]:
     count = len(photos)
-    if count >= settings.spatial_from and _gps_usable(photos):
+    if count >= settings.spatial_from and _gps_usable(photos, settings.neighbours):
         return "spatial", f"{count} photos with GPS, {settings.neighbours} neighbours each"
     if is_video and count > settings.overlap * 2:
         return "sequential", "frames of a video"
@@ -121,9 +126,22 @@ def _automatic(
     return "sequential", f"{count} photos without GPS, more than {settings.exhaustive_up_to}"
 
 
-def _gps_usable(photos: list[Photo]) -> bool:
+def _gps_usable(photos: list[Photo], neighbours: int) -> bool:
+    """Whether most photos have a position, and these tell which photos are neighbours."""
     known, positions = gps_positions(photos)
-    return len(known) >= max(3, 0.8 * len(photos)) and gps_spread_m(positions) > MIN_GPS_SPREAD_M
+    if len(known) < max(3, 0.8 * len(photos)) or gps_spread_m(positions) <= MIN_GPS_SPREAD_M:
+        return False
+    cells = np.rint(_metric(positions) / SAME_POSITION_M)
+    _, at, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    return float((counts[at.ravel()] > neighbours).mean()) <= MOST_REPEATED
+
+
+def _metric(positions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """WGS84 positions (N, 3) in metres, unknown heights in the middle of the others."""
+    metric = local_frame(positions).apply(positions)
+    heights = metric[:, 2][np.isfinite(metric[:, 2])]
+    metric[:, 2] = np.nan_to_num(metric[:, 2], nan=np.median(heights) if len(heights) else 0.0)
+    return metric
 
 
 def _counted(name: str) -> list[str | int]:

@@ -74,6 +74,18 @@ def test_flights_up_a_facade_and_flights_at_two_heights_hold_together():
     assert len(spatial_pairs(unknown, 10)) > 0
 
 
+def test_positions_that_a_phone_repeats_do_not_choose_the_pairs():
+    """A phone writes its last fix into dozens of photos: all distances among these are 0."""
+    repeated = [photo(f"{i:03d}.jpg", (40.0 * (i // 30), 0.0, 50.0)) for i in range(120)]
+    settings = MatchSettings()
+    assert choose_pairs(repeated, False, settings)[0] == "exhaustive"
+    assert choose_pairs(repeated, False, replace(settings, exhaustive_up_to=100))[0] == "sequential"
+    hovering = strip(120) + [photo(f"z{i:03d}.jpg", (500.0, 0.0, 50.0)) for i in range(12)]
+    assert choose_pairs(hovering, False, settings)[0] == "spatial"
+    pairs = set(spatial_pairs(hovering, 6))
+    assert pairs.issuperset([(f"z{i:03d}.jpg", f"z{i + 1:03d}.jpg") for i in range(11)])
+
+
 def test_sequential_pairs_close_loops():
     pairs = sequential_pairs([str(i) for i in range(9)], 2, 4)
     assert ("0", "2") in pairs and ("0", "3") not in pairs
