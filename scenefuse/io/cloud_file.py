@@ -7,7 +7,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, chosen_rows, cloud_of, concatenate, finite_rows, precision_note, spacing
+from scenefuse.io.clouds import (
+    Cloud,
+    chosen_rows,
+    cloud_of,
+    coincidence_note,
+    concatenate,
+    finite_rows,
+    precision_note,
+    spacing,
+)
 from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees
 from scenefuse.io.readers.columns import COLOR, Columns, positions
 from scenefuse.io.readers.text import text_notes
@@ -67,7 +76,7 @@ class CloudFile:
         notes = [*text_notes(path)]
         notes += [f"{number} {why} of {path} are not used" for why, number in whole.left_out.items() if number]
         found = cls(whole, cloud, part.every, last, notes)
-        notes += precision_note(path, cloud.points, found.spacing)
+        notes += [*precision_note(path, cloud.points, found.spacing), *coincidence_note(path, cloud.points)]
         return found
 
     @property

@@ -49,6 +49,10 @@ AT_ONCE = 1 << 18
 """Points whose neighbours are held at once."""
 
 
+COINCIDING = 0.1
+"""Share of points that lie where others do, from which it is told."""
+
+
 UNIT_TOLERANCE = 0.05
 """Normals may be this far from unit length."""
 
@@ -161,12 +165,21 @@ def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[n
 
 
 def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0, quantile: float = 0.5) -> float:
-    """Median (or other quantile) distance from a point to its nearest neighbour, by a seeded sample; 0 for one."""
+    """Median (or other quantile) distance from a point to its nearest neighbour elsewhere, by a seeded sample; 0 where
+    all are in one place. Of points that coincide, as in a scan that was merged twice, one counts."""
+    distance = _to_nearest(points, sample, seed)
+    if np.count_nonzero(distance == 0) > COINCIDING * len(distance):
+        distance = _to_nearest(np.unique(points, axis=0), sample, seed)
+    distance = distance[distance > 0]
+    return float(np.quantile(distance, quantile)) if len(distance) else 0.0
+
+
+def _to_nearest(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> NDArray[np.float64]:
+    """Distances from some of (N, 3) points to their nearest neighbours; none for one point."""
     if len(points) < 2:
-        return 0.0
-    tree = cKDTree(points)
+        return np.zeros(0)
     chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
-    return float(np.quantile(tree.query(points[chosen], k=2)[0][:, 1], quantile))
+    return np.asarray(cKDTree(points).query(points[chosen], k=2)[0][:, 1])
 
 
 def plane_normals(points: NDArray[np.float64], neighbours: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -270,6 +283,18 @@ def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list
     return [
         f"{path.name} has coordinates up to {farthest:.6g} in single precision, which knows them in steps of"
         f" {coarse:.3g}, and its points are {step:.3g} apart: export it in double precision, or shifted to near zero"
+    ]
+
+
+def coincidence_note(path: Path, points: NDArray[np.float64]) -> list[str]:
+    """What to say of a file where many of (N, 3) points lie in the place of others."""
+    distance = _to_nearest(points)
+    same = np.count_nonzero(distance == 0) / max(len(distance), 1)
+    if same <= COINCIDING:
+        return []
+    return [
+        f"{same:.0%} of the points of {path.name} lie exactly where others do, as in a scan that was merged twice or was"
+        " written in too coarse steps: their spacing is that between different places"
     ]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from scenefuse.io.clouds import (
     Cloud,
     cloud_of,
+    coincidence_note,
     concatenate,
     has_unit_normals,
     precision_note,
@@ -115,6 +116,7 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
     placed = replace(whole, points=whole.points - origin)
     write_cloud(cloud, placed)
     shift = Sim3(1.0, np.eye(3), -origin)
+    notes += coincidence_note(source, placed.points)
     content = file.report(spacing(placed.points), placed.diagonal, "object units", notes)
     content["points"] = quantity(len(placed), "1")
     write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
@@ -203,7 +205,8 @@ class ImportedFile:
 
         write_tiled(cloud, placed, self.survey.count, move(Cloud(self.survey.sample)).points)
         tiles = open_cloud(cloud)
-        return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit)
+        same = coincidence_note(self.survey.path, np.concatenate(tiles.samples()))
+        return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit, same)
 
     def report(self, step: float, diagonal: float, unit: str, more: Sequence[str] = ()) -> dict[str, Any]:
         """What was taken over, and what became of the rest; printed too.

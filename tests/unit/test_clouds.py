@@ -79,6 +79,15 @@ def test_spacing_of_a_grid_is_its_step():
     assert spacing(grid) == pytest.approx(0.25)
 
 
+def test_of_points_that_coincide_the_spacing_is_that_between_different_places():
+    grid = np.stack(np.meshgrid(*[np.arange(6) * 0.25] * 3), axis=-1).reshape(-1, 3)
+    assert spacing(np.concatenate([grid, grid])) == pytest.approx(0.25)
+    fine = np.random.default_rng(0).random((20_000, 3)) * [1, 1, 0]
+    assert spacing(np.round(fine, 1)) == pytest.approx(0.1)
+    assert spacing(np.concatenate([grid, grid[:5]]), quantile=0.0) == pytest.approx(0.25)
+    assert spacing(np.zeros((9, 3))) == spacing(grid[:1]) == 0
+
+
 def test_transform_turns_normals_and_keeps_fields():
     quarter = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3))
     one = Cloud(np.array([[1.0, 0, 0]]), np.array([[1, 0, 0]], dtype=np.float32), None, {"views": np.array([3])})

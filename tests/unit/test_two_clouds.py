@@ -194,6 +194,18 @@ def test_a_scene_with_some_field_of_the_same_name_keeps_it(tmp_path):
     assert any("'source' is 'source_after'" in n for n in value(read_json(tmp_path / "completed.json"), "notes"))
 
 
+def test_a_scan_that_was_merged_twice_is_completed_as_once_and_is_said_to_be(tmp_path):
+    scene = in_scene(sheet(0, 4))
+    write_survey(tmp_path / "once.laz", scene)
+    write_survey(tmp_path / "twice.laz", scene[np.tile(np.arange(len(scene)), 2)])
+    once, twice = (CloudFile.of(tmp_path / f"{name}.laz") for name in ("once", "twice"))
+    settings = FusionSettings(mode="fill", match_colors=False)
+    done, again = (complete(own(sheet(2, 8)), file, POSE, settings) for file in (once, twice))
+    assert again.fill_distance == done.fill_distance > 0.1 and np.array_equal(again.added.points, done.added.points)
+    assert 0 < len(done.added) < 0.7 * len(sheet(2, 8)) and not once.notes
+    assert any("100% of the points of twice.laz lie exactly where others do" in note for note in twice.notes)
+
+
 def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be(tmp_path, capsys):
     scene, obj = in_scene(sheet(0, 4)), Cloud(sheet(2, 8).points)
     scene.fields["height"] = scene.points[:, 2]

@@ -99,11 +99,15 @@ class TiledCloud:
 
     def spacing(self, seed: int = 0) -> float:
         """Median distance from a point to its nearest neighbour; of a larger cloud in a few tiles, drawn by points."""
+        return float(np.median([spacing(points, seed=seed) for points in self.samples(seed)]))
+
+    def samples(self, seed: int = 0) -> list[Array]:
+        """All points (N, 3), or of a larger cloud those of a few tiles, drawn by points."""
         if len(self) <= WHOLE:
-            return spacing(self.read(np.arange(len(self.low)))[1].points, seed=seed)
+            return [self.read(np.arange(len(self.low)))[1].points]
         drawn = np.random.default_rng(seed).integers(0, len(self), SPACING_TILES)
         tiles = np.unique(np.searchsorted(self.starts, drawn, side="right") - 1)
-        return float(np.median([spacing(self.read(tiles[k : k + 1])[1].points, seed=seed) for k in range(len(tiles))]))
+        return [self.read(tiles[k : k + 1])[1].points for k in range(len(tiles))]
 
     def _records(self, first: int, last: int) -> NDArray[Any]:
         with open(self.path, "rb") as file:
