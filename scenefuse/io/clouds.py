@@ -36,8 +36,8 @@ FAR = 10.0
 """Sizes of a cloud; what lies so far from it is none of it."""
 
 
-SINGLE_STEP = 0.25
-"""Of the spacing of points, from which the steps of single precision show."""
+STEP_SPACINGS = 0.25
+"""Of the spacing of points, from which the steps of their coordinates show."""
 
 
 NEIGHBOURS, ALONE, LONELY, FEW = 8, 0.02, 10.0, 0.1
@@ -278,7 +278,7 @@ def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list
     """What to say of coordinates in single precision, whose steps are not small beside the spacing `step`."""
     farthest = float(np.abs(points).max(initial=0))
     coarse = float(np.spacing(np.float32(farthest)))
-    if coarse < SINGLE_STEP * step or not (points == points.astype(np.float32)).all():
+    if coarse < STEP_SPACINGS * step or not (points == points.astype(np.float32)).all():
         return []
     return [
         f"{path.name} has coordinates up to {farthest:.6g} in single precision, which knows them in steps of"
@@ -338,7 +338,8 @@ def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
 
 
 def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
-    """Write LAZ 1.4, coordinates to a millimetre; without a CRS to 1e-8 of the cloud's diagonal.
+    """Write LAZ 1.4, coordinates to a millimetre, or finer where the points ask for it; without a CRS to 1e-8 of the
+    cloud's diagonal.
 
     Args:
         path: output, .laz or .las.
@@ -347,7 +348,8 @@ def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | 
         crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
     """
     ends = cloud.points.min(0, initial=np.inf), cloud.points.max(0, initial=-np.inf)
-    with laz_in_parts(path, cloud, ends if len(cloud) else (np.zeros(3), np.zeros(3)), origin, crs) as append:
+    ends, apart = ends if len(cloud) else (np.zeros(3), np.zeros(3)), spacing(cloud.points)
+    with laz_in_parts(path, cloud, ends, origin, crs, apart) as append:
         append(cloud)
 
 
@@ -368,7 +370,7 @@ class LasLayout:
     @classmethod
     def of(
         cls, path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]],
-        origin: NDArray[np.float64], crs: str | None,
+        origin: NDArray[np.float64], crs: str | None, apart: float,
     ) -> "LasLayout":  # fmt: skip
         """For clouds of `like`'s columns; see `laz_in_parts`."""
         import laspy
@@ -378,7 +380,7 @@ class LasLayout:
         header.generating_software = f"scenefuse {VERSION}"
         low, high = box
         if crs is not None:
-            step, offset = _step_of(path, np.maximum(np.abs(low), np.abs(high))), np.floor(origin)
+            step, offset = _step_of(path, np.maximum(np.abs(low), np.abs(high)), apart), np.floor(origin)
         else:  # LAS counts steps from the offset in 32 bits, and the points may lie anywhere
             step, offset = (float(np.linalg.norm(high - low)) or 1.0) * 1e-8, origin + (low + high) / 2
         header.scales, header.offsets = np.full(3, step), offset
@@ -409,15 +411,28 @@ class LasLayout:
         return points
 
 
-def _step_of(path: Path, farthest: NDArray[np.float64]) -> float:
-    """A thousandth of the CRS's unit, or more where 32 bits do not count as far as strays lie.
+def finer(step: float, apart: float, fits: Callable[[float], bool]) -> float:
+    """A step of coordinates, or the tenth of it, or of that, ..., that points which lie `apart` need, as far as `fits`
+    says that integers count so far."""
+    while step > STEP_SPACINGS * apart > 0 and fits(step / 10):
+        step /= 10
+    return step
+
+
+def _step_of(path: Path, farthest: NDArray[np.float64], apart: float) -> float:
+    """A thousandth of the CRS's unit; less where points are dense; more where 32 bits do not count as far as strays lie.
 
     Args:
         path: for the note.
         farthest: (3,) largest distance from the origin along each axis; the factor of 4 is for turned axes and feet.
+        apart: spacing of the points.
     """
-    step = 0.001
-    while 4 * np.linalg.norm(farthest) / step >= 1 << 31:
+
+    def fits(step: float) -> bool:
+        return bool(4 * np.linalg.norm(farthest) / step < 1 << 31)
+
+    step = finer(0.001, apart, fits)
+    while not fits(step):
         step *= 10
     if step > 0.001:
         print(
@@ -431,7 +446,7 @@ def _step_of(path: Path, farthest: NDArray[np.float64]) -> float:
 @contextmanager
 def laz_in_parts(
     path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
-    crs: str | None,
+    crs: str | None, apart: float = np.inf,
 ) -> Iterator[Callable[[Cloud], None]]:  # fmt: skip
     """`write_laz` for clouds of any size: gives a function that appends a part.
 
@@ -441,6 +456,7 @@ def laz_in_parts(
         box: two opposite corners (3,) of a box around all points, relative to `origin`.
         origin: see `write_laz`.
         crs: see `write_laz`.
+        apart: spacing of the points; much closer than a millimetre it asks for finer steps.
 
     Raises:
         StageError: the disk is full.
@@ -448,7 +464,7 @@ def laz_in_parts(
     import laspy
     import lazrs
 
-    layout = LasLayout.of(path, like, box, origin, crs)
+    layout = LasLayout.of(path, like, box, origin, crs, apart)
 
     def append(part: Cloud) -> None:
         writer.write_points(layout.records(part))

@@ -15,7 +15,7 @@ from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
 from scenefuse.io.cloud_file import CloudFile
-from scenefuse.io.clouds import LAS_DESCRIPTIONS, Cloud, records_of, spacing
+from scenefuse.io.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, records_of, spacing
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import unit_and_name
 from scenefuse.io.readers.columns import COLOR
@@ -28,6 +28,9 @@ from scenefuse.version import VERSION
 
 CHUNK = 1_000_000
 """Points of a LAS file that are copied at a time."""
+AXES = ("X", "Y", "Z")
+MOST = np.iinfo(np.int32).max
+"""Integers of a LAS file's coordinates, and the greatest of them."""
 OWN = {*FIELDS, "source"}
 """Fields of a completed scene; one that is completed again keeps them, and its numbers in `source` go on."""
 
@@ -167,12 +170,13 @@ def _stay(rows: Rows, done: Completed) -> NDArray[np.bool_]:
 def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
     """Copy a LAS or LAZ file with all that its points have, and append what was added.
 
-    Coordinates keep the file's own steps, and its CRS stays. The fields of `Completed` become extra dimensions. Added
+    Coordinates keep the file's own steps, or have a tenth, a hundredth, ... of them where the added points are too dense
+    for these: the scene's points stay exactly where they are. The CRS stays. The fields of `Completed` become extra dimensions. Added
     points have colours where the file has them; their classification and the like are 0. Points are copied in parts, so
     that memory stays small.
 
     Returns:
-        Notes of what has another name there.
+        Notes of the steps, and of what has another name there.
 
     Raises:
         StageError: the object reaches farther than the file's coordinates can.
@@ -181,6 +185,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
 
     with laspy.open(scene.survey.path) as reader:
         header = copy.deepcopy(reader.header)
+        times, notes = _finer_steps(header, done, scene.survey.path)
         # What laspy writes; a later version has all that 1.0 and 1.1 have.
         header.version = max(header.version, laspy.header.Version(1, 2))
         # An index of the points (COPC) is not one of more points.
@@ -200,6 +205,10 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                 part = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
                 for name in chunk.array.dtype.names:
                     part.array[name] = chunk.array[name]
+                for axis in AXES if times > 1 else ():
+                    if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MOST:
+                        raise StageError(f"{scene.survey.path} has points outside the box that it names; write it again")
+                    part.array[axis] *= times
                 if "red" in own:
                     brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
                 if not again:
@@ -207,10 +216,40 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                     _fill_in(part, {names[name]: values for name, values in unknown.items()})
                 writer.write_points(part)
             colors = 1 if 0 < brightest <= 255 else 257
-            writer.write_points(_added_record(header, done, names, colors, scene.survey.path))
+            writer.write_points(_added_record(header, done, names, colors))
             if further:
                 writer.write_evlrs(further)
-    return [f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other]
+    return [*notes, *(f"in {path.name}, '{name}' is '{other}'" for name, other in names.items() if name != other)]
+
+
+def _finer_steps(header: Any, done: Completed, scene: Path) -> tuple[int, list[str]]:
+    """Make the steps of a file's coordinates as fine as the added points need, as far as 32 bits count.
+
+    Returns:
+        How many of the new steps an old one is, and a note of the change, or that there is none.
+
+    Raises:
+        StageError: the object reaches farther than the file's coordinates can.
+    """
+    own, apart, notes = header.scales.copy(), spacing(done.added.points), list[str]()
+    farthest = np.abs(done.added.points - header.offsets).max(0, initial=0) / own
+    if farthest.max() > MOST:
+        raise StageError(
+            f"the coordinates of {scene} end before the object does: its steps of {own.max():g} are too small; write it"
+            " again with larger ones (0.001)"
+        )
+    farthest = np.maximum(farthest, np.abs([header.mins, header.maxs] - header.offsets).max(0) / own)
+    step = finer(own.max(), apart, lambda step: bool(farthest.max() * (own.max() / step) <= MOST))
+    times = round(own.max() / step)
+    if times > 1:
+        header.scales = own / times
+        notes.append(f"completed.laz counts in steps of {step:g}, not {own.max():g}, as the object is so dense")
+    if step > STEP_SPACINGS * apart > 0:
+        notes.append(
+            f"the added points are {apart:.3g} apart, and completed.laz counts in steps of {step:g}: use completed.ply,"
+            " or write the scene again with an offset near its points and finer steps"
+        )
+    return times, notes
 
 
 def _free(name: str, taken: set[str]) -> str:
@@ -222,18 +261,13 @@ def _but_copc(records: Iterable[Any]) -> list[Any]:
     return [record for record in records if record.user_id != "copc"]
 
 
-def _added_record(header: Any, done: Completed, names: dict[str, str], colors: int, scene: Path) -> Any:
+def _added_record(header: Any, done: Completed, names: dict[str, str], colors: int) -> Any:
     """The added points as a LAS file's points; a file of 8-bit colours gets those, by the factor `colors`."""
     import laspy
 
     record = laspy.ScaleAwarePointRecord.zeros(len(done.added), header=header)
     steps = (done.added.points - header.offsets) / header.scales
-    if len(steps) and np.abs(steps).max() > np.iinfo(np.int32).max:
-        raise StageError(
-            f"the coordinates of {scene} end before the object does: its steps of {header.scales.max():g} are too"
-            " small; write it again with larger ones (0.001)"
-        )
-    columns: dict[str, NDArray[Any]] = dict(zip("XYZ", np.rint(steps).astype(np.int32).T))
+    columns: dict[str, NDArray[Any]] = dict(zip(AXES, np.rint(steps).astype(np.int32).T))
     columns |= dict.fromkeys(("return_number", "number_of_returns"), np.ones(len(record), np.uint8))
     if done.added.colors is not None and "red" in header.point_format.dimension_names:
         columns |= dict(zip(COLOR, done.added.colors.astype(np.uint16).T * colors))

@@ -1,5 +1,6 @@
 import sys
 
+import laspy
 import numpy as np
 import pytest
 
@@ -102,6 +103,13 @@ def test_concatenate_keeps_what_all_clouds_have():
     )
     assert len(joined) == 53 and joined.normals is None and joined.colors is not None
     assert list(joined.fields) == ["source"]
+
+
+def test_a_laz_in_a_crs_has_steps_as_fine_as_its_points_are_dense(tmp_path):
+    grid = np.stack(np.meshgrid(*[np.arange(20) * 0.0005] * 2, [0.0]), axis=-1).reshape(-1, 3)
+    for name, times, step in (("fine", 1, 0.0001), ("coarse", 100, 0.001)):
+        write_laz(tmp_path / f"{name}.laz", Cloud(grid * times), np.array([5e5, 5.5e6, 300]), "EPSG:32632")
+        assert laspy.open(tmp_path / f"{name}.laz").header.scales == pytest.approx([step] * 3)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")

@@ -147,6 +147,27 @@ def test_a_laz_keeps_all_that_its_points_have(tmp_path):
     assert (after.classification[count:] == 0).all() and (after.return_number[count:] == 1).all()
 
 
+@pytest.mark.parametrize(("offset", "step"), [(0.0, 0.001), (1e8, 0.1)])
+def test_a_laz_has_finer_steps_where_the_object_asks_for_them_or_says_that_it_cannot(tmp_path, offset, step):
+    scene = in_scene(sheet(0, 4))
+    header = laspy.LasHeader(point_format=3, version="1.2")
+    header.scales, header.offsets = np.full(3, 0.1), np.floor(UTM) - offset
+    las = laspy.LasData(header)
+    las.xyz = scene.points
+    las.write(tmp_path / "yard.laz")
+    file = CloudFile.of(tmp_path / "yard.laz")
+    dense = Cloud(np.random.default_rng(0).random((3000, 3)) * [1, 1, 0] + [5, 0, 0])
+    done = complete(own(dense), file, POSE, FusionSettings(mode="append"))
+    write_completed(tmp_path, done, tmp_path / "shed.ply", file)
+    after, count = laspy.read(tmp_path / "completed.laz"), len(scene)
+    assert after.header.scales == pytest.approx([step] * 3)
+    assert np.array_equal(after.X[:count], laspy.read(tmp_path / "yard.laz").X * round(0.1 / step))
+    assert np.abs(after.xyz[:count] - scene.points).max() < 1e-6
+    assert np.abs(after.xyz[count:] - done.added.points).max() <= step / 2 + 1e-6
+    notes = " ".join(value(read_json(tmp_path / "completed.json"), "notes"))
+    assert ("counts in steps of 0.001, not 0.1" if step < 0.1 else "use completed.ply") in notes
+
+
 @pytest.mark.parametrize("ending", ["las", "laz"])
 def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     scene, obj = in_scene(sheet(0, 4)), sheet(2, 8)

@@ -54,7 +54,7 @@ def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], 
         StageError: points lie where the CRS has no coordinates.
     """
     box = cloud.low.min(0), cloud.high.max(0)
-    layout = LasLayout.of(path, cloud.like, box, in_crs(np.zeros((1, 3)))[0], crs)
+    layout = LasLayout.of(path, cloud.like, box, in_crs(np.zeros((1, 3)))[0], crs, cloud.spacing())
     source = _Source.of(cloud, in_crs, layout)
     low, high = source.low.min(0), source.high.max(0)
     bits = max(int((high - low).max()).bit_length(), GRID_BITS)
