@@ -461,18 +461,25 @@ def laz_in_parts(
     Raises:
         StageError: the disk is full.
     """
+    layout = LasLayout.of(path, like, box, origin, crs, apart)
+    with las_writer(path, layout.header) as writer:
+        yield lambda part: writer.write_points(layout.records(part))
+
+
+@contextmanager
+def las_writer(path: Path, header: Any) -> Iterator[Any]:
+    """A `laspy.LasWriter` of a file that appears when all is written.
+
+    Raises:
+        StageError: the disk is full.
+    """
     import laspy
     import lazrs
 
-    layout = LasLayout.of(path, like, box, origin, crs, apart)
-
-    def append(part: Cloud) -> None:
-        writer.write_points(layout.records(part))
-
     with atomic_file(path) as temporary:
         try:
-            with laspy.open(temporary, mode="w", header=layout.header) as writer:
-                yield append
+            with laspy.open(temporary, mode="w", header=header) as writer:
+                yield writer
         except lazrs.LazrsError as error:  # it does not say why, and only writing can fail
             left = shutil.disk_usage(temporary.parent).free / 1e9
             raise StageError(

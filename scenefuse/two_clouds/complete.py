@@ -15,17 +15,18 @@ from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
 from scenefuse.fusion.fuse_object import GREY, possible
 from scenefuse.fusion.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
 from scenefuse.io.cloud_file import CloudFile
-from scenefuse.io.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, records_of, spacing
+from scenefuse.io.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, records_of, spacing
 from scenefuse.io.formats import las_crs
 from scenefuse.io.import_cloud import unit_and_name
 from scenefuse.io.readers.columns import COLOR
 from scenefuse.io.settings import build, read_settings
 from scenefuse.io.tiles.tiled_cloud import Rows
 from scenefuse.io.tiles.write_tiles import reserved
-from scenefuse.stage import StageError, atomic_file, quantity, write_json
+from scenefuse.stage import StageError, quantity, scratch_directory, write_json
 from scenefuse.transforms import Sim3
 from scenefuse.version import VERSION
 
+FILES = ("completed.ply", "completed.laz", "completed.json")
 CHUNK = 1_000_000
 """Points of a LAS file that are copied at a time."""
 AXES = ("X", "Y", "Z")
@@ -109,15 +110,26 @@ def _again(scene: Cloud) -> bool:
 def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) -> list[Path]:
     """Write completed.ply, completed.laz where the scene is LAS or LAZ, and completed.json; returns their paths.
 
-    The scene is read and written in parts.
+    The scene is read and written in parts. The files appear together, when all are written.
+
+    Raises:
+        StageError: the disk is full, or the object reaches farther than a LAS file's coordinates can.
     """
-    notes, crs, written = list(done.notes), las_crs(scene.survey.path), [out / "completed.ply"]
-    _write_ply(written[0], done, scene)
-    if scene.survey.is_las:
-        written.append(out / "completed.laz")
-        notes += append_to_las(written[1], scene, done)
+    with scratch_directory(out / "completed") as folder:
+        notes = list(done.notes)
+        if scene.survey.is_las:
+            notes += append_to_las(folder / "completed.laz", scene, done)
+        _write_ply(folder / "completed.ply", done, scene)
+        _write_report(folder / "completed.json", done, object, scene, notes)
+        written = [folder / name for name in FILES if (folder / name).exists()]
+        return [path.replace(out / path.name) for path in written]
+
+
+def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, notes: list[str]) -> None:
+    """Write completed.json, and print the notes."""
     for note in notes:
         print(f"note       {note}", flush=True)
+    crs = las_crs(scene.survey.path)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
     earlier = {str(number): f"{number} in {scene.survey.path.name}" for number in range(FROM_OBJECT, done.source)}
     kept = scene.total - len(done.gone)
@@ -134,8 +146,7 @@ def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) 
         "version": quantity(VERSION, ""),
         "seconds": quantity(done.seconds, "s"),
     }
-    write_json(out / "completed.json", content)
-    return [*written, out / "completed.json"]
+    write_json(path, content)
 
 
 def _write_ply(path: Path, done: Completed, scene: CloudFile) -> None:
@@ -197,7 +208,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
         types = {} if again else {name: values.dtype.str[1:] for name, values in done.added.fields.items()}
         described = {name: LAS_DESCRIPTIONS.get(name, "") for name in types}
         header.add_extra_dims([laspy.ExtraBytesParams(names[n], kind, described[n]) for n, kind in types.items()])
-        with atomic_file(path) as temporary, laspy.open(temporary, mode="w", header=header) as writer:
+        with las_writer(path, header) as writer:
             brightest, first = 0, 0
             for chunk in reader.chunk_iterator(CHUNK):
                 stay = _stay(np.arange(first, first + len(chunk)), done)

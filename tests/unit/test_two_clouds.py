@@ -2,6 +2,7 @@
 
 import json
 import re
+import sys
 from dataclasses import replace
 
 import laspy
@@ -250,7 +251,36 @@ def test_an_object_beyond_the_coordinates_of_a_las_file_is_one_sentence(tmp_path
     done = complete(own(far), scene, POSE, FILL)
     with pytest.raises(StageError, match="coordinates of .*yard.laz end before the object"):
         write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
-    assert not (tmp_path / "completed.laz").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["yard.laz"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no limit of a file's size")
+@pytest.mark.parametrize("limit", [3_000, 20_000])
+def test_a_completed_scene_that_does_not_fit_is_an_error_and_leaves_nothing(tmp_path, limit):
+    import resource
+
+    noise = np.random.default_rng(0).random((20_000, 3))
+    write_survey(tmp_path / "yard.laz", in_scene(Cloud(noise, None, (noise * 255).astype(np.uint8))))
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), scene, POSE, FILL)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
+    try:
+        with pytest.raises(StageError, match=r"completed\.laz could not be written .* GB of its disk are free: free"):
+            write_completed(tmp_path / "out", done, tmp_path / "shed.ply", scene)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list((tmp_path / "out").iterdir())
+
+
+def test_completed_files_appear_together_or_not_at_all(tmp_path, monkeypatch):
+    write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 4)))
+    scene = CloudFile.of(tmp_path / "yard.laz")
+    done = complete(own(sheet(2, 8)), scene, POSE, FILL)
+    monkeypatch.setattr("scenefuse.two_clouds.complete.VERSION", float("nan"))  # which no JSON holds
+    with pytest.raises(ValueError):
+        write_completed(tmp_path / "out", done, tmp_path / "shed.ply", scene)
+    assert not list((tmp_path / "out").iterdir())
 
 
 def test_the_page_shows_the_decision_the_scene_in_3d_and_the_matrix_and_fetches_nothing(fused):
