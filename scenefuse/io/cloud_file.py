@@ -13,7 +13,6 @@ from scenefuse.io.clouds import (
     cloud_of,
     coincidence_note,
     concatenate,
-    finite_rows,
     precision_note,
     spacing,
 )
@@ -21,7 +20,7 @@ from scenefuse.io.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees
 from scenefuse.io.readers.columns import COLOR, Columns, positions
 from scenefuse.io.readers.text import text_notes
 from scenefuse.io.tiles.parts import columns_in_parts
-from scenefuse.io.tiles.survey import NOT_FINITE, Survey, Thinned, surface_rows, survey
+from scenefuse.io.tiles.survey import Survey, Thinned, surface_rows, survey
 from scenefuse.io.tiles.tiled_cloud import Rows
 from scenefuse.transforms import Array
 
@@ -80,11 +79,6 @@ class CloudFile:
         return found
 
     @property
-    def total(self) -> int:
-        """Number of points that `parts` has: of LAS and LAZ all with a position."""
-        return self.survey.rows - self.survey.left_out[NOT_FINITE] if self.survey.is_las else self.survey.count
-
-    @property
     def spacing(self) -> float:
         """Median distance from a point of the part to its nearest neighbour, as if the part had all: on a surface, a
         quarter of the points lie twice as far apart."""
@@ -96,26 +90,22 @@ class CloudFile:
         return self.part[np.zeros(0, np.int64)]
 
     def parts(self) -> Iterator[tuple[Rows, Cloud]]:
-        """The points of a surface, of LAS and LAZ all points, in the order of the file; with the number of each one's
-        row (N,) in it."""
-        return self._clouds(everything=self.survey.is_las)
-
-    def near(self, low: Array, high: Array) -> tuple[Rows, Cloud]:
-        """All points of a surface in the box from `low` (3,) to `high` (3,), and their rows (N,)."""
-        found = [(np.zeros(0, np.int64), self.like)]
-        for rows, cloud in self._clouds(everything=False):
-            inside = _inside(cloud.points, (low, high))
-            found.append((rows[inside], cloud[inside]))
-        return np.concatenate([rows for rows, _ in found]), concatenate([cloud for _, cloud in found])
-
-    def _clouds(self, everything: bool) -> Iterator[tuple[Rows, Cloud]]:
+        """The points of a surface in the order of the file, with the number of each one's row (N,) in it."""
         first = 0
         for columns in self.survey.columns():
             numbered = columns | {ROW: np.arange(first, first + len(columns["x"]))}
             first += len(columns["x"])
-            chosen = finite_rows(numbered)[0] if everything else self.survey.surface(numbered)
+            chosen = self.survey.surface(numbered)
             rows = chosen.pop(ROW)
             yield rows, _cloud(chosen, self.survey)
+
+    def near(self, low: Array, high: Array) -> tuple[Rows, Cloud]:
+        """All points of a surface in the box from `low` (3,) to `high` (3,), and their rows (N,)."""
+        found = [(np.zeros(0, np.int64), self.like)]
+        for rows, cloud in self.parts():
+            inside = _inside(cloud.points, (low, high))
+            found.append((rows[inside], cloud[inside]))
+        return np.concatenate([rows for rows, _ in found]), concatenate([cloud for _, cloud in found])
 
 
 def _cloud(columns: Columns, whole: Survey) -> Cloud:

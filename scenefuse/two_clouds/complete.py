@@ -119,6 +119,8 @@ def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) 
         notes = list(done.notes)
         if scene.survey.is_las:
             notes += append_to_las(folder / "completed.laz", scene, done)
+            if noise := scene.survey.rows - scene.survey.count:
+                notes.append(f"completed.ply leaves out the {noise} points that are not used; completed.laz has them")
         _write_ply(folder / "completed.ply", done, scene)
         _write_report(folder / "completed.json", done, object, scene, notes)
         written = [folder / name for name in FILES if (folder / name).exists()]
@@ -132,7 +134,7 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
     crs = las_crs(scene.survey.path)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
     earlier = {str(number): f"{number} in {scene.survey.path.name}" for number in range(FROM_OBJECT, done.source)}
-    kept = scene.total - len(done.gone)
+    kept = scene.survey.count - len(done.gone)
     content = {
         "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
         "points": quantity(kept + len(done.added), "points"),
@@ -158,7 +160,7 @@ def _write_ply(path: Path, done: Completed, scene: CloudFile) -> None:
         colors=None if like.colors is None else done.added.colors,
         fields={name: done.added.fields[name] for name in like.fields},
     )
-    count = scene.total - len(done.gone) + len(added)
+    count = scene.survey.count - len(done.gone) + len(added)
     with reserved(path, records_of(like, path).dtype, count) as (file, _):
         for rows, cloud in scene.parts():
             file.write(records_of(with_fields(cloud[_stay(rows, done)]), path).tobytes())

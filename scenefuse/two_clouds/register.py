@@ -110,7 +110,7 @@ def register(
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
     found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
-    points = {"object_points": len(given.object), "scene_points": given.scene.total}
+    points = {"object_points": len(given.object), "scene_points": given.scene.survey.count}
     content = report(found, given.ups) | {
         "evidence": quantity(evidence, ""),
         "searched": quantity(given.searched, ""),

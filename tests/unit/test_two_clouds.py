@@ -308,7 +308,7 @@ def test_a_refused_pose_leaves_no_completed_scene_and_nothing_of_an_earlier_run(
     assert "unregistered" in page and "The pose was refused" in page
 
 
-def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_file(tmp_path, house, monkeypatch, capsys):
+def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_laz_alone(tmp_path, house, monkeypatch, capsys):
     monkeypatch.setattr(RegistrationSettings, "read", lambda path: (LITTLE, 0))
     write_cloud(tmp_path / "house.ply", house.object)
     write_laz(tmp_path / "clean.laz", house.scene, np.zeros(3), None)
@@ -326,6 +326,10 @@ def test_noise_of_a_laz_is_not_searched_and_stays_in_the_completed_file(tmp_path
     assert "30 points of the classes 7 and 18 (noise) of" in printed and "10 withheld points of" in printed
     written = laspy.read(tmp_path / "out/completed.laz")
     assert (np.asarray(written.classification) == 7).sum() == 30 and (np.asarray(written["source"]) == 1).any()
+    about, surface = read_json(tmp_path / "out/completed.json"), read_cloud(tmp_path / "out/completed.ply")
+    assert np.array_equal(surface.points[surface.fields["source"] == 0], read_cloud(tmp_path / "clean.laz").points)
+    assert value(about, "points") == len(surface) == len(written.points) - 40
+    assert any("completed.ply leaves out the 40 points that are not used" in note for note in value(about, "notes"))
 
 
 def test_bad_input_leaves_nothing_of_an_earlier_run(tmp_path, house):
@@ -401,7 +405,7 @@ def test_a_crop_box_is_all_that_is_held_of_a_scene(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 40)))
     low, high = UTM + [2.95, -1, -1], UTM + [4.95, 3, 1]
     held = CloudFile.of(tmp_path / "yard.laz", (low, high))
-    assert (len(held.part), held.survey.count, held.total) == (20 * 20, 400 * 20, 400 * 20)
+    assert (len(held.part), held.survey.count) == (20 * 20, 400 * 20)
     rows, near = held.near(low - 1, high + 1)
     assert len(near) == 40 * 20 and np.array_equal(near.points, read_cloud(tmp_path / "yard.laz").points[rows])
 
@@ -422,7 +426,7 @@ def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeyp
     scene = in_scene(sheet(0, 4))
     write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([scene.points, np.zeros((1200, 3))])))
     held = CloudFile.of(tmp_path / "yard.ply")
-    assert (held.survey.count, held.total, len(held.part)) == (len(scene), len(scene), len(scene))
+    assert held.survey.count == len(held.part) == len(scene)
     assert any("1200 points at 0 0 0, far from all others, of" in note for note in held.notes)
     assert sum(len(cloud) for _, cloud in held.parts()) == len(held.near(*EVERYWHERE)[0]) == len(scene)
     # A site whose own zero lies in it has a point there.
@@ -464,7 +468,7 @@ def test_a_las_of_an_old_version_is_completed(tmp_path):
     done = complete(own(sheet(2, 8)), scene, POSE, FusionSettings(mode="append"))
     append_to_las(tmp_path / "completed.las", scene, done)
     after = laspy.read(tmp_path / "completed.las")
-    assert len(after.points) == scene.total + len(done.added)
+    assert len(after.points) == scene.survey.rows + len(done.added)
 
 
 def test_colours_that_the_scene_has_no_place_for_are_named(tmp_path):
