@@ -106,7 +106,7 @@ def _told(done: Completed, scene_points: int) -> str:
         + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
         *done.notes,
     ]
-    return f"<p>{escape('; '.join(said))}. <code>source</code> of completed.ply: 0 scene, 1 object.</p>"
+    return f"<p>{escape('; '.join(said))}. <code>source</code> of completed.ply: 0 scene, {done.source} object.</p>"
 
 
 def _table(content: dict[str, Any]) -> str:

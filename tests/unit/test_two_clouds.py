@@ -20,9 +20,10 @@ from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud, write_l
 from scenefuse.registration.coarse import CoarseSettings
 from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.register import RegistrationSettings
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.stage import StageError, quantity, read_json, value
 from scenefuse.transforms import Sim3
 from scenefuse.two_clouds.complete import append_to_las, complete, write_completed
+from scenefuse.two_clouds.page import write_page
 from scenefuse.two_clouds.register import register
 from scenefuse.version import VERSION
 
@@ -88,6 +89,12 @@ def in_scene(cloud):
 def own(cloud):
     """A cloud that POSE puts where `in_scene` puts `cloud`."""
     return cloud.transformed(POSE.inverse() @ Sim3(1.0, np.eye(3), UTM))
+
+
+def complete_sheet(folder):
+    """A sheet in the folder's yard.ply, continued by another."""
+    write_cloud(folder / "yard.ply", in_scene(sheet(0, 4)))
+    return complete(own(sheet(2, 8)), CloudFile.of(folder / "yard.ply"), POSE, FILL)
 
 
 @pytest.fixture(scope="module")
@@ -199,6 +206,20 @@ def test_a_completed_scene_takes_further_objects_and_keeps_what_is_known(tmp_pat
     assert not any("after" in name for name in last.point_format.dimension_names)
     named = value(read_json(tmp_path / "3/completed.json"), "sources")
     assert named == {"0": "scene", "1": "1 in completed.laz", "2": "2 in completed.laz", "3": "shed"}
+
+
+def test_the_page_names_the_number_of_an_object_in_a_scene_that_was_completed_before(tmp_path):
+    done = complete_sheet(tmp_path)
+    again = replace(done, source=2)
+    content = {
+        "inputs": quantity({"object": "shed.ply", "scene": "yard.ply", "scene_points": 800}, ""),
+        "status": quantity("registered", ""),
+        "reason": quantity("", ""),
+        "notes": quantity([], ""),
+    }
+    for one, said in ((done, "0 scene, 1 object"), (again, "0 scene, 2 object")):
+        write_page(tmp_path / "report.html", content, "m", tmp_path / "none.png", one, None)
+        assert said in (tmp_path / "report.html").read_text()
 
 
 def test_a_scene_with_some_field_of_the_same_name_keeps_it(tmp_path):
