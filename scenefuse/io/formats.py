@@ -290,6 +290,9 @@ def _e57_scan(file: Any, header: Any, colored: bool, measured: bool, at_once: in
     states = ("cartesianInvalidState", "sphericalInvalidState")
     more = ("intensity",) if measured else ()
     wanted = [name for name in (*cartesian, *spherical, *color, *more, *states) if name in header.point_fields]
+    # Fractions of 1, or bytes and 16 bits.
+    columns_of = libe57.StructureNode(header.points.prototype())
+    real = {name: not isinstance(columns_of[name], libe57.IntegerNode) for name in color}
     buffer = {name: np.empty(min(header.point_count, at_once)) for name in wanted}
     buffers = libe57.VectorSourceDestBuffer()
     for name, values in buffer.items():
@@ -305,7 +308,7 @@ def _e57_scan(file: Any, header: Any, colored: bool, measured: bool, at_once: in
             points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
             state = states[1]
         found = dict(zip(POSITION, (points @ turn.T + shift).T))
-        found |= {name: columns[own].astype(np.uint16) for name, own in zip(COLOR, color)}
+        found |= {name: columns[own].astype(np.float32 if real[own] else np.uint16) for name, own in zip(COLOR, color)}
         found |= {name: columns[name].astype(np.float32) for name in more}
         valid = columns[state] == 0 if state in columns else np.ones(len(points), bool)
         yield {name: values[valid] for name, values in found.items()}

@@ -80,19 +80,22 @@ def test_intensities_of_e57_are_read(tmp_path, cloud):
     assert np.allclose(read_cloud(tmp_path / "a.e57").fields["intensity"], bright)
 
 
-def test_e57_in_spherical_coordinates_with_sixteen_bit_colours(tmp_path):
+@pytest.mark.parametrize("most", [65535, 255, 1])
+def test_e57_in_spherical_coordinates_with_colours_of_sixteen_bits_or_as_real_numbers(tmp_path, most):
     rng = np.random.default_rng(0)
     columns = {
         "sphericalRange": rng.uniform(1, 50, 30),
         "sphericalAzimuth": rng.uniform(-np.pi, np.pi, 30),
         "sphericalElevation": rng.uniform(-1.5, 1.5, 30),
-        **{f"color{name}": rng.integers(0, 65536, 30).astype(np.float64) for name in ("Red", "Green", "Blue")},
+        **{f"color{name}": rng.uniform(0, most, 30) for name in ("Red", "Green", "Blue")},
     }
+    if most > 1:
+        columns |= {name: np.rint(values) for name, values in columns.items() if name.startswith("color")}
     file = pye57.E57(str(tmp_path / "a.e57"), mode="w")
     image = file.image_file
     prototype, buffers = libe57.StructureNode(image), libe57.VectorSourceDestBuffer()
     for name, values in columns.items():
-        whole = name.startswith("color")
+        whole = name.startswith("color") and most > 255
         node = libe57.IntegerNode(image, 0, 0, 65535) if whole else libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE)
         prototype.set(name, node)
         buffers.append(libe57.SourceDestBuffer(image, name, values, 30, True, True))
@@ -107,7 +110,7 @@ def test_e57_in_spherical_coordinates_with_sixteen_bit_colours(tmp_path):
     assert np.allclose(np.linalg.norm(found.points, axis=1), columns["sphericalRange"])
     assert np.allclose(np.arctan2(y, x), columns["sphericalAzimuth"])
     assert np.allclose(np.arcsin(z / columns["sphericalRange"]), columns["sphericalElevation"])
-    assert np.array_equal(found.colors[:, 1], np.rint(columns["colorGreen"] / 257))
+    assert np.array_equal(found.colors[:, 1], np.rint(columns["colorGreen"] * (255 / most)))
 
 
 @pytest.mark.parametrize("ending", ["las", "laz"])
