@@ -198,6 +198,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
 
     with laspy.open(scene.survey.path) as reader:
         header = copy.deepcopy(reader.header)
+        _keep_no_data(header)
         times, notes = _finer_steps(header, done, scene.survey.path)
         # What laspy writes; a later version has all that 1.0 and 1.1 have.
         header.version = max(header.version, laspy.header.Version(1, 2))
@@ -263,6 +264,14 @@ def _finer_steps(header: Any, done: Completed, scene: Path) -> tuple[int, list[s
             " or write the scene again with an offset near its points and finer steps"
         )
     return times, notes
+
+
+def _keep_no_data(header: Any) -> None:
+    """What a file's further dimensions say of no value; laspy forgets it with every change of them."""
+    said = [one for record in header.vlrs.get("ExtraBytesVlr") for one in record.extra_bytes_structs]
+    known = {one.format_name(): one.no_data for one in said}
+    dimensions = header.point_format.dimensions
+    dimensions[:] = [one._replace(no_data=known.get(one.name, one.no_data)) for one in dimensions]
 
 
 def _free(name: str, taken: set[str]) -> str:

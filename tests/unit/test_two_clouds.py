@@ -47,7 +47,7 @@ def write_survey(path, cloud, crs="EPSG:25832", bright=257):
     header.scales, header.offsets = np.full(3, 0.001), np.floor(cloud.points.min(0))
     if crs:
         header.add_crs(pyproj.CRS.from_user_input(crs))
-    header.add_extra_dim(laspy.ExtraBytesParams("height", "f4"))
+    header.add_extra_dim(laspy.ExtraBytesParams("height", "f4", no_data=np.array([-9999.0])))
     las = laspy.LasData(header)
     las.x, las.y, las.z = cloud.points.T
     las.red, las.green, las.blue = cloud.colors.astype(np.uint16).T * bright
@@ -146,6 +146,8 @@ def test_a_laz_keeps_all_that_its_points_have(tmp_path):
     count = len(before.points)
     for name in before.point_format.dimension_names:
         assert np.array_equal(before[name], after[name][:count]), name
+    extra = [las.header.vlrs.get("ExtraBytesVlr")[0].extra_bytes_structs[0] for las in (before, after)]
+    assert extra[0].no_data == extra[1].no_data == [-9999] and extra[0].options & 1 == extra[1].options & 1 == 1
     assert after.header.parse_crs().to_epsg() == 25832
     assert (after.source[:count] == 0).all() and (after.source[count:] == 1).all() and len(done.added) > 0
     new = np.stack([after.x, after.y, after.z], axis=1)[count:]
