@@ -41,8 +41,13 @@ STEP_SPACINGS = 0.25
 
 
 NEIGHBOURS, ALONE, LONELY, FEW = 8, 0.02, 10.0, 0.1
-"""Of `strays`: neighbours of a point; how far they are from a lonely one, of the diagonal and beside the median; the
+"""Of `strays`: neighbours of a point; how far they are from a lonely one, of the diagonal and beside most points; the
 largest share of all points that strays are."""
+
+
+EVENLY, COARSE = 0.02, 0.25
+"""Of `strays`, in sizes of the box: the cubes in which a point counts once; those in which more points than a lonely one
+has neighbours are a part of the cloud, and by which a box has to grow."""
 
 
 AT_ONCE = 1 << 18
@@ -248,17 +253,42 @@ def is_nothing_at_zero(others: NDArray[np.float64]) -> bool:
 def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which of (N, 3) points lie far from all others, N as many as one looks through at once.
 
-    Outside the box around the middle 98 % of them, grown by its size on each side; or with the eighth neighbour
-    farther away than 2 % of that box's diagonal, and ten times as far as most have it. None, if they are many.
+    Outside the box around most of them, grown by its size on each side; or with the eighth neighbour farther away than
+    2 % of that box's diagonal, and ten times as far as the median of points on an even grid, so that a part which was
+    measured densely does not stand for all. None, if they are many.
     """
-    low, high = np.percentile(points, [1, 99], axis=0)
-    far = ((points < low - (high - low).max()) | (points > high + (high - low).max())).any(1)
-    near = np.flatnonzero(~far)
-    if len(near) > NEIGHBOURS:
+    low, high, near, together = _box_of_most(points)
+    far, size = np.ones(len(points), dtype=bool), float((high - low).max())
+    far[near] = False
+    if len(near) > NEIGHBOURS and size:
         tree, parts = cKDTree(points[near]), np.array_split(points[near], 1 + len(near) // AT_ONCE)
         away = np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
-        far[near] = away > max(ALONE * float(np.linalg.norm(high - low)), LONELY * float(np.median(away)))
+        evenly = voxel_downsample(Cloud(points[near], fields={"away": away})[together], EVENLY * size)
+        usual = float(np.median(evenly.fields["away"])) if len(evenly) else np.inf
+        far[near] = away > max(ALONE * float(np.linalg.norm(high - low)), LONELY * usual)
     return far if far.mean() <= FEW else np.zeros(len(points), dtype=bool)
+
+
+def _box_of_most(
+    points: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
+    """Corners (3,) of the box around most of (N, 3) points, the rows (M,) in the box grown by its size on each side, and
+    which of these lie among others.
+
+    It begins as that of the middle 98 %, which may all lie in a part that was measured densely; while there are clearly
+    larger ones, it becomes the box of those in the grown box that lie among others.
+    """
+    low, high = np.percentile(points, [1, 99], axis=0)
+    while True:
+        size = float((high - low).max())
+        near = np.flatnonzero(((points >= low - size) & (points <= high + size)).all(1))
+        group, counts = _voxels(points[near], COARSE * size or 1.0)
+        together = counts[group] > NEIGHBOURS
+        part = points[near[together]]
+        ends = part.min(0, initial=np.inf), part.max(0, initial=-np.inf)
+        if np.maximum(low - ends[0], ends[1] - high).max() <= COARSE * size:
+            return low, high, near, together
+        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
 
 
 def without_strays(cloud: Cloud, what: str) -> tuple[Cloud, list[str]]:

@@ -4,7 +4,7 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud, write_laz
+from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, strays, voxel_downsample, write_cloud, write_laz
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 
@@ -87,6 +87,28 @@ def test_of_points_that_coincide_the_spacing_is_that_between_different_places():
     assert spacing(np.round(fine, 1)) == pytest.approx(0.1)
     assert spacing(np.concatenate([grid, grid[:5]]), quantile=0.0) == pytest.approx(0.25)
     assert spacing(np.zeros((9, 3))) == spacing(grid[:1]) == 0
+
+
+def on_sphere(count, radius, middle, rng):
+    directions = rng.normal(size=(count, 3))
+    return directions / np.linalg.norm(directions, axis=1, keepdims=True) * radius + middle
+
+
+def test_a_sparse_body_under_a_dense_head_is_none_of_the_strays_which_still_are():
+    rng = np.random.default_rng(0)
+    head = on_sphere(300_000, 0.12, [0, 0, 1.7], rng)
+    body = on_sphere(5500, [0.3, 0.2, 0.8], [0, 0, 0.8], rng)
+    lost = np.array([[0, 0, 90.0], [5, -9, 2], [5, -9, 2.1], [-3, 0, 1], [0.5, 0.9, 0.1]])
+    found = strays(np.concatenate([head, body, lost]))
+    assert not found[: -len(lost)].any() and found[-len(lost) :].all()
+
+
+def test_scattered_points_around_an_even_surface_are_strays():
+    rng = np.random.default_rng(0)
+    surface, scattered = on_sphere(30_000, 1.0, 0.0, rng), rng.uniform(-4, 4, (300, 3))
+    off = np.abs(np.linalg.norm(scattered, axis=1) - 1)
+    found = strays(np.concatenate([surface, scattered]))
+    assert not found[:30_000].any() and found[30_000:][off > 0.3].all()
 
 
 def test_transform_turns_normals_and_keeps_fields():
