@@ -280,6 +280,31 @@ def test_numbers_and_names_of_points_are_no_coordinates_and_that_is_said(tmp_pat
     assert "1 of its columns have no names" in "".join(text_notes(tmp_path / "more.xyz"))
 
 
+@pytest.mark.parametrize("further", ["colours", "intensity and colours", "intensity", "none"])
+def test_rows_and_columns_of_a_scanners_grid_are_no_coordinates_and_that_is_said(tmp_path, further):
+    rng, places = np.random.default_rng(0), np.arange(40)
+    points, colors = rng.uniform(0, 50, (40, 3)).round(3) + 5e5 + 0.0004, rng.integers(0, 256, (40, 3))
+    bright = rng.integers(0, 2048, (40, 1))
+    behind = {"colours": [colors], "intensity and colours": [bright, colors], "intensity": [bright], "none": []}[further]
+    rows = np.column_stack([places // 8, places % 8, points, *behind])
+    np.savetxt(tmp_path / "faro.xyz", rows, fmt="%.4f")
+    found = read_cloud(tmp_path / "faro.xyz")
+    np.testing.assert_allclose(found.points, points)
+    assert "first two columns are rows and columns of a scan" in "".join(text_notes(tmp_path / "faro.xyz"))
+    assert further != "colours" or np.array_equal(found.colors, colors)
+
+
+def test_a_grid_of_heights_with_whole_eastings_and_northings_is_no_scanners(tmp_path):
+    rng, places = np.random.default_rng(0), np.arange(40)
+    normals = rng.normal(size=(40, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    far = np.column_stack([places // 8 + 5e5, places % 8 + 5.4e6, rng.uniform(1, 9, 40), rng.random((40, 2))])
+    near = np.column_stack([places // 8, places % 8, rng.uniform(1, 9, 40), normals])
+    for rows in (far, near):
+        np.savetxt(tmp_path / "grid.xyz", rows, fmt="%.4f")
+        np.testing.assert_allclose(read_cloud(tmp_path / "grid.xyz").points, rows[:, :3], atol=1e-4)
+
+
 def test_whole_coordinates_are_no_numbers_of_points(tmp_path):
     rng = np.random.default_rng(0)
     x, yz, colors = 5 * np.arange(20.0), rng.uniform(-5, 5, (20, 2)).round(3) + 0.0005, rng.integers(0, 256, (20, 3))

@@ -21,6 +21,8 @@ NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
 # By how much the better of two places for the colours among the columns has to be.
 CLEARLY = 0.1
+# Rows or columns that no scanner's grid has more of; most coordinates in metres do.
+MOST_ROWS = 100_000
 # Lines in which the first row is looked for, and rows by which it is told what their columns are.
 HEAD, LOOKED_AT = 50, 100_000
 # Lines that are taken at once where nobody says how many: as text they take twice the memory of their numbers.
@@ -67,8 +69,8 @@ def text_layout(path: Path) -> TextLayout:
     Rows are numbers separated by blanks, commas or semicolons, below any number of other lines. A line above them that
     names the columns (`//X Y Z R G B`, `Point,Northing,Easting,Elevation`) is believed. Without one, the first three
     columns are x, y, z and each three that follow are normals if they have unit length, else colours, if they can be;
-    an intensity may stand before or behind these. A first column that names or numbers the points is left out, and so
-    is what follows.
+    an intensity may stand before or behind these. A first column that names or numbers the points, or two
+    with the row and column of a scanner, are left out, and so is what follows.
 
     Raises:
         StageError: longitude and latitude; commas as decimal points.
@@ -94,9 +96,11 @@ def text_layout(path: Path) -> TextLayout:
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
-    notes, first = list[str](), int(named or _numbers_points(rows))
-    if first:
+    notes, first = list[str](), 1 if named else _indices(rows)
+    if first == 1:
         notes.append(f"{path.name}: its first column names or numbers the points and is left out")
+    elif first:
+        notes.append(f"{path.name}: its first two columns are rows and columns of a scan and are left out")
     if len(names) - rows.shape[1] + first in (0, 1):
         title = head[above - 1].strip()[:60]
         notes.append(f"{path.name}: '{title}' names no columns x, y, z; the first three are these")
@@ -233,17 +237,20 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
     return first, True
 
 
-def _numbers_points(rows: NDArray[np.float64]) -> bool:
-    """Whether the first of (N, C) columns numbers the points: one after the other, or whole numbers, each once, before
-    coordinates that are not whole where x, y, z and colours or normals would be a column fewer or more."""
+def _indices(rows: NDArray[np.float64]) -> int:
+    """How many of the first of (N, C) columns number the points: 1, one after the other, or whole numbers, each once,
+    before coordinates that are not whole where x, y, z and colours or normals would be a column fewer or more; or 2, as
+    in a scanner's grid, where what follows is x, y, z, and colours or whole numbers."""
     first, columns = rows[:, 0], rows.shape[1]
     if columns <= 3 or len(rows) <= 3:
-        return False
+        return 0
+    whole = (rows == np.rint(rows)).all(0)
+    if columns > 4 and whole[:2].all() and not whole[2:5].any() and (columns % 3 == 2 or whole[5:].all()):
+        return 2 if 0 <= rows[:, :2].min() and rows[:, :2].max() <= MOST_ROWS else 0
     if (first == first[0] + np.arange(len(first))).all():
-        return True
-    whole = (rows[:, :4] == np.rint(rows[:, :4])).all(0)
+        return 1
     once = len(np.unique(first)) == len(first)
-    return bool(columns % 3 == 1 and whole[0] and not whole[1:].any() and once)
+    return int(columns % 3 == 1 and whole[0] and not whole[1:4].any() and once)
 
 
 def _separator(line: str) -> str | None:
