@@ -5,9 +5,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scenefuse.io.cloud_file import EVERYWHERE
-from scenefuse.io.clouds import Cloud, has_unit_normals, read_cloud
+from scenefuse.io.clouds import Cloud, has_unit_normals, occupied_voxels, read_cloud, sampled
 from scenefuse.io.readers.text import TEXTS
 from scenefuse.io.settings import build, read_settings
 from scenefuse.registration.agreement import AgreementSettings, registration_metrics
@@ -20,15 +21,19 @@ from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.problem import Evidence, Problem, check_extent
 from scenefuse.registration.refinement import Outcome, refine_hypotheses
 from scenefuse.registration.scale import ScaleSettings, estimates, prior
+from scenefuse.registration.score import SCORE_FRACTION
 from scenefuse.registration.uncertainty import uncertainty_quantities
 from scenefuse.sfm.fiducials import ScenePoints, read_points
-from scenefuse.stage import StageError, quantity
+from scenefuse.stage import StageError, quantity, threads
 from scenefuse.transforms import Array, Sim3
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
 # Points in which too few different ones are looked for before all are counted.
 SAMPLE = 20_000
+# Of `second_place`: what a found pose leaves of a scene, over the object, so that it may show it again; share of the
+# object that the coarse search finds there; distance of both places, over the object's diagonal.
+LEFT, SHOWN, APART = 0.3, 0.25, 0.4
 Direction = tuple[float, float, float]
 # Wrong poses that the gate accepted on the planted trials of docs/results.md that had no depth maps, of how many.
 PLANTED = 3, 224, "with shape alone"
@@ -167,6 +172,41 @@ def register_clouds(
     return Registration(
         outcome.decision.registered, outcome.decision.reason, whole, outcome, origins, scales, agreement, unit
     )
+
+
+def second_place(
+    found: Registration,
+    obj: Cloud,
+    scene: Cloud,
+    settings: RegistrationSettings,
+    seed: int,
+    ups: tuple[Array, Array] | None = None,
+) -> Array | None:
+    """Where (3,) the scene shows an object again that was registered in it, or something of its shape; None if nowhere.
+
+    The object is registered once more, at the scale found, in what the found pose leaves unexplained, if that is large
+    enough, and the coarse search finds enough of the object there. Arguments as of `register_clouds`.
+    """
+    pose = found.scene_from_object
+    if pose is None:
+        return None
+    moved = sampled(pose.apply(obj.points), SEARCHED_POINTS, seed)
+    centre, size = moved.mean(0), float(np.linalg.norm(np.ptp(moved, axis=0)))
+    own = sampled(scene.points, SEARCHED_POINTS, seed)
+    rest = own[cKDTree(moved).query(own, workers=threads())[0] > SCORE_FRACTION * scene.diagonal]
+    voxel = SCORE_FRACTION * size
+    if len(rest) < MIN_POINTS or occupied_voxels(rest, voxel) < LEFT * occupied_voxels(moved, voxel):
+        return None
+    evidence = Evidence(None if ups is None else (ups[1], ups[1]))
+    problem = Problem(Cloud(moved - centre), Cloud(rest - centre), ScaleRange(1.0, 0.0), evidence, seed)
+    there = find_hypotheses(problem, settings.coarse)
+    if not there or max(one.score.precision for one in there) < SHOWN:
+        return None
+    outcome = refine_hypotheses(problem, [(one.pose, one.source) for one in there], settings.fine)
+    place = outcome.ranked[0].pose.translation
+    if not outcome.decision.registered or np.linalg.norm(place) < APART * size:
+        return None
+    return np.asarray(place + centre)
 
 
 def _check_points(cloud: Cloud, name: str) -> None:

@@ -24,6 +24,7 @@ from scenefuse.registration.register import (
     register_clouds,
     report,
     search_box,
+    second_place,
     summary,
 )
 from scenefuse.stage import StageError, atomic_file, quantity, value, write_json
@@ -109,6 +110,15 @@ def register(
     crs = las_crs(scene)
     unit = "scene units" if crs is None else unit_and_name(crs)[0]
     found = register_clouds(given.object, given.scene.part, settings, seed, ups=given.ups, scales=scales, unit=unit)
+    if found.registered and known.fiducials is None and known.crop_box is None:
+        again = second_place(found, given.object, given.scene.part, settings, seed, given.ups)
+        if again is not None:
+            at = " ".join(f"{x:.10g}" for x in again)
+            notes.append(
+                f"the scene shows the object, or something like it, a second time, at ({at}): if that is the one, mark it"
+                " with --fiducials or --crop-box"
+            )
+            print(f"note       {notes[-1]}", flush=True)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
     points = {"object_points": len(given.object), "scene_points": given.scene.survey.count}
     content = report(found, given.ups) | {
