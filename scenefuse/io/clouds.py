@@ -46,8 +46,8 @@ largest share of all points that strays are."""
 
 
 EVENLY, COARSE = 0.02, 0.25
-"""Of `strays`, in sizes of the box: the cubes in which a point counts once; those in which more points than a lonely one
-has neighbours are a part of the cloud, and by which a box has to grow."""
+"""Of `strays`, in sizes of the box: the cubes in which a point counts once; those in which more points than a lonely
+one has neighbours are a part of the cloud, and by which a box has to grow."""
 
 
 AT_ONCE = 1 << 18
@@ -272,8 +272,8 @@ def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
 def _box_of_most(
     points: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Corners (3,) of the box around most of (N, 3) points, the rows (M,) in the box grown by its size on each side, and
-    which of these lie among others.
+    """Corners (3,) of the box around most of (N, 3) points, the rows (M,) in the box grown by its size on each side,
+    and which of these lie among others.
 
     It begins as that of the middle 98 %, which may all lie in a part that was measured densely; while there are clearly
     larger ones, it becomes the box of those in the grown box that lie among others.
@@ -323,8 +323,8 @@ def coincidence_note(path: Path, points: NDArray[np.float64]) -> list[str]:
     if same <= COINCIDING:
         return []
     return [
-        f"{same:.0%} of the points of {path.name} lie exactly where others do, as in a scan that was merged twice or was"
-        " written in too coarse steps: their spacing is that between different places"
+        f"{same:.0%} of the points of {path.name} lie exactly where others do, as in a scan that was merged twice or"
+        " was written in too coarse steps: their spacing is that between different places"
     ]
 
 
@@ -450,7 +450,8 @@ def finer(step: float, apart: float, fits: Callable[[float], bool]) -> float:
 
 
 def _step_of(path: Path, farthest: NDArray[np.float64], apart: float) -> float:
-    """A thousandth of the CRS's unit; less where points are dense; more where 32 bits do not count as far as strays lie.
+    """A thousandth of the CRS's unit; less where points are dense; more where 32 bits do not count as far as strays
+    lie.
 
     Args:
         path: for the note.

@@ -183,10 +183,10 @@ def _stay(rows: Rows, done: Completed) -> NDArray[np.bool_]:
 def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
     """Copy a LAS or LAZ file with all that its points have, and append what was added.
 
-    Coordinates keep the file's own steps, or have a tenth, a hundredth, ... of them where the added points are too dense
-    for these: the scene's points stay exactly where they are. The CRS stays. The fields of `Completed` become extra dimensions. Added
-    points have colours where the file has them; their classification and the like are 0. Points are copied in parts, so
-    that memory stays small.
+    Coordinates keep the file's own steps, or have a tenth, a hundredth, ... of them where the added points are too
+    dense for these: the scene's points stay exactly where they are. The CRS stays. The fields of `Completed` become
+    extra dimensions. Added points have colours where the file has them; their classification and the like are 0. Points
+    are copied in parts, so that memory stays small.
 
     Returns:
         Notes of the steps, and of what has another name there.
@@ -221,7 +221,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                     part.array[name] = chunk.array[name]
                 for axis in AXES if times > 1 else ():
                     if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MOST:
-                        raise StageError(f"{scene.survey.path} has points outside the box that it names; write it again")
+                        raise StageError(f"points of {scene.survey.path} lie outside the box it names; write it again")
                     part.array[axis] *= times
                 if "red" in own:
                     brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))

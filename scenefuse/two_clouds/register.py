@@ -115,8 +115,8 @@ def register(
         if again is not None:
             at = " ".join(f"{x:.10g}" for x in again)
             notes.append(
-                f"the scene shows the object, or something like it, a second time, at ({at}): if that is the one, mark it"
-                " with --fiducials or --crop-box"
+                f"the scene shows the object, or something like it, a second time, at ({at}): if that is the one, mark"
+                " it with --fiducials or --crop-box"
             )
             print(f"note       {notes[-1]}", flush=True)
     evidence = evidence_of(given.object, given.scene.part, given.ups)

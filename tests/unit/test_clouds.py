@@ -4,7 +4,16 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, strays, voxel_downsample, write_cloud, write_laz
+from scenefuse.io.clouds import (
+    Cloud,
+    concatenate,
+    read_cloud,
+    spacing,
+    strays,
+    voxel_downsample,
+    write_cloud,
+    write_laz,
+)
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 

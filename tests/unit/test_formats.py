@@ -285,7 +285,7 @@ def test_rows_and_columns_of_a_scanners_grid_are_no_coordinates_and_that_is_said
     rng, places = np.random.default_rng(0), np.arange(40)
     points, colors = rng.uniform(0, 50, (40, 3)).round(3) + 5e5 + 0.0004, rng.integers(0, 256, (40, 3))
     bright = rng.integers(0, 2048, (40, 1))
-    behind = {"colours": [colors], "intensity and colours": [bright, colors], "intensity": [bright], "none": []}[further]
+    behind = ([bright] if "intensity" in further else []) + ([colors] if "colours" in further else [])
     rows = np.column_stack([places // 8, places % 8, points, *behind])
     np.savetxt(tmp_path / "faro.xyz", rows, fmt="%.4f")
     found = read_cloud(tmp_path / "faro.xyz")

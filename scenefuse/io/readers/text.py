@@ -246,7 +246,7 @@ def _indices(rows: NDArray[np.float64]) -> int:
         return 0
     whole = (rows == np.rint(rows)).all(0)
     if columns > 4 and whole[:2].all() and not whole[2:5].any() and (columns % 3 == 2 or whole[5:].all()):
-        return 2 if 0 <= rows[:, :2].min() and rows[:, :2].max() <= MOST_ROWS else 0
+        return 2 if rows[:, :2].min() >= 0 and rows[:, :2].max() <= MOST_ROWS else 0
     if (first == first[0] + np.arange(len(first))).all():
         return 1
     once = len(np.unique(first)) == len(first)
