@@ -202,6 +202,12 @@ def read_cameras(folder: Path) -> dict[str, pycolmap.Camera]:
     return {image.name: model.cameras[image.camera_id] for image in model.images.values()}
 
 
+def ray_through(camera: pycolmap.Camera, pixel: Array) -> Array:
+    """(2,) where the ray of a pixel (2,) meets the plane z = 1 in front of its camera; NaN where the lens's model does
+    not reach so far: a strong distortion folds back beyond some angle."""
+    return np.asarray(camera.cam_from_img(np.asarray(pixel, dtype=np.float64).reshape(1, 2)))[0]
+
+
 def posed_images(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
     """The images of a model that have a pose, sorted by name."""
     return sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)

@@ -10,7 +10,7 @@ from scenefuse.pick.clicks import Click, Sizes
 from scenefuse.sfm.fiducials import Clicks, triangulate_consistent
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
-from scenefuse.workspace import posed_images, read_model
+from scenefuse.workspace import posed_images, ray_through, read_model
 
 DEPTHS = 200
 """Samples of a ray, from near to far."""
@@ -91,7 +91,9 @@ class Cameras:
         image = self._images[click.photo]
         camera = self._model.cameras[image.camera_id]
         pixel = np.array([click.x, click.y]) * [camera.width, camera.height] / np.array(self._sizes[click.photo])
-        ray = np.array([*np.asarray(camera.cam_from_img(pixel)).ravel(), 1.0])
+        ray = np.array([*ray_through(camera, pixel), 1.0])
+        if not np.isfinite(ray).all():
+            return np.zeros((0, 2))
         pose = image.cam_from_world().matrix()
         seen = np.array([self._model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
         depth = seen @ pose[2, :3] + pose[2, 3] if len(seen) else np.ones(1)

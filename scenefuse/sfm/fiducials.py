@@ -235,7 +235,10 @@ def triangulate_consistent(
         position, residual = intersect(seen, pixels)
         if position is None:
             where = ", ".join(name for name, _ in observed)
-            left_out.append(f"the rays to point {point} from {where} are parallel or meet behind a camera")
+            left_out.append(
+                f"the rays to point {point} from {where} are parallel, meet behind a camera, or lie beyond what a lens's"
+                " model reaches"
+            )
         elif residual > max_residual_px:
             off = np.linalg.norm(np.array([image.project_point(position) for image in seen]) - pixels, axis=1)
             where = ", ".join(f"{name} {px:.1f} px" for (name, _), px in zip(observed, off))
@@ -338,10 +341,15 @@ def model_pixel(
 
 
 def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
-    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet."""
+    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet, or a pixel
+    lies beyond what its lens's model reaches."""
+    from scenefuse.workspace import ray_through
+
     poses = np.array([image.cam_from_world().matrix() for image in images])
     cameras = [image.camera for image in images if image.camera is not None]
-    normalised = np.array([camera.cam_from_img(pixel) for camera, pixel in zip(cameras, pixels)])
+    normalised = np.array([ray_through(camera, pixel) for camera, pixel in zip(cameras, pixels)])
+    if not np.isfinite(normalised).all():
+        return None, np.inf
     rows = normalised[:, :, None] * poses[:, 2:3, :] - poses[:, :2, :]
     system = rows.reshape(-1, 4)
     homogeneous = np.linalg.svd(system)[2][3]

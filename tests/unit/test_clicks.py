@@ -705,3 +705,11 @@ def test_a_click_where_the_undistorted_photo_has_no_pixels_is_left_out_but_count
     assert len(found[0].pixels) == 1 and "whose edge is cut away there" in left_out[0]
     found, left_out = clicks_per_photo(labels, tmp_path / "bent", photos.views, None)
     assert (found[0].pixels[1] < 0).all() and not left_out
+
+
+def test_a_click_beyond_what_the_lens_s_model_reaches_is_left_out_and_a_box_s_corner_is_moved(tmp_path, photos):
+    bent_model(tmp_path / "bent", photos.views[0], -0.5)
+    clicks = [("inside", "f00.png", 60, 45), ("outside", "f00.png", 2, 2), ("box", "f00.png", 1, 1), ("box", "f00.png", 60, 60)]
+    found, left_out = clicks_per_photo(read(tmp_path, clicks), tmp_path / "bent", photos.views, {})
+    assert len(found[0].pixels) == 1 and len(left_out) == 1 and "(2, 2)" in left_out[0]
+    assert (found[0].box[0] >= 0).all() and (found[0].box[0] < 2).all()

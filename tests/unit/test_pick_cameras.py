@@ -124,3 +124,13 @@ def test_an_accepted_mask_is_so_until_it_changes(results):
     assert again.is_accepted("2.jpg") and not again.is_accepted("1.jpg")
     cv2.imwrite(str(results / "masks/2.png"), np.zeros((480, 640), dtype=np.uint8))
     assert not CarriedMasks(results, results / "pick/accepted.json").is_accepted("2.jpg")
+
+
+def test_a_click_beyond_what_the_lens_s_model_reaches_says_nothing(model, tmp_path):
+    model = pycolmap.Reconstruction(model)
+    model.cameras[1].params = [500, 320, 240, -0.6]
+    model.write(tmp_path)
+    cameras, corner = Cameras(tmp_path, SIZES), Click("roof", "1.jpg", 4.0, 4.0)
+    assert len(cameras.expected([corner], "2.jpg").pixels) == 0
+    assert cameras.expected([corner, seen(model, 3)], "2.jpg") is None
+    assert cameras.residuals([corner, seen(model, 3)]) == {}

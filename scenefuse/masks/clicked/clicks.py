@@ -14,7 +14,7 @@ from scenefuse.io.tables import composed
 from scenefuse.sfm.fiducials import Labels
 from scenefuse.stage import StageError
 from scenefuse.transforms import Array
-from scenefuse.workspace import View, posed_images, read_model
+from scenefuse.workspace import View, posed_images, ray_through, read_model
 
 if TYPE_CHECKING:
     import pycolmap
@@ -111,7 +111,8 @@ def clicks_per_photo(
         if photo in images and photo in rows:
             view, size = views[rows[photo]], (listed or {}).get(photo)
             undistorted = _undistorted(f"{labels.path}: {click}", label, pixel, images[photo], view, size)
-            if listed is not None and ((undistorted < 0) | (undistorted > [view.width, view.height])).any():
+            beyond = ((undistorted < 0) | (undistorted > [view.width, view.height])).any()
+            if not np.isfinite(undistorted).all() or (listed is not None and beyond):
                 left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
             else:
                 found.setdefault(rows[photo], []).append((label, undistorted, pixel))
@@ -130,17 +131,19 @@ def clicks_per_photo(
 def _undistorted(
     click: str, label: str, pixel: Array, image: pycolmap.Image, view: View, size: tuple[int, int] | None
 ) -> Array:
-    """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge; a corner of a box is moved into it.
-    StageError where it lies outside the original."""
+    """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge, NaN where the lens's model does not reach;
+    a corner of a box is moved into it. StageError where it lies outside the original."""
     camera = image.camera
     assert camera is not None
     width, height = size or (camera.width, camera.height)
     if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
         raise StageError(f"{click} lies outside {image.name}, which has {width} x {height} pixels; correct the click")
-    ray = camera.cam_from_img(pixel * [camera.width / width, camera.height / height])
-    undistorted: Array = (view.intrinsics @ [*np.asarray(ray).ravel(), 1.0])[:2]
-    edge = np.array([view.width, view.height]) - 1e-3
-    return np.clip(undistorted, 0, edge) if label == "box" else undistorted
+    ray = ray_through(camera, pixel * [camera.width / width, camera.height / height])
+    undistorted: Array = (view.intrinsics @ [*ray, 1.0])[:2]
+    if label != "box":
+        return undistorted
+    size = np.array([view.width, view.height])
+    return np.clip(np.where(np.isfinite(undistorted), undistorted, pixel * size / [width, height]), 0, size - 1e-3)
 
 
 def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array, Array]]) -> PhotoClicks:
