@@ -640,6 +640,12 @@ def test_a_click_in_a_photo_without_a_camera_is_left_out_where_others_say_what_t
     assert prompted.left_out == [sentence]
 
 
+def test_a_click_in_a_photo_that_is_not_used_is_left_out_where_others_say_what_the_object_is(tmp_path, model, photos):
+    labels = read(tmp_path, [("inside", "f03.png", *MIDDLE), ("inside", "unused.png", 5, 5)])
+    found, left_out = clicks_per_photo(labels, model, photos.views, SIZES)
+    assert list(found) == [3] and "unused.png, which is not among the photos that are used" in left_out[0]
+
+
 @pytest.mark.parametrize(
     "rows, sentence",
     [
@@ -651,7 +657,7 @@ def test_a_click_in_a_photo_without_a_camera_is_left_out_where_others_say_what_t
             [("inside", "lost.png", 5, 5), ("outside", "f00.png", 5, 5)],
             r"no other click inside: .* in lost\.png, which has no camera .*; click in one of the 12",
         ),
-        ([("inside", "none.png", 5, 5)], r"in none\.png, which is not among the photos; click in one of the 12"),
+        ([("inside", "none.png", 5, 5)], r"in none\.png, which is not among the photos that are used.*; click in one of the 12"),
         ([("outside", "f00.png", 5, 5)], "holds only clicks outside the object"),
         ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
         (

@@ -92,12 +92,12 @@ def clicks_per_photo(
             where these are not known, and photos have the size of their cameras.
 
     Returns:
-        The clicks, and a sentence for each that is left out since its photo has no camera, or none there once its lens
-        distortion is removed.
+        The clicks, and a sentence for each that is left out since its photo is not used or has no camera, or none there
+        once its lens distortion is removed.
 
     Raises:
-        StageError: a photo that does not exist, a click outside its photo, a box that is not two corners, no click
-            inside and no box in a photo with a camera.
+        StageError: a click outside its photo, a box that is not two corners, no click inside and no box in a photo with
+            a camera.
     """
     images = {composed(image.name): image for image in posed_images(read_model(sparse))}
     rows = {composed(view.name): k for k, view in enumerate(views)}
@@ -119,7 +119,10 @@ def clicks_per_photo(
         elif listed is None or photo in listed:
             left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
         else:
-            raise StageError(f"{labels.path}: {click} is in {photo}, which is not among the photos{advice}")
+            left_out.append(
+                f"{click} is in {photo}, which is not among the photos that are used: renamed since, or left out by"
+                " object.frames (max_frames, frame_step)"
+            )
     clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
     if not any(clicks.prompt for clicks in clicked.values()):
         if left_out:
