@@ -194,7 +194,9 @@ def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
     with open(path, "rb") as file:
         file.seek(offset)
         while left:
-            rows: Any = np.fromfile(file, row, min(left, at_once)) if binary else _rows_of_text(file, row, left, at_once)
+            rows: Any = (
+                np.fromfile(file, row, min(left, at_once)) if binary else _rows_of_text(file, row, left, at_once)
+            )
             if not len(rows):
                 raise StageError(f"{path} is cut short: its last {left} points are missing; copy it again")
             left -= len(rows)
@@ -331,7 +333,9 @@ def part_reader(path: Path) -> Callable[[Path, int], Iterator[Columns]] | None:
     if ending == ".ply":
         elements = (read_header(path) or read_text_header(path) or ([], 0))[0]
         plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
-        return _ply_parts if plain and not any(element.name == "face" and element.count for element in elements) else None
+        return (
+            _ply_parts if plain and not any(element.name == "face" and element.count for element in elements) else None
+        )
     in_parts = {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts, ".pcd": pcd_parts}
     return (in_parts | dict.fromkeys(TEXTS, text_parts)).get(ending)
 

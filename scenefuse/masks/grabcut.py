@@ -23,6 +23,9 @@ COLOURS_WIDTH_PX = 300
 """Pixels along a mask's longer side of which its colours are learnt."""
 AROUND = 0.1
 """What is around a mask: so far, as a share of its longer side."""
+LEAST_HALF_PX, THIN_BANDS = 1.5, 2.0
+"""Half width from which the middle of a part is told from its rim; how far a thin part reaches, in bands, beyond what
+is certain."""
 EDGE_WIDTH_PX = 1024
 """Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each."""
 STEP_BLUR_PX, STEP_PX = 0.7, 0.15
@@ -233,10 +236,19 @@ def grabcut(image: NDArray[np.uint8], trimap: Trimap, width_px: int, iterations:
 
 
 def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
-    """A coarse mask (H, W) moved to the edges of its photo (H, W, 3): cut again, but only this near its outline."""
+    """A coarse mask (H, W) moved to the edges of its photo (H, W, 3): cut again, but only this near its outline.
+
+    Of parts that are thinner than the band, and reach beyond it, the middle stays: nothing else of them is certain.
+    """
     inner, outer = distance_to(~mask), distance_to(mask)
     trimap = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[inner > band_px], trimap[outer > band_px] = cv2.GC_FGD, cv2.GC_BGD
+    certain = inner > band_px
+    middle = (inner >= LEAST_HALF_PX) & (inner >= cv2.dilate(inner, np.ones((3, 3), np.uint8))) & ~certain
+    count, labels = cv2.connectedComponents(middle.astype(np.uint8))
+    thin = np.zeros(count, dtype=bool)
+    thin[labels[middle & (distance_to(certain) > THIN_BANDS * band_px)]] = True
+    trimap[middle & thin[labels]] = cv2.GC_FGD
     return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask
 
 

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicked.carry import carry
+from scenefuse.masks.clicked.carry import carry, one_photo
 from scenefuse.masks.clicked.click_depth import with_depth
 from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
 from scenefuse.masks.clicked.parts import Ask, prompted_parts
 from scenefuse.masks.clicked.stereo_points import with_stereo_points
+from scenefuse.masks.clicked.votes import near_most
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
@@ -81,14 +82,17 @@ def masks_from_prompts(
     """
     if isinstance(marked, Labels):
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
-        clicked = with_depth(photos, own)
-        photos = with_stereo_points(photos) if network else photos
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
         )
-        carried = carry(ask, photos, clicked, settings.max_click_residual_px)
-        placed = [np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())]
-        target = target_from_votes(carried.kind, photos, up, seed, np.concatenate(placed))
+        limit = settings.max_click_residual_px
+        first = {k: one_photo(ask, photos.views[k], clicks, limit)[0] for k, clicks in own.items() if clicks.enough}
+        clicked = with_depth(photos, own, first)
+        photos = with_stereo_points(photos) if network else photos
+        carried = carry(ask, photos, clicked, limit)
+        placed = np.concatenate([np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())])
+        placed = placed[near_most(placed, photos.points[carried.kind > 0])]
+        target = target_from_votes(carried.kind, photos, up, seed, placed, carried.ends)
         if network:
             masks = segment_again(network, target, carried.masks, photos, settings, carried.clicked)
         else:

@@ -122,10 +122,16 @@ def segment_again(
             if mask_iou(again, outline) > agreement[k]:
                 masks[k] = again
             print(f"{view.name} segmented again, IoU {mask_iou(masks[k], outline):.2f}", flush=True)
-    return [
-        cleaned(along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX), view.pixels)
-        for view, mask in zip(photos.views, masks)
-    ]
+    return [_at_full_size(view, mask) for view, mask in zip(photos.views, masks)]
+
+
+def _at_full_size(view: View, mask: Mask) -> Mask:
+    """A mask (H, W) at its photo's resolution. Small parts of it stay: they were asked for, by a click or by points of
+    other photos; small parts that the edges leave do not."""
+    assert view.pixels is not None
+    edges = along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX)
+    asked = mask & ~cleaned(mask)
+    return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
 
 
 def score_masks(masks: list[Mask], target: Target, views: list[View], settings: MaskSettings) -> ScoredMasks:

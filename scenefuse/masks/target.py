@@ -91,10 +91,15 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
 
 
 def target_from_votes(
-    kind: NDArray[np.int8], photos: Workspace, up: Array, seed: int, clicked: Array = NOTHING_CLICKED
+    kind: NDArray[np.int8],
+    photos: Workspace,
+    up: Array,
+    seed: int,
+    clicked: Array = NOTHING_CLICKED,
+    ends: Array = NOTHING_CLICKED,
 ) -> Target:
     """Where the object is, by the sparse points that the photos' masks vote for, those whose kind (P,) is 1, and by the
-    points (N, 3) that were clicked.
+    points (N, 3) that were clicked; (E, 3) ends say how far it reaches, and no more.
 
     What these points do not decide is decided as in `target_from_points`, whose other arguments they are: a vote
     against a point says less, as a part of the object that one mask lacks is missing from the next ones too.
@@ -108,7 +113,8 @@ def target_from_votes(
             f"only {len(own)} points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
             " a photo that shows more of the object, or in several"
         )
-    target = target_from_points(np.concatenate([clicked, _without_outermost(own, up)]), photos, up, seed)
+    reach = np.concatenate([own, ends])
+    target = target_from_points(np.concatenate([clicked, _without_outermost(reach, up)]), photos, up, seed)
     spanning = far_apart(clicked, target.spanning, MOST_SPANNING)
     return replace(
         target,

@@ -195,7 +195,9 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, least_inside: int = 1) -> lis
         return ["Nothing is marked yet."]
     found = []
     for photo, count in Counter(row.photo for row in rows if row.photo not in sizes).items():
-        found.append(f"{photo} is not among the photos ({count} clicks): was it renamed, or left out by object.frames.max_frames? Its clicks do not count.")
+        found.append(
+            f"{photo} is not among the photos ({count} clicks): was it renamed, or left out by object.frames.max_frames? Its clicks do not count."
+        )
     for row in rows:
         width, height = sizes.get(row.photo, (row.x, row.y))
         if not (0 <= row.x <= width and 0 <= row.y <= height):

@@ -533,11 +533,36 @@ def test_a_click_has_the_depth_at_which_the_other_photos_show_the_same():
     painted = Workspace(Path(), views, sparse, rows, [v.project(sparse[r])[0] for v, r in zip(views, rows)])
     blank = views[0].project(np.array([[2.2, 0.0, 0.0]]))[0][0]
     told = clicks([(160.0, 160.0), (200.5, 120.0), blank], [(90.0, 200.0)])
-    placed = with_depth(painted, {0: told})[0]
+    placed = with_depth(painted, {0: told}, {})[0]
     assert np.isfinite(placed.points).all(axis=1).tolist() == [True, True, False, True]
     assert np.abs(placed.points[[0, 1, 3], 2]).max() < 0.03
     np.testing.assert_allclose(views[0].project(placed.points[:2])[0], told.pixels[:2], atol=0.1)
     assert len(placed.placed) == 2 and len(placed.only(np.array([True, False, False, False])).placed) == 1
+    # What lies beside the mask is not looked for: here too little is left of one patch, and half of the other.
+    mask = np.zeros(views[0].pixels.shape[:2], dtype=bool)
+    mask[159:161, 159:161] = mask[:, 200:240] = True
+    found = with_depth(painted, {0: told}, {0: mask})[0].points
+    assert np.isfinite(found).all(axis=1).tolist() == [False, True, False, True] and abs(found[1, 2]) < 0.03
+
+
+def test_a_click_on_what_repeats_has_no_depth():
+    """Seven photos of a striped plane, from a row of places: shifted by a stripe, all of them match."""
+    found, uneven = {}, np.random.default_rng(1).uniform(60, 200, 800)
+    for repeats in (True, False):
+        views = []
+        for k in range(7):
+            centre, pose = np.array([0.5 * (k - 3), 0, 4.0]), np.diag([1.0, -1, -1, 1])
+            pose[:3, 3] = -pose[:3, :3] @ centre
+            x = np.arange(320) + 0.5 - 160 + 64 * centre[0]
+            row = 128 + 60 * np.sin(2 * np.pi * x / 6) if repeats else np.interp(x, np.arange(-400, 400), uneven)
+            pixels = np.repeat(np.uint8(row)[None, :, None], 240, axis=0).repeat(3, axis=2)
+            intrinsics = np.array([[256.0, 0, 160], [0, 256, 120], [0, 0, 1]])
+            views.append(View(f"{k}.png", intrinsics, pose, 320, 240, pixels))
+        sparse = np.random.default_rng(0).uniform([-2, -1, -0.5], [2, 1, 0.5], (300, 3))
+        rows = [view.visible(sparse)[0] for view in views]
+        painted = Workspace(Path(), views, sparse, rows, [v.project(sparse[r])[0] for v, r in zip(views, rows)])
+        found[repeats] = with_depth(painted, {3: clicks([(200.0, 120.0)])}, {})[3].placed
+    assert len(found[True]) == 0 and len(found[False]) == 1 and abs(found[False][0, 2]) < 0.1
 
 
 def test_what_was_clicked_in_one_photo_prompts_the_others_though_no_sparse_point_is_there(photos):
@@ -590,6 +615,56 @@ def test_a_coarse_mask_is_moved_to_the_edges_of_its_photo_and_no_farther():
     assert mask_iou(sharp[20:], truth[20:]) > 0.99
     # The pole reaches farther than the band.
     assert not sharp[:15].any() and not along_edges(pixels, np.zeros_like(truth), 5.0).any()
+
+
+def test_of_a_part_thinner_than_the_band_the_edges_take_nothing_away():
+    """A staff of the colours around it has no certain pixel of its own."""
+    pixels = np.random.default_rng(0).integers(90, 170, (240, 320, 3)).astype(np.uint8)
+    pixels[100:200, 100:220] = (40, 60, 50)
+    mask = pixels[..., 0] == 40
+    mask[20:100, 158:164] = True
+    found = along_edges(pixels, mask, 6.0)
+    assert found[30:100, 158:164].any(axis=1).all()
+
+
+def test_a_small_part_that_was_asked_for_stays_and_specks_that_the_edges_leave_do_not(photos):
+    """A basket below a balloon, on ropes that no photo shows."""
+    views = []
+    for view in photos.views:
+        pixels = view.pixels.copy()
+        pixels[80:84, 58:62] = (190, 60, 50)
+        views.append(replace(view, pixels=pixels))
+    marked = replace(photos, views=views)
+    masks = [true_mask(view) for view in views]
+    assert masks[0][80:84, 58:62].all() and masks[0][80:84, 58:62].sum() < 0.02 * masks[0].sum()
+    found = segment_again(Told(marked), of_points(marked), masks, marked, MaskSettings())
+    assert all(mask[80:84, 58:62].sum() >= 8 for mask in found)
+
+
+def test_points_that_two_photos_vote_for_say_how_far_the_object_reaches_unless_they_stand_alone(photos):
+    top = photos.points[:600, 2] > 0.5
+    stray = len(photos.points)
+    points = np.concatenate([photos.points, [[0.0, 0.0, 1.6]]])
+    seen, seen_at = [], []
+    for k, view in enumerate(photos.views):
+        kept = ~np.isin(photos.seen[k], np.flatnonzero(top)) | (k in (2, 3))
+        rows = np.concatenate([photos.seen[k][kept], [stray] * (k in (2, 3))]).astype(photos.seen[k].dtype)
+        seen.append(rows)
+        seen_at.append(view.project(points[rows])[0])
+    votes = Workspace(photos.folder, photos.views, points, seen, seen_at)
+
+    def ask(view, inside, outside, box, likely):
+        mask = true_mask(view)
+        mask[:12, 55:65] = True
+        return [mask], np.ones(1)
+
+    carried = carry(ask, votes, {3: clicks([MIDDLE, (70, 45), (50, 45)])}, 2)
+    assert (carried.kind[:600][top] < 1).all() and len(carried.ends) > 10
+    assert carried.ends[:, 2].max() > 0.9 and (np.linalg.norm(carried.ends, axis=1) < 1.01).all()
+    up = np.array([0, 0, 1.0])
+    without = target_from_votes(carried.kind, votes, up, 0)
+    reaching = target_from_votes(carried.kind, votes, up, 0, ends=carried.ends)
+    assert reaching.spanning[:, 2].max() > without.spanning[:, 2].max() + 0.2
 
 
 @pytest.fixture
@@ -657,7 +732,10 @@ def test_a_click_in_a_photo_that_is_not_used_is_left_out_where_others_say_what_t
             [("inside", "lost.png", 5, 5), ("outside", "f00.png", 5, 5)],
             r"no other click inside: .* in lost\.png, which has no camera .*; click in one of the 12",
         ),
-        ([("inside", "none.png", 5, 5)], r"in none\.png, which is not among the photos that are used.*; click in one of the 12"),
+        (
+            [("inside", "none.png", 5, 5)],
+            r"in none\.png, which is not among the photos that are used.*; click in one of the 12",
+        ),
         ([("outside", "f00.png", 5, 5)], "holds only clicks outside the object"),
         ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
         (
@@ -715,7 +793,12 @@ def test_a_click_where_the_undistorted_photo_has_no_pixels_is_left_out_but_count
 
 def test_a_click_beyond_what_the_lens_s_model_reaches_is_left_out_and_a_box_s_corner_is_moved(tmp_path, photos):
     bent_model(tmp_path / "bent", photos.views[0], -0.5)
-    clicks = [("inside", "f00.png", 60, 45), ("outside", "f00.png", 2, 2), ("box", "f00.png", 1, 1), ("box", "f00.png", 60, 60)]
+    clicks = [
+        ("inside", "f00.png", 60, 45),
+        ("outside", "f00.png", 2, 2),
+        ("box", "f00.png", 1, 1),
+        ("box", "f00.png", 60, 60),
+    ]
     found, left_out = clicks_per_photo(read(tmp_path, clicks), tmp_path / "bent", photos.views, {})
     assert len(found[0].pixels) == 1 and len(left_out) == 1 and "(2, 2)" in left_out[0]
     assert (found[0].box[0] >= 0).all() and (found[0].box[0] < 2).all()

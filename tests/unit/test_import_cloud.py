@@ -69,7 +69,9 @@ def test_a_scene_in_utm_lies_near_its_origin_and_goes_back_to_its_place(tmp_path
     assert value(report, "points") == 500 and value(report, "source") == name
 
 
-@pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.xyz", "a.copc.laz"])
+@pytest.mark.parametrize(
+    "name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.xyz", "a.copc.laz"]
+)
 def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkeypatch):
     turned = np.random.default_rng(1).normal(size=(500, 3))
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
@@ -79,7 +81,9 @@ def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkey
     found, *others = imported_scene(tmp_path, source)
     assert jsons == others and np.array_equal(found.points, whole.points)
     assert np.array_equal(found.colors, cloud.colors)
-    assert (found.normals is None) == (not name.endswith((".ply", ".pcd"))) and np.array_equal(found.normals, whole.normals)
+    assert (found.normals is None) == (not name.endswith((".ply", ".pcd"))) and np.array_equal(
+        found.normals, whole.normals
+    )
 
 
 def test_a_copc_of_many_nodes_is_read_whole(tmp_path, monkeypatch):

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.masks.clicked.clicks import ENOUGH, PhotoClicks
 from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
@@ -13,12 +14,14 @@ from scenefuse.masks.clicked.space import Left, Space
 from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
     LEAST_QUALITY,
+    LEAST_SPANNING,
     SURE,
     Known,
     Voter,
     agreement_of,
     known_pixels,
     known_points,
+    near_most,
     shares_of,
     voter_of,
 )
@@ -36,6 +39,8 @@ CERTAIN, AS_GOOD = 0.9, 0.06
 of those within so much of its score: who clicks on several parts means the whole."""
 FILL_WEIGHT = 0.5
 """Of how well it fills the space that the others leave, likewise."""
+CROWD, CROWDED = 4, 3.0
+"""A point that two photos vote for has so many others within so many times the distance that they mostly have."""
 SAME = 0.9
 """IoU from which two masks are the same but for their seams, of which the space says nothing: it is coarse."""
 
@@ -50,6 +55,7 @@ class Carried:
         masks: (H, W) per photo, empty where none was good enough.
         reasons: why a photo's mask is not good enough, by the photo's name.
         kind: (P,) per sparse point, 1 on the object, -1 not on it, 0 unknown.
+        ends: (E, 3) points on the object that two photos alone vote for: they say how far it reaches.
         left_out: the clicks that contradict their mask, a sentence each.
         clicked: the others, by row of the photo.
     """
@@ -57,6 +63,7 @@ class Carried:
     masks: list[Mask]
     reasons: dict[str, str]
     kind: NDArray[np.int8]
+    ends: Array
     left_out: list[str]
     clicked: dict[int, PhotoClicks]
 
@@ -256,7 +263,18 @@ def _carried(photos: Workspace, made: dict[int, Voter], left_out: list[str]) -> 
             )
     counts = np.bincount(np.concatenate([v.rows for v in made.values() if v.votes]), minlength=len(photos.points))
     kind, _ = known_points(photos, made)
+    ends = _ends(photos.points[(kind > 0) & (counts >= 3)], photos.points[(kind > 0) & (counts == 2)])
     kind[counts < 3] = 0
-    return Carried(
-        masks, reasons, kind, left_out, {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
-    )
+    clicked = {k: voter.clicks for k, voter in made.items() if voter.clicks is not NO_CLICKS}
+    return Carried(masks, reasons, kind, ends, left_out, clicked)
+
+
+def _ends(sure: Array, others: Array) -> Array:
+    """Of points (N, 3) that two photos vote for those near which many of these or of the sure ones (M, 3) lie: the ends
+    of what is photographed in passing are in two photos only; a mismatched point stands alone."""
+    own = np.concatenate([sure, others])
+    if len(sure) < LEAST_SPANNING or not len(others):
+        return others[:0]
+    others = others[near_most(others, sure)]
+    away, usual = (cKDTree(own).query(points, CROWD + 1)[0][:, CROWD] for points in (others, sure))
+    return others[away <= CROWDED * np.median(usual)]

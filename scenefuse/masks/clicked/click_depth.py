@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.pixels import held
+from scenefuse.mvs.visual_hull import Mask
 from scenefuse.transforms import Array
 from scenefuse.workspace import View, Workspace
 
@@ -21,27 +23,42 @@ RANGE_PERCENT, NEARER = (1, 95), 0.7
 """Which of their depths bound the range; the object may be so much nearer."""
 LEAST_NCC, LEAST_PHOTOS = 0.7, 3
 """Correlation with the patch, mean of the best so many photos, from which a depth counts."""
+PEAK_STEPS, CLEARLY = 8, 0.1
+"""No depth farther than so many steps from the best may match nearly as well."""
+LEAST_SHARE = 0.25
+"""Of the patch that lies in the photo's mask: the rest shows what is behind a thin part, at its depth."""
 
 
-def with_depth(photos: Workspace, clicked: Mapping[int, PhotoClicks]) -> dict[int, PhotoClicks]:
+def with_depth(
+    photos: Workspace, clicked: Mapping[int, PhotoClicks], masks: Mapping[int, Mask]
+) -> dict[int, PhotoClicks]:
     """The clicks with the points (N, 3) in the object's frame that they are on, NaN where none is found (method K1).
 
     Args:
         photos: views with RGB pixels, sparse points and who observes them.
         clicked: clicks by row of the photo.
+        masks: (H, W) of the clicked photos by their own clicks, where these are enough for one: of the patch around a
+            click inside, what lies in it is looked for.
     """
     grey = [cv2.cvtColor(view.pixels, cv2.COLOR_RGB2GRAY) for view in photos.views]
     found = {}
     for k, clicks in clicked.items():
-        points = [_point_at(photos, grey, k, pixel) for pixel in clicks.pixels]
+        mask = masks.get(k)
+        points = [
+            _point_at(photos, grey, k, pixel, mask if inside else None)
+            for pixel, inside in zip(clicks.pixels, clicks.inside)
+        ]
         known = [np.full(3, np.nan) if point is None else point for point in points]
         found[k] = replace(clicks, points=np.array(known).reshape(-1, 3))
     print(f"{sum(len(c.placed) for c in found.values())} clicks on the object have a depth", flush=True)
     return found
 
 
-def _point_at(photos: Workspace, grey: list[NDArray[np.uint8]], k: int, pixel: Array) -> Array | None:
-    """The point (3,) on the ray of a pixel (2,) that other photos show alike; None where too few do."""
+def _point_at(
+    photos: Workspace, grey: list[NDArray[np.uint8]], k: int, pixel: Array, mask: Mask | None
+) -> Array | None:
+    """The point (3,) on the ray of a pixel (2,) that other photos show alike; None where too few do, or too little of
+    its patch lies in a mask."""
     view = photos.views[k]
     depths = view.project(photos.points[photos.seen[k]])[1]
     if not len(depths):
@@ -52,16 +69,25 @@ def _point_at(photos: Workspace, grey: list[NDArray[np.uint8]], k: int, pixel: A
     grid = pixel + np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2)
     if (grid < 0).any() or (grid > [view.width - 1, view.height - 1]).any():
         return None
+    if mask is not None:
+        whole, grid = len(grid), grid[held(mask, grid, 0)]
+        if len(grid) < LEAST_SHARE * whole:
+            return None
+    grid = np.concatenate([pixel[None], grid])
     rays = np.column_stack([grid, np.ones(len(grid))]) @ np.linalg.inv(view.intrinsics).T
     rays = rays @ view.cam_from_world[:3, :3]
-    patch, others = _sampled(grey[k], grid), _beside(photos.views, k, view.centre + rays[len(rays) // 2] * near)
+    ray, rays, grid = rays[0], rays[1:], grid[1:]
+    patch, others = _sampled(grey[k], grid), _beside(photos.views, k, view.centre + ray * near)
     tried = np.linspace(1 / far, 1 / (NEARER * near), STEPS)
     for fine in (False, True):
         scores = [_alike(photos.views, grey, others, view.centre + rays / inverse, patch) for inverse in tried]
         best, step = tried[int(np.argmax(scores))], tried[1] - tried[0]
         if not fine:
+            elsewhere = np.array(scores)[np.abs(np.arange(STEPS) - np.argmax(scores)) > PEAK_STEPS]
+            if elsewhere.max() > max(scores) - CLEARLY:
+                return None
             tried = np.linspace(best - step, best + step, FINE_STEPS)
-    return view.centre + rays[len(rays) // 2] / best if max(scores) >= LEAST_NCC else None
+    return view.centre + ray / best if max(scores) >= LEAST_NCC else None
 
 
 def _beside(views: list[View], k: int, point: Array) -> list[int]:

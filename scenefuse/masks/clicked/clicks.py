@@ -145,8 +145,8 @@ def _undistorted(
     undistorted: Array = (view.intrinsics @ [*ray, 1.0])[:2]
     if label != "box":
         return undistorted
-    size = np.array([view.width, view.height])
-    return np.clip(np.where(np.isfinite(undistorted), undistorted, pixel * size / [width, height]), 0, size - 1e-3)
+    whole = np.array([view.width, view.height])
+    return np.clip(np.where(np.isfinite(undistorted), undistorted, pixel * whole / [width, height]), 0, whole - 1e-3)
 
 
 def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array, Array]]) -> PhotoClicks:

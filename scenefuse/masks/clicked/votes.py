@@ -106,7 +106,7 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     known = np.where(share >= SURE, 1, np.where(share <= 1 - SURE, -1, 0)).astype(np.int8)
     rows = [voter.rows for voter in made.values() if voter.votes]
     counts = np.bincount(np.concatenate([np.zeros(0, np.int64), *rows]), minlength=len(known))
-    known[(known > 0) & ~_near_most(photos.points, known > 0)] = 0
+    known[(known > 0) & ~near_most(photos.points, photos.points[known > 0])] = 0
     own = central(photos.points[(known > 0) & (counts >= SPANNING_VOTES)])
     enclosed, sparse = np.zeros(len(known), dtype=bool), np.arange(len(known)) < len(known) - photos.by_stereo
     if len(own) >= LEAST_SPANNING:
@@ -121,12 +121,13 @@ def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.
     return known, enclosed & sparse
 
 
-def _near_most(points: Array, own: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """(P,) which points are no farther from most of the object's own than these reach: a mask that leaks takes in what
-    is far behind the object, and would have the next photos look for that."""
-    if own.sum() < LEAST_SPANNING:
+def near_most(points: Array, own: Array) -> NDArray[np.bool_]:
+    """(P,) which points (P, 3) are no farther from most of the object's own (N, 3) than these reach: a mask that leaks,
+    or a click whose depth is wrong, takes in what is far behind the object, and would have the next photos look for
+    that. All, where few of the object's own are known."""
+    if len(own) < LEAST_SPANNING:
         return np.ones(len(points), dtype=bool)
-    low, high = np.percentile(points[own], [STRAY, 100 - STRAY], axis=0)
+    low, high = np.percentile(own, [STRAY, 100 - STRAY], axis=0)
     reach = FAR * np.linalg.norm(high - low)
     return np.asarray(((points >= low - reach) & (points <= high + reach)).all(1))
 
@@ -142,7 +143,8 @@ class Known(NamedTuple):
 def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Known:
     """What the votes of the others say of a photo's points; those clicked in the others are inside where this photo has
     them in its frame: what hides them is mostly the object."""
-    kind, enclosed = (values[photos.seen[k]] for values in known_points(photos, others))
+    known, enclosing = known_points(photos, others)
+    kind, enclosed = known[photos.seen[k]], enclosing[photos.seen[k]]
     pixels, own = photos.seen_at[k][kind != 0], kind[kind != 0] > 0
     if len(pixels) > NEIGHBOURS:
         near = cKDTree(pixels).query(pixels, NEIGHBOURS + 1)[1][:, 1:]
@@ -150,6 +152,7 @@ def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Known:
         pixels, own = pixels[agree], own[agree]
     view, clicked = photos.views[k], [voter.clicks.placed for voter in others.values() if voter.votes]
     points = np.concatenate([np.zeros((0, 3)), *clicked])
+    points = points[near_most(points, photos.points[known > 0])]
     shown = view.project(points[view.visible(points)[0]])[0]
     return Known(np.concatenate([shown, pixels[own]]), pixels[~own], photos.seen_at[k][enclosed])
 
