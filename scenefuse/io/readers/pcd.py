@@ -1,4 +1,7 @@
-"""PCD 0.7, the format of PCL: ASCII, binary and compressed. Open3D misreads positions that are binary doubles, without a word."""
+"""PCD 0.7, the format of PCL: ASCII, binary and compressed.
+
+Open3D misreads positions that are binary doubles, without a word.
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
