@@ -194,19 +194,18 @@ def _ply_parts(path: Path, at_once: int) -> Iterator[Columns]:
     with open(path, "rb") as file:
         file.seek(offset)
         while left:
-            rows: Any = (
-                np.fromfile(file, row, min(left, at_once)) if binary else _rows_of_text(file, row, left, at_once)
-            )
+            most = min(left, at_once)
+            rows: Any = np.fromfile(file, row, most) if binary else _rows_of_text(file, row, most)
             if not len(rows):
                 raise StageError(f"{path} is cut short: its last {left} points are missing; copy it again")
             left -= len(rows)
             yield {name: np.ascontiguousarray(rows[name]) for name in kinds}
 
 
-def _rows_of_text(file: BinaryIO, row: np.dtype[Any], left: int, at_once: int) -> NDArray[Any]:
-    """The next rows of a PLY of text; what the header calls single precision has the digits of the text."""
+def _rows_of_text(file: BinaryIO, row: np.dtype[Any], most: int) -> NDArray[Any]:
+    """The next rows of a PLY of text, so many at most; single precision has the digits of the text."""
     assert row.names is not None
-    lines = list(islice(file, min(left, at_once, LINES_AT_ONCE)))
+    lines = list(islice(file, min(most, LINES_AT_ONCE)))
     wide = np.dtype([(name, "f8" if row[name].kind == "f" else row[name]) for name in row.names])
     return np.loadtxt((line.decode("ascii") for line in lines), wide, ndmin=1) if lines else np.empty(0, wide)
 
@@ -333,9 +332,8 @@ def part_reader(path: Path) -> Callable[[Path, int], Iterator[Columns]] | None:
     if ending == ".ply":
         elements = (read_header(path) or read_text_header(path) or ([], 0))[0]
         plain = bool(elements) and elements[0].name == "vertex" and elements[0].row is not None
-        return (
-            _ply_parts if plain and not any(element.name == "face" and element.count for element in elements) else None
-        )
+        mesh = any(element.name == "face" and element.count for element in elements)
+        return _ply_parts if plain and not mesh else None
     in_parts = {".las": _las_parts, ".laz": _las_parts, ".e57": _e57_parts, ".pcd": pcd_parts}
     return (in_parts | dict.fromkeys(TEXTS, text_parts)).get(ending)
 

@@ -110,8 +110,9 @@ def target_from_votes(
     own = photos.points[kind > 0]
     if len(own) < LEAST_OWN:
         raise StageError(
-            f"only {len(own)} points lie in the masks that the clicks lead to, {LEAST_OWN} are needed; click in"
-            " a photo that shows more of the object, or in several"
+            f"only {len(own)} points of the sparse model lie in the masks that the clicks lead to, {LEAST_OWN} are"
+            " needed; click in a photo that shows more of the object, or in several. If it has no texture, there are"
+            " none: light from the side may bring some out"
         )
     reach = np.concatenate([own, ends])
     target = target_from_points(np.concatenate([clicked, _without_outermost(reach, up)]), photos, up, seed)

@@ -196,7 +196,7 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, least_inside: int = 1) -> lis
     found = []
     for photo, count in Counter(row.photo for row in rows if row.photo not in sizes).items():
         found.append(
-            f"{photo} is not among the photos ({count} clicks): was it renamed, or left out by object.frames.max_frames?"
+            f"{photo} is not among the photos ({count} clicks): was it renamed, or left out by max_frames?"
             " Its clicks do not count."
         )
     for row in rows:

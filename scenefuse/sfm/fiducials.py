@@ -236,8 +236,8 @@ def triangulate_consistent(
         if position is None:
             where = ", ".join(name for name, _ in observed)
             left_out.append(
-                f"the rays to point {point} from {where} are parallel, meet behind a camera, or lie beyond what the lens"
-                " shows"
+                f"the rays to point {point} from {where} are parallel, meet behind a camera, or lie beyond what the"
+                " lens shows"
             )
         elif residual > max_residual_px:
             off = np.linalg.norm(np.array([image.project_point(position) for image in seen]) - pixels, axis=1)
@@ -341,8 +341,8 @@ def model_pixel(
 
 
 def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
-    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet, or one lies
-    beyond what the lens's model reaches."""
+    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet, or one
+    lies beyond what the lens shows."""
     from scenefuse.workspace import ray_through
 
     poses = np.array([image.cam_from_world().matrix() for image in images])

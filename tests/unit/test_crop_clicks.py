@@ -10,6 +10,7 @@ from scenefuse.io.tiles import tiled_cloud, write_tiles
 from scenefuse.io.tiles.write_tiles import write_tiled
 from scenefuse.registration.crop.crop_cloud import CropSettings
 from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.registration.crop.one_photo import SceneClicks
 from scenefuse.sfm.fiducials import read_points
 from scenefuse.stage import StageError, read_json, value
 from scenefuse.transforms import look_at
@@ -172,3 +173,16 @@ def test_a_click_in_a_scene_photo_without_a_camera_is_left_out_and_named(crop, m
 def test_bad_clicks_in_the_scene_are_one_sentence(crop, rows, sentence):
     with pytest.raises(StageError, match=sentence):
         crop(rows)
+
+
+def test_clicks_outside_on_the_ground_beside_a_wall_leave_the_wall():
+    """Who clicks on a house's ends and on the ground before it has no click on the wall's foot."""
+    rng = np.random.default_rng(0)
+    wall = rng.uniform([0, 0, 0], [10, 0, 6], (4000, 3))
+    ground = np.c_[rng.uniform([-5, -8], [15, 0], (4000, 2)), rng.normal(0, 0.005, 4000)]
+    ends = np.array([[0, 0, 0.1], [10, 0, 0.1], [0, 0, 6], [10, 0, 6]])
+    other = SceneClicks([], ends, np.array([[5, -0.7, 0.0], [2.5, -0.7, 0.0]]), [], []).other(
+        np.concatenate([wall, ground])
+    )
+    assert other[:4000].mean() < 0.08 and (np.linalg.norm(ground - [5, -0.7, 0], axis=1) < 1)[other[4000:]].any()
+    assert other[4000:][np.linalg.norm(ground - [5, -0.7, 0], axis=1) < 0.6].all()

@@ -134,7 +134,7 @@ def clicks_per_photo(
 def _undistorted(
     click: str, label: str, pixel: Array, image: pycolmap.Image, view: View, size: tuple[int, int] | None
 ) -> Array:
-    """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge, NaN beyond what the lens's model reaches;
+    """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge, NaN beyond what the lens shows;
     a corner of a box is moved into it. StageError where it lies outside the original."""
     camera = image.camera
     assert camera is not None

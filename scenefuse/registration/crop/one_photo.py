@@ -19,6 +19,9 @@ from scenefuse.workspace import View, read_views
 # A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
 # more; of points up to so many spacings behind the nearest that is no stray: so many lie within these.
 AROUND_SPACINGS, AROUND_PX, THICK_SPACINGS, LEAST_CROWD = 2, 3, 8, 3
+# What a click outside is on is flat where so many points around it have a surface variation below FLAT; then what is
+# farther from their plane than this share of the clicks' extent is not it.
+AROUND_POINTS, FLAT, FLAT_DEPTH = 8, 0.02, 0.03
 # Inside clicks with a depth that span an object.
 LEAST_INSIDE = 3
 # Rounds in which the crop grows along the object; each reaches farther by its margin.
@@ -53,13 +56,27 @@ class SceneClicks:
     left_out: list[str]
 
     def other(self, points: Array) -> NDArray[np.bool_]:
-        """(N,) points (N, 3) that are something else: nearer to a click outside than to any inside, or off a box."""
+        """(N,) points (N, 3) that are something else: nearer to a click outside than to any inside, or off a box.
+
+        Of a click on something flat, as the ground beside a wall, only what lies in that plane: clicks inside are few,
+        and most of the wall is nearer to it than to these.
+        """
         found = np.zeros(len(points), dtype=bool)
         for view, clicks in self.boxes:
             found |= _off_box(clicks, *view.project(points))
-        if len(self.outside):
-            near = [cKDTree(side).query(points, workers=threads())[0] for side in (self.outside, self.inside)]
-            found |= near[0] < near[1]
+        if not len(self.outside):
+            return found
+        (to_outside, row), (to_inside, _) = (
+            cKDTree(side).query(points, workers=threads()) for side in (self.outside, self.inside)
+        )
+        extent = float(np.linalg.norm(np.ptp(self.inside, axis=0)))
+        for k, click in enumerate(self.outside):
+            own = (row == k) & (to_outside < to_inside)
+            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:AROUND_POINTS]]
+            spread, axes = np.linalg.eigh(np.cov(around.T))
+            if spread[0] < FLAT * spread.sum():
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < FLAT_DEPTH * extent
+            found |= own
         return found
 
 
