@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.masks.clicked.parts import prompted_parts
 from scenefuse.masks.grabcut import (
     Trimap,
     cleaned,
@@ -137,7 +138,14 @@ def second_cuts(
         band = band_px * view.width / REFERENCE_WIDTH_PX
         trimap = second_trimap(outline, mask, colours.evidence(view.pixels), band)
         stamp(trimap, target, view, photos.seen[k], photos.seen_at[k], clicked.get(k))
-        cut.append(cleaned(grabcut(view.pixels, trimap, view.width, 1)) if outline.any() else outline)
+        if not outline.any():
+            cut.append(outline)
+            continue
+        found, told = grabcut(view.pixels, trimap, view.width, 1), clicked.get(k)
+        cut.append(cleaned(found))
+        if told is not None and len(told.on):
+            # A small part that was clicked is no speck.
+            cut[-1] = cut[-1] | prompted_parts(found, told.on, told.off)
     return cut
 
 

@@ -487,6 +487,18 @@ def test_clicks_count_in_their_own_photo_to_the_end_with_grabcut(photos):
     assert mask_iou(corrected[7], plain[7]) > 0.95
 
 
+def test_a_small_part_that_was_clicked_stays_with_grabcut_too(photos):
+    view = photos.views[2]
+    pixels = view.pixels.copy()
+    pixels[80:85, 58:63] = (190, 60, 50)
+    marked = replace(photos, views=[*photos.views[:2], replace(view, pixels=pixels), *photos.views[3:]])
+    told = {2: clicks([MIDDLE, (60.5, 82.5)])}
+    settings = MaskSettings(grabcut_width_px=120)
+    plain, corrected = (segment_by_grabcut(of_points(marked), marked, settings, clicked) for clicked in ({}, told))
+    assert not plain[2][80:85, 58:63].any() and corrected[2][82, 60]
+    assert mask_iou(corrected[2][:75], plain[2][:75]) > 0.95
+
+
 class Told:
     """A network that answers with the true mask, of photo f06 with a corner beside, and remembers what it was told."""
 
