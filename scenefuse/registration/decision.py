@@ -8,11 +8,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from scenefuse.registration.problem import Problem
-from scenefuse.registration.score import SCORE_FRACTION, Hypothesis, color_agreement, distinct, pair
+from scenefuse.registration.score import (
+    SAME_ANGLE_DEG,
+    SAME_SHIFT,
+    SCORE_FRACTION,
+    Hypothesis,
+    color_agreement,
+    distinct,
+    pair,
+)
 from scenefuse.registration.surface import Surface
 from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.stage import setting
-from scenefuse.transforms import Array, Sim3
+from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 
 DecidedBy = Literal["geometry", "near", "photos", "both"]
 
@@ -23,6 +31,8 @@ MAX_TILT_DEG = 8.0  # angle between the up directions
 MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
 # A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
 SAME_SHAPE, SAME_COLOR = 0.95, 0.9
+# Where the object ends along an axis, as percentiles: strays do not count.
+ENDS = 1, 99
 # A pose that may be so far off because the object's own model is bent (`Uncertainty.size`) is none: the model is torn.
 MOST_BENT = 0.1
 
@@ -49,6 +59,19 @@ class FineSettings:
     """Distance within which points agree in the score, as a share of the diagonal."""
     turn_steps: int = 24
     """Turned copies of the leading poses tried about an axis."""
+
+
+@dataclass(frozen=True)
+class Repetition:
+    """What an object's repetition leaves open; as it is for one that does not repeat itself.
+
+    Attributes:
+        same_shift: poses whose shift differs by less are one, as a share of the diagonal.
+        undecided: period, scene units, by which the object can be shifted and fits what both show as well; or None.
+    """
+
+    same_shift: float = SAME_SHIFT
+    undecided: float | None = None
 
 
 @dataclass(frozen=True)
@@ -80,10 +103,11 @@ def decide(
     obj: Surface,
     problem: Problem,
     settings: FineSettings,
+    repetition: Repetition = Repetition(),
 ) -> Decision:
     """Compare the best hypothesis with its rivals and with the gate.
 
-    A rival that maps the object onto itself, in shape and colour, is no rival: fused, both give the same points.
+    A rival that turns the object onto itself, in shape and colour, is no rival: fused, both give the same points.
     Shared photos settle which pose is meant, so that rivals, colours and scores no longer matter: the scene may lack
     nearly all of the object, or show much beside it. Free space, gravity and the pose's own uncertainty still count:
     `registered` means the same tolerances whatever decided.
@@ -95,14 +119,15 @@ def decide(
         obj: the object in its own frame.
         problem: the clouds, the scale prior (a scale at its edge is rejected) and what else is known.
         settings: the gate.
+        repetition: of the object.
     """
     best, rest = ranked[0], ranked[1:]
-    rivals, free_axis = _rivals(best, rest, obj, problem.scene.diagonal, settings)
+    rivals, free_axis = _rivals(best, rest, obj, problem.scene.diagonal, settings, repetition.same_shift)
     rival = rivals[0] if rivals else None
     # The alignment's pose may score less than a rival: then there is no lead.
     margin = 1.0 if rival is None else 1 - rival.score.total / max(best.score.total, 1e-12)
     by_clouds = decided_by in ("geometry", "near")
-    of_clouds = _reasons_of_clouds(best, margin, problem, settings) if by_clouds else ()
+    of_clouds = _reasons_of_clouds(best, margin, repetition, problem, settings) if by_clouds else ()
     of_spread = _reasons_of_spread(free_axis, uncertainty, problem.scene.diagonal, settings)
     reason = next(_reasons(best, (*of_clouds, *of_spread), problem), None)
     fit = f"F-score {best.score.f_score:.2f}, margin {margin:.2f} to the best other pose{_freely(free_axis)}"
@@ -133,15 +158,20 @@ def unless_torn(decision: Decision, with_bending: Uncertainty | None, diagonal: 
 
 
 def _rivals(
-    best: Hypothesis, others: list[Hypothesis], obj: Surface, diagonal: float, settings: FineSettings
+    best: Hypothesis,
+    others: list[Hypothesis],
+    obj: Surface,
+    diagonal: float,
+    settings: FineSettings,
+    same_shift: float,
 ) -> tuple[list[Hypothesis], Array | None]:
     """The poses that differ from the best and leave the object elsewhere, and the axis about which it turns freely."""
     tau, centre = settings.score_fraction * diagonal, obj.points.mean(0)
     rivals, free_axis = [], None
     for other in others:
-        if not distinct(best.pose, other.pose, centre, diagonal):
+        if not distinct(best.pose, other.pose, centre, diagonal, shift=same_shift):
             continue
-        if not _maps_onto_itself(obj, best.pose.inverse() @ other.pose, tau / best.pose.scale):
+        if not _turns_onto_itself(obj, best.pose.inverse() @ other.pose, tau / best.pose.scale):
             rivals.append(other)
         elif free_axis is None and other.score.total > (1 - settings.min_margin) * best.score.total:
             free_axis = rotation_axis(other.pose.rotation @ best.pose.rotation.T)
@@ -169,7 +199,9 @@ def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> It
         yield f"the object would lean by {tilt:.1f} degrees, more than {MAX_TILT_DEG:.1f}"
 
 
-def _reasons_of_clouds(best: Hypothesis, margin: float, problem: Problem, settings: FineSettings) -> Iterator[str]:
+def _reasons_of_clouds(
+    best: Hypothesis, margin: float, repetition: Repetition, problem: Problem, settings: FineSettings
+) -> Iterator[str]:
     """Why a pose that no photos support may not be used."""
     found, scales = best.score, problem.scales
     if found.f_score < settings.min_f_score:
@@ -178,6 +210,11 @@ def _reasons_of_clouds(best: Hypothesis, margin: float, problem: Problem, settin
         yield f"the object explains only {found.recall:.2f} of the scene crop, below {MIN_RECALL:.2f}"
     if found.color is not None and found.color < MIN_COLOR:
         yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
+    if repetition.undecided is not None:
+        yield (
+            f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted along itself it"
+            " fits what both show as well; cut the scene to where the object ends, or register it by photos"
+        )
     if margin < settings.min_margin:
         yield f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"
     if scales.at_edge(best.pose.scale):
@@ -219,11 +256,18 @@ def tilt_deg(pose: Sim3, up: tuple[Array, Array] | None) -> float | None:
     return float(np.degrees(np.arccos(np.clip(pose.rotate(up[0]) @ up[1], -1, 1))))
 
 
-def _maps_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
-    """Whether a motion of the object's frame leaves its shape, and its colours if it has any, as they were.
+def _turns_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
+    """Whether a motion of the object's frame turns it, and leaves its shape, and any colours, as they were.
 
-    Nearly every point must find another within `tau` (object units), both ways.
+    Nearly every point must find another within `tau` (object units), both ways, and the object's middle must stay: a
+    long row of equal parts that is shifted by one of them is elsewhere.
     """
+    if rotation_angle_deg(motion.rotation) <= SAME_ANGLE_DEG:
+        return False
+    axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
+    middle = np.percentile(obj.points @ axes.T, ENDS, axis=0).mean(0) @ axes
+    if np.linalg.norm(motion.apply(middle) - middle) > tau:
+        return False
     pairs = pair(obj, obj, motion, tau)
     ahead, back = pairs.forward / len(obj.queries), (len(pairs.distance) - pairs.forward) / len(obj.queries)
     color = color_agreement(obj, obj, pairs)

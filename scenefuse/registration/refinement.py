@@ -1,4 +1,4 @@
-"""From coarse poses to one decision: refine, turn, polish, rank, compare with the alignment, decide."""
+"""From coarse poses to one decision: refine, turn, polish, shift, rank, compare with the alignment, decide."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,14 +12,16 @@ from scenefuse.registration.decision import (
     DecidedBy,
     Decision,
     FineSettings,
+    Repetition,
     decide,
     unless_torn,
 )
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
-from scenefuse.registration.score import SAME_ANGLE_DEG, Hypothesis, Score, best_distinct, score
-from scenefuse.registration.surface import Surface, with_grid, with_queries
+from scenefuse.registration.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
+from scenefuse.registration.score import SAME_ANGLE_DEG, SAME_SHIFT, Hypothesis, Score, best_distinct, score
+from scenefuse.registration.surface import Surface, prepare, with_grid, with_queries
 from scenefuse.registration.uncertainty import Uncertainty, alike, half_sampling, with_bending
 from scenefuse.transforms import Array, Sim3
 
@@ -30,7 +32,7 @@ POLISH_QUERY_POINTS = 3000
 # Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
 START_FRACTION, END_FRACTION = 0.05, 0.02
 REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
-# Leading poses whose turned copies are tried, copies that are refined, and hypotheses that are polished.
+# Leading poses whose turned copies are tried, copies that are refined, and hypotheses, or copies, that are polished.
 TURNED, COPIES, POLISHED = 2, 6, 4
 # Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
 COPY_ANGLE_DEG = 25
@@ -38,6 +40,10 @@ COPY_ANGLE_DEG = 25
 COPY_START = 0.7
 # A valley that is flat in scale has several ends: the polish is repeated from both sides.
 OFF_SCALE = 1.06
+# Poses of an object that repeats itself differ when they lie more than this share of the shortest period apart.
+OF_PERIOD = 0.5
+# Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
+OWN_SPACING = 0.005
 # The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
 BEYOND_PRIOR = 0.15
 # The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
@@ -85,9 +91,9 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
 
     Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
-    polish; turned copies of what is best then; ranking by the two-way F-score, the agreement of colours and free space;
-    comparison with the alignment from shared features, which replaces the clouds' pose where they differ; the most
-    likely pose; the uncertainty; the gate.
+    polish; turned copies of what is best then, and shifted ones where the object repeats itself; ranking by the two-way
+    F-score, the agreement of colours and free space; comparison with the alignment from shared features, which replaces
+    the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
 
     Args:
         problem: the clouds and what is known.
@@ -102,9 +108,10 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     polished = work.best_first([*polished, *both_sides])
     # About the polished pose, whose axis is exact, rivals turn up that the copies of a rough one slid past.
     polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED])])
+    polished = work.best_first([*polished, *work.shifted(polished[0])])
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
-    decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings)
+    decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
     pose, alignment = ranked[0].pose, problem.evidence.alignment
     by_photos = alignment is not None and pose is alignment.pose
     return Outcome(
@@ -127,7 +134,17 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
         ),
         (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
         problem.surfaces(scale, 2 * fraction, FINE_POINTS),
+        _shifts(problem, obj, fraction * diagonal / scale),
     )
+
+
+def _shifts(problem: Problem, obj: Surface, spacing: float) -> list[Array]:
+    """The shifts (3,) by which the object, thinned to a spacing, repeats itself; the scale may be wrong yet, and the
+    spacing too large to tell."""
+    own = OWN_SPACING * problem.object.diagonal
+    if own < spacing:
+        obj, spacing = prepare(problem.object, own, problem.seed, FINE_POINTS), own
+    return shifts_onto_itself(with_queries(obj, QUERY_POINTS, problem.seed), spacing)
 
 
 @dataclass(frozen=True)
@@ -141,6 +158,7 @@ class _Work:
         searched: object and scene with few query points and grids of nearest points, for refinement and ranking.
         scored: the same with more query points and trees, for the polish and the final score.
         coarser: both at twice the spacing, for the uncertainty.
+        shifts: (3,) each, by which the object repeats itself, in its own frame.
     """
 
     problem: Problem
@@ -149,6 +167,7 @@ class _Work:
     searched: tuple[Surface, Surface]
     scored: tuple[Surface, Surface]
     coarser: tuple[Surface, Surface]
+    shifts: list[Array]
 
     @property
     def centre(self) -> Array:
@@ -167,7 +186,14 @@ class _Work:
 
     def best_first(self, hypotheses: list[Hypothesis], angle_deg: float = SAME_ANGLE_DEG) -> list[Hypothesis]:
         """Ranked by score, one of each valley."""
-        return best_distinct(hypotheses, self.centre, self.problem.scene.diagonal, len(hypotheses), angle_deg)
+        diagonal = self.problem.scene.diagonal
+        same = self.same_shift(min(h.pose.scale for h in hypotheses))
+        return best_distinct(hypotheses, self.centre, diagonal, len(hypotheses), angle_deg, same)
+
+    def same_shift(self, scale: float) -> float:
+        """Poses whose shift differs by less are one, as a share of the diagonal."""
+        lengths = [OF_PERIOD * scale * float(np.linalg.norm(s)) / self.problem.scene.diagonal for s in self.shifts]
+        return min([SAME_SHIFT, *lengths])
 
     def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
         """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
@@ -182,6 +208,20 @@ class _Work:
         scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
         best = [h for h in self.best_first([*leaders, *scored], COPY_ANGLE_DEG) if h.source == "turned"]
         return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:COPIES]]
+
+    def shifted(self, best: Hypothesis) -> list[Hypothesis]:
+        """The best of a pose's copies shifted along the object's repetition, polished."""
+        poses = [shifted(best.pose, step) for shift in self.shifts for step in multiples(self.obj, shift)]
+        scored = [Hypothesis(pose, "shifted", self._score(pose, self.searched)) for pose in poses]
+        return [self.polish(h) for h in sorted(scored, key=lambda h: -h.score.total)[:POLISHED]]
+
+    def repetition(self, pose: Sim3) -> Repetition:
+        """What the object's repetition leaves open of a pose."""
+        if not self.shifts:
+            return Repetition()
+        tau, free_space = self.settings.score_fraction * self.problem.scene.diagonal, self.problem.evidence.free_space
+        period = undecided_shift(*self.scored, pose, self.shifts, tau, self.settings.min_margin, free_space)
+        return Repetition(self.same_shift(pose.scale), period)
 
     def polish(self, h: Hypothesis) -> Hypothesis:
         """The hypothesis after the last refinement, by planes and colours."""

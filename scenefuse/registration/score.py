@@ -78,6 +78,20 @@ def pair(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> P
     )
 
 
+def worth(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> tuple[Pairs, Array]:
+    """The pairs of a pose and how much each counts (M,), 0..1: less the farther and the more tilted its partner is."""
+    pairs = pair(obj, scene, scene_from_object, tau)
+    turned = scene_from_object.rotate(obj.normals)
+    facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
+    return pairs, (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
+
+
+def f_beta(precision: float, recall: float) -> float:
+    """The F-score in which recall weighs more."""
+    b = RECALL_WEIGHT**2
+    return (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
+
+
 def score(
     obj: Surface,
     scene: Surface,
@@ -96,18 +110,14 @@ def score(
         usual_scale: centre of the scale prior; in the total, an object's area counts as it would be at that scale.
         free_space: space known to be empty, or None.
     """
-    pairs = pair(obj, scene, scene_from_object, tau)
-    turned = scene_from_object.rotate(obj.normals)
-    facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
-    worth = (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
-    precision = float(worth[: pairs.forward].sum() / len(obj.queries))
-    recall = float(worth[pairs.forward :].sum() / len(scene.queries))
-    b = RECALL_WEIGHT**2
-    f_score = (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
+    pairs, value = worth(obj, scene, scene_from_object, tau)
+    precision = float(value[: pairs.forward].sum() / len(obj.queries))
+    recall = float(value[pairs.forward :].sum() / len(scene.queries))
+    f_score = f_beta(precision, recall)
     color = color_agreement(obj, scene, pairs)
     # A smaller object sticks out less: as a share of its own area, precision would always reward shrinking.
     level = min(1.0, precision * (scene_from_object.scale / usual_scale) ** 2)
-    total = (1 + b) * level * recall / (b * level + recall) if level + recall > 0 else 0.0
+    total = f_beta(level, recall)
     total *= 1.0 if color is None else 0.5 + 0.5 * color
     violation = None
     if free_space is not None:
@@ -169,21 +179,33 @@ class Hypothesis:
 
 
 def best_distinct(
-    hypotheses: list[Hypothesis], centre: Array, diagonal: float, most: int, angle_deg: float = SAME_ANGLE_DEG
+    hypotheses: list[Hypothesis],
+    centre: Array,
+    diagonal: float,
+    most: int,
+    angle_deg: float = SAME_ANGLE_DEG,
+    shift: float = SAME_SHIFT,
 ) -> list[Hypothesis]:
     """At most `most` hypotheses, best first, without those that equal a better one; see `distinct`."""
     chosen: list[Hypothesis] = []
     for one in sorted(hypotheses, key=lambda h: -h.score.total):
         if len(chosen) == most:
             break
-        if all(distinct(one.pose, other.pose, centre, diagonal, angle_deg) for other in chosen):
+        if all(distinct(one.pose, other.pose, centre, diagonal, angle_deg, shift) for other in chosen):
             chosen.append(one)
     return chosen
 
 
-def distinct(a: Sim3, b: Sim3, centre: Array, diagonal: float, angle_deg: float = SAME_ANGLE_DEG) -> bool:
-    """Whether two poses differ by more than an angle, 6 % of scale or 5 % of the diagonal at the object's centre."""
-    shift = np.linalg.norm(a.apply(centre) - b.apply(centre))
+def distinct(
+    a: Sim3,
+    b: Sim3,
+    centre: Array,
+    diagonal: float,
+    angle_deg: float = SAME_ANGLE_DEG,
+    shift: float = SAME_SHIFT,
+) -> bool:
+    """Whether two poses differ by more than an angle, 6 % of scale or, at the object's centre, `shift` diagonals."""
+    apart = np.linalg.norm(a.apply(centre) - b.apply(centre))
     turn = rotation_angle_deg(a.rotation @ b.rotation.T)
     scale_log = abs(np.log(a.scale / b.scale))
-    return bool(turn > angle_deg or scale_log > SAME_SCALE_LOG or shift > SAME_SHIFT * diagonal)
+    return bool(turn > angle_deg or scale_log > SAME_SCALE_LOG or apart > shift * diagonal)

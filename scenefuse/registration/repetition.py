@@ -1,0 +1,243 @@
+"""Objects that repeat themselves, as stairs, colonnades and facades do: by which shifts, and does the scene tell which
+is right? (method R8, R12)"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import map_coordinates, maximum_filter
+
+from scenefuse.registration.free_space import FreeSpace
+from scenefuse.registration.icp import ScaleRange, refine_planes
+from scenefuse.registration.score import color_agreement, f_beta, worth
+from scenefuse.registration.surface import Surface
+from scenefuse.stage import threads
+from scenefuse.transforms import Array, Sim3
+
+# Edge of a voxel, and distance within which points agree, in spacings of the points.
+VOXEL, AGREEING = 4 / 3, 8 / 3
+# Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
+MOST_CELLS, LEAST_VOXELS = 1_000_000, 3
+# A shift is looked at when this share of the object's voxels meet, and so much less of them on the way to it: a plane
+# that slides along itself does not repeat.
+MEETING, DIP = 0.3, 0.02
+# Shifts that are looked at, directions kept, and rounds that refine a shift.
+LOOKED_AT, DIRECTIONS, ROUNDS = 8, 3, 20
+# It repeats when it meets its shifted self about as closely as points of one surface lie apart, and on the way there so
+# much less closely, within half the distance.
+SAME_SELF, CONTRAST = 0.96, 0.03
+# Where two clouds end along a direction, as percentiles: strays do not count.
+ENDS = 1, 99
+# The part that both show must be so many periods long, and at least this share of what it is at the pose found: then
+# nothing distinctive in that can leave it unnoticed.
+LEAST_PERIODS, LEAST_LEFT = 2, 0.5
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """How well two surfaces agree where both are, along a direction.
+
+    Attributes:
+        agreement: two-way F, colours and free space, 0..1, as in a score.
+        length: of the part that both show, scene units.
+        same_ends: whether both end in the same places, to half the distance within which points agree.
+    """
+
+    agreement: float
+    length: float
+    same_ends: bool
+
+
+def overlap(
+    obj: Surface, scene: Surface, pose: Sim3, shift: Array, tau: float, free_space: FreeSpace | None = None
+) -> Overlap:
+    """Compare an object and a scene where both are, along a direction of the object.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        pose: scene_from_object.
+        shift: (3,) the direction, in the object's frame.
+        tau: distance within which points agree, scene units.
+        free_space: space known to be empty, or None.
+    """
+    of_object, of_scene, ends = _places(obj, scene, pose, shift)
+    low, high = ends[:, 0].max(), ends[:, 1].min()
+    pairs, value = worth(obj, scene, pose, tau)
+    shares = []
+    for place, queries, met, worths in (
+        (of_object, obj.queries, pairs.object_index[: pairs.forward], value[: pairs.forward]),
+        (of_scene, scene.queries, pairs.scene_index[pairs.forward :], value[pairs.forward :]),
+    ):
+        inside = (place >= low) & (place <= high)
+        shares.append(float(worths[inside[met]].sum() / max(inside[queries].sum(), 1)))
+    agreement, color = f_beta(*shares), color_agreement(obj, scene, pairs)
+    agreement *= 1.0 if color is None else 0.5 + 0.5 * color
+    if free_space is not None:
+        agreement *= 1 - (free_space.violation(pose.apply(obj.points[obj.queries])) or 0.0)
+    return Overlap(agreement, float(high - low), bool((np.abs(ends[0] - ends[1]) <= tau / 2).all()))
+
+
+def _places(obj: Surface, scene: Surface, pose: Sim3, shift: Array) -> tuple[Array, Array, Array]:
+    """Where along a direction of the object its points (N,) and the scene's (M,) lie, and both their ends (2, 2)."""
+    along = pose.rotate(shift / np.linalg.norm(shift))
+    places = pose.apply(obj.points) @ along, scene.points @ along
+    return *places, np.array([np.percentile(place, ENDS) for place in places])
+
+
+def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
+    """The shortest shifts (3,) that map an object onto itself, one for each direction; often none.
+
+    Peaks of the autocorrelation of its voxels propose them, point-to-plane ICP of the object onto itself refines them.
+
+    Args:
+        obj: the object, thinned.
+        spacing: of its points, in its own unit.
+    """
+    found: list[Array] = []
+    voxel, tau = VOXEL * spacing, AGREEING * spacing
+    for shift in _peaks(obj, voxel):
+        if any(_is_multiple(shift, of, 2 * voxel) for of in found):
+            continue
+        start = Sim3(1.0, np.eye(3), shift)
+        refined = refine_planes(obj, obj, start, ScaleRange(1.0, 0.0), 2 * voxel, ROUNDS, 0.0)
+        shift = refined.apply(obj.points.mean(0)) - obj.points.mean(0)
+        length = float(np.linalg.norm(shift))
+        if length < LEAST_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
+            continue
+        if _repeats(obj, shift, tau):
+            found.append(shift)
+        if len(found) == DIRECTIONS:
+            break
+    return found
+
+
+def multiples(obj: Surface, shift: Array) -> list[Array]:
+    """A shift (3,) repeated both ways, as far as the object reaches, shortest first."""
+    along = obj.points @ (shift / np.linalg.norm(shift))
+    most = int(np.ptp(np.percentile(along, ENDS)) / np.linalg.norm(shift))
+    return [sign * k * shift for k in range(1, most + 1) for sign in (1, -1)]
+
+
+def shifted(pose: Sim3, shift: Array) -> Sim3:
+    """A pose with the object shifted by (3,) in its own frame."""
+    return pose @ Sim3(1.0, np.eye(3), shift)
+
+
+def undecided_shift(
+    obj: Surface,
+    scene: Surface,
+    pose: Sim3,
+    shifts: list[Array],
+    tau: float,
+    margin: float,
+    free_space: FreeSpace | None,
+) -> float | None:
+    """The period of the object, scene units, along which it fits what both show as well when it is shifted; or None.
+
+    How much both show does not count: of a row of equal bays, the scene and the object may show parts that overlap
+    little. It does count where both end in the same places.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        pose: scene_from_object.
+        shifts: by which the object repeats itself; see `shifts_onto_itself`.
+        tau: distance within which points agree, scene units.
+        margin: relative lead that tells two poses apart.
+        free_space: space known to be empty, or None.
+    """
+    for shift in shifts:
+        period, found = pose.scale * float(np.linalg.norm(shift)), overlap(obj, scene, pose, shift, tau, free_space)
+        if found.same_ends:
+            continue
+        of_object, of_scene = _places(obj, scene, pose, shift)[2]
+        for step in multiples(obj, shift):
+            moved = of_object + pose.scale * (step @ shift) / np.linalg.norm(shift)
+            left = min(moved[1], of_scene[1]) - max(moved[0], of_scene[0])
+            if left < max(LEAST_PERIODS * period, LEAST_LEFT * found.length):
+                continue
+            other = overlap(obj, scene, shifted(pose, step), shift, tau, free_space)
+            if other.agreement > (1 - margin) * found.agreement:
+                return period
+    return None
+
+
+def _repeats(obj: Surface, shift: Array, tau: float) -> bool:
+    """Whether an object meets itself shifted by (3,), and less so on the way there, where it would slide else."""
+    distance, nearest = obj.tree.query(obj.points[obj.queries], k=2, workers=threads())
+    facing = np.abs((obj.normals[obj.queries] * obj.normals[nearest[:, 1]]).sum(1))
+    usual = float((np.clip(1 - (distance[:, 1] / tau) ** 2, 0, 1) * facing).mean())
+    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < SAME_SELF * usual:
+        return False
+    quarter, half, there = (
+        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (0.25, 0.5, 1.0)
+    )
+    return bool(min(quarter, half) < (1 - CONTRAST) * there)
+
+
+def _peaks(obj: Surface, voxel: float) -> list[Array]:
+    """Shifts (3,) at which many of an object's voxels meet others, most first; of each and its reverse, one."""
+    axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
+    points, normals = obj.points @ axes.T, obj.normals @ axes.T
+    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / MOST_CELLS)))
+    meeting, share = _autocorrelation(np.floor((points - points.min(0)) / voxel).astype(np.int64), normals)
+    size = np.array(meeting.shape)
+    high = np.argwhere((share == maximum_filter(share, 5, mode="wrap")) & (meeting > MEETING))
+    step = np.where(high > size // 2, high - size, high)
+    ahead = (step[:, 0] > 0) | (step[:, 0] == 0) & ((step[:, 1] > 0) | (step[:, 1] == 0) & (step[:, 2] > 0))
+    step = step[ahead & (np.linalg.norm(step, axis=1) >= LEAST_VOXELS)]
+    way = step[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
+    least = map_coordinates(share, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
+    step = step[share[tuple(step.T)] - least > DIP]
+    order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:LOOKED_AT]
+    return [voxel * step[k] @ axes for k in order]
+
+
+def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> tuple[Array, Array]:
+    """How much of a surface in cells (N, 3) with normals (N, 3) meets its shifted self, for every shift of a periodic
+    grid: as a share of all of it, and of what lies where both are."""
+    count = cells.max(0) + 1
+    shape = tuple(fft.next_fast_len(2 * int(n) + 4, real=True) for n in count)
+    flat, size = np.ravel_multi_index(tuple(cells.T), shape), int(np.prod(shape))
+    filled = np.bincount(flat, minlength=size)
+    spectrum = 0.0
+    for axis in range(3):
+        facing = np.sqrt(np.bincount(flat, normals[:, axis] ** 2, minlength=size) / np.maximum(filled, 1))
+        wave = fft.rfftn(facing.reshape(shape).astype(np.float32), workers=threads())
+        spectrum = spectrum + wave.real**2 + wave.imag**2
+    meeting = fft.irfftn(_blurred(np.asarray(spectrum), shape), shape, workers=threads())
+    meeting /= meeting[0, 0, 0]
+    return meeting, meeting / np.maximum(_of_both((filled > 0).reshape(shape), count), MEETING / 3)
+
+
+def _of_both(filled: NDArray[np.bool_], count: NDArray[np.int64]) -> Array:
+    """The share of a box's voxels that lie in the box and in its shifted self, for every shift of a periodic grid."""
+    total = np.pad(filled, ((1, 0),) * 3).astype(np.float32)
+    for axis in range(3):
+        total = total.cumsum(axis)
+    bounds = []
+    for n, size in zip(count, filled.shape):
+        step = np.arange(size)
+        step = np.where(step > size // 2, step - size, step)
+        bounds.append((np.clip(step, 0, n), np.clip(n + step, 0, n)))
+    inside = np.zeros(filled.shape, np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        inside += (-1) ** (3 - sum(corner)) * total[np.ix_(*(bounds[k][corner[k]] for k in range(3)))]
+    return np.sqrt(np.maximum(inside * np.roll(inside[::-1, ::-1, ::-1], 1, (0, 1, 2)), 0)) / total[-1, -1, -1]
+
+
+def _blurred(power: Array, shape: tuple[int, ...]) -> Array:
+    """The spectrum of voxels that meet their neighbours, too: a (1/4, 1/2, 1/4) kernel along each axis."""
+    for axis, count in enumerate(shape):
+        frequency = np.arange(power.shape[axis]) / count
+        kernel = (0.5 + 0.5 * np.cos(2 * np.pi * frequency)).astype(np.float32)
+        power = power * kernel.reshape([-1 if k == axis else 1 for k in range(3)])
+    return power
+
+
+def _is_multiple(shift: Array, of: Array, tolerance: float) -> bool:
+    """Whether a shift (3,) is another times a whole number."""
+    count = np.round(shift @ of / (of @ of))
+    return bool(np.linalg.norm(shift - count * of) < max(tolerance, 0.05 * np.linalg.norm(shift)))
