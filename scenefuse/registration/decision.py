@@ -212,8 +212,8 @@ def _reasons_of_clouds(
         yield f"the colours agree by {found.color:.2f} only, below {MIN_COLOR:.2f}"
     if repetition.undecided is not None:
         yield (
-            f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted along itself it"
-            " fits what both show as well; cut the scene to where the object ends, or register it by photos"
+            f"the object repeats itself every {repetition.undecided:.3g} units of the scene, and shifted along itself"
+            " it fits what both show as well; cut the scene to where the object ends, or register it by photos"
         )
     if margin < settings.min_margin:
         yield f"another pose is nearly as good: the margin is {margin:.3f}, below {settings.min_margin:.3f}"

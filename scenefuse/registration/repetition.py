@@ -171,10 +171,10 @@ def _repeats(obj: Surface, shift: Array, tau: float) -> bool:
     usual = float((np.clip(1 - (distance[:, 1] / tau) ** 2, 0, 1) * facing).mean())
     if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < SAME_SELF * usual:
         return False
-    quarter, half, there = (
-        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (0.25, 0.5, 1.0)
+    there, half, quarter = (
+        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (1.0, 0.5, 0.25)
     )
-    return bool(min(quarter, half) < (1 - CONTRAST) * there)
+    return half < (1 - CONTRAST) * there or quarter < (1 - CONTRAST) * there
 
 
 def _peaks(obj: Surface, voxel: float) -> list[Array]:
@@ -240,4 +240,4 @@ def _blurred(power: Array, shape: tuple[int, ...]) -> Array:
 def _is_multiple(shift: Array, of: Array, tolerance: float) -> bool:
     """Whether a shift (3,) is another times a whole number."""
     count = np.round(shift @ of / (of @ of))
-    return bool(np.linalg.norm(shift - count * of) < max(tolerance, 0.05 * np.linalg.norm(shift)))
+    return bool(np.linalg.norm(shift - count * of) < max(tolerance, 0.05 * float(np.linalg.norm(shift))))
