@@ -19,7 +19,8 @@ from scenefuse.registration.decision import (
 from scenefuse.registration.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.registration.likelihood.certain import certified
 from scenefuse.registration.problem import Problem
-from scenefuse.registration.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
+from scenefuse.registration.repetition.overlap import multiples, shifted, undecided_shift
+from scenefuse.registration.repetition.shifts import shifts_onto_itself
 from scenefuse.registration.score import SAME_ANGLE_DEG, SAME_SHIFT, Hypothesis, Score, best_distinct, score
 from scenefuse.registration.surface import Surface, prepare, with_grid, with_queries
 from scenefuse.registration.uncertainty import Uncertainty, alike, half_sampling, with_bending

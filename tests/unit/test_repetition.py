@@ -14,7 +14,7 @@ from scenefuse.registration.decision import FineSettings
 from scenefuse.registration.icp import ScaleRange
 from scenefuse.registration.problem import Alignment, Evidence, Problem
 from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.repetition import shifts_onto_itself
+from scenefuse.registration.repetition.shifts import shifts_onto_itself
 from scenefuse.registration.surface import prepare
 from scenefuse.registration.uncertainty import Uncertainty
 from scenefuse.transforms import Sim3

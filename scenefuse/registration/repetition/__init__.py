@@ -1,0 +1,1 @@
+"""Objects that repeat themselves: by which shifts, and whether the scene tells which of them is right."""
