@@ -368,7 +368,9 @@ class Page:
         else:
             self._draw_points()
         self._show_masks(picture)
-        self.strip.count(Counter(row.photo for row in document.rows))
+        # The two corners of a box are one mark.
+        marks = {(row.photo, "box" if row.label == "box" else k) for k, row in enumerate(document.rows)}
+        self.strip.count(Counter(photo for photo, _ in marks))
         unsaved = [board.source.title for board in self.session.boards if board.document.unsaved]
         if unsaved:
             text = "● not saved" + (f": {', '.join(unsaved)}" if len(self.session.boards) > 1 else "")

@@ -83,7 +83,7 @@ class SidePanel:
     def _fill_points(self) -> None:
         document, cameras = self._page.board.document, self._page.board.cameras
         lengths = document.kind == "lengths"
-        asked = "New length: a name and metres (bar 1.5)" if lengths else "New point: a name, then Enter"
+        asked = "New length, in m: bar 1.5" if lengths else "New point: a name, then Enter"
         entry = ui.input(asked).props("dense outlined").classes("w-full")
         entry.on("keydown.enter", lambda: self._page.choose_point(entry.value))
         names = [row.label for row in document.rows]
