@@ -493,10 +493,8 @@ def test_a_small_part_that_was_clicked_stays_with_grabcut_too(photos):
     pixels[80:85, 58:63] = (190, 60, 50)
     marked = replace(photos, views=[*photos.views[:2], replace(view, pixels=pixels), *photos.views[3:]])
     told = {2: clicks([MIDDLE, (60.5, 82.5)])}
-    settings = MaskSettings(grabcut_width_px=120)
-    plain, corrected = (segment_by_grabcut(of_points(marked), marked, settings, clicked) for clicked in ({}, told))
-    assert not plain[2][80:85, 58:63].any() and corrected[2][82, 60]
-    assert mask_iou(corrected[2][:75], plain[2][:75]) > 0.95
+    found = segment_by_grabcut(of_points(marked), marked, MaskSettings(grabcut_width_px=120), told)[2]
+    assert found[82, 60] and mask_iou(found[:75], true_mask(view)[:75]) > 0.9
 
 
 class Told:
