@@ -118,12 +118,12 @@ def test_a_box_is_dragged(page):
     page.key("b")
     page.until("return !!window.boxTool?._enabled;")
     page.drag((140, 70), (360, 290))
-    page.marks(2)
+    page.marks(1)
     marked = page.save()
     assert marked.labels == ["box", "box"] and np.abs(marked.pixels - [(140, 70), (360, 290)]).max() < 1.5
     page.until(f"return !!document.querySelector('{MASK}')?.naturalWidth;")
     page.click(*DISC[0])  # and the tool is the one for clicks again
-    page.marks(3)
+    page.marks(2)
 
 
 def test_the_keyboard_steps_through_the_photos_sharpest_first(page):
