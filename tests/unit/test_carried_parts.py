@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
-from scenefuse.masks.clicked.carry import carry
+from scenefuse.masks.clicked.carry import _asked, carry
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.clicked.parts import with_parts
+from scenefuse.masks.clicked.space import Left
 from scenefuse.masks.clicked.stereo_points import with_stereo_points
-from scenefuse.masks.clicked.votes import known_points, voter_of
+from scenefuse.masks.clicked.votes import Known, known_points, voter_of
 from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.workspace import View, Workspace
 
@@ -127,3 +128,32 @@ def test_a_part_that_goes_far_beyond_the_points_next_to_an_outline_is_not_added(
         known = np.concatenate([np.column_stack([rng.uniform(32, 78, 20), rng.uniform(42, 78, 20)]), on])
         found = with_parts(lambda *_: ([part], np.array([0.9])), view, mask, (none, known), (none, none), none, 2.0)
         assert (found == (mask | part if added else mask)).all()
+
+
+@pytest.mark.parametrize(
+    ("quality", "like", "added"), [(0.95, "around", False), (0.95, "object", True), (0.6, "around", True)]
+)
+def test_the_space_adds_to_a_mask_that_the_network_is_certain_of_only_what_looks_like_it(quality, like, added):
+    """Of a side that few photos show, the space holds much of what is around: a marble head got its pedestal."""
+    rng, colors = np.random.default_rng(0), {"object": (150, 110, 80), "around": (90, 95, 105)}
+    head, stand = np.zeros((2, 120, 100), dtype=bool)
+    head[20:80, 30:70], stand[80:100, 20:80] = True, True
+    image = np.full((120, 100, 3), colors["around"])
+    image[head], image[stand] = colors["object"], colors[like]
+    view = View(
+        "a.jpg",
+        np.eye(3),
+        np.eye(3, 4),
+        100,
+        120,
+        pixels=np.clip(image + rng.normal(0, 3, image.shape), 0, 255).astype(np.uint8),
+    )
+    inside = np.column_stack([rng.uniform(32, 68, 20), rng.uniform(22, 78, 20)])
+    known = Known(inside, np.zeros((0, 2)), np.zeros((0, 2)))
+
+    def ask(view, inside, outside, box, likely):
+        return ([head], np.array([quality])) if likely is None else ([head | stand], np.array([0.9]))
+
+    space = Left(np.ones_like(head), np.ones_like(head))
+    mask, *_ = _asked(ask, view, NO_CLICKS, known, None, 2.0, space)
+    assert (mask == (head | stand if added else head)).all()

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.masks.clicked.clicks import ENOUGH, PhotoClicks
-from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, prompted_parts, with_parts
+from scenefuse.masks.clicked.parts import LEAST_KNOWN, Ask, agrees, own_colors, prompted_parts, with_parts
 from scenefuse.masks.clicked.space import Left, Space
 from scenefuse.masks.clicked.votes import (
     LEAST_AGREEMENT,
@@ -198,7 +198,8 @@ def _asked(
 
     For several clicks alone the largest of those about as good, if the method is certain of none.
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and of all masks one
-    is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone.
+    is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone, nor
+    where colours speak against it: of a side that few photos show, the space holds much of what is around the object.
     """
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
@@ -209,9 +210,17 @@ def _asked(
         more = ask(view, inside, outside, None, space.box)
         found += _candidates(more, view.pixels, inside, outside, tolerance_px)
         other = max(found, key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask))
-        best = other if mask_iou(other.mask, best.mask) < SAME else best
+        if mask_iou(other.mask, best.mask) < SAME and _vouched_for(view, other, best):
+            best = other
     mask = with_parts(ask, view, best.mask, inside, outside, known.enclosed, tolerance_px)
     return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
+
+
+def _vouched_for(view: View, other: "_Candidate", best: "_Candidate") -> bool:
+    """Whether a mask that the space prefers may stand for the best one by its prompts: to one that the network is
+    certain of it adds only what has this one's colours rather than those around."""
+    more = other.mask & ~best.mask
+    return best.quality < CERTAIN or not more.any() or own_colors(view.pixels, best.mask, more) > 0
 
 
 class _Candidate(NamedTuple):
