@@ -187,7 +187,8 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
             found = np.linalg.norm(pose.apply(source) - target, axis=1) <= distance
             if found.sum() > best.sum():
                 best = found
-                wanted = np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** RANSAC_POINTS, CONFIDENCE))
+                enough = np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** RANSAC_POINTS, CONFIDENCE))
+                wanted = min(enough, RANSAC_SAMPLES)
     return best
 
 

@@ -339,9 +339,9 @@ def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], s
     raise StageError(
         f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} that"
         f" min_registered_share requires; not registered: {some}."
-        " Likely reasons: too little overlap between neighbouring photos, blur, surfaces without texture, or pairs that"
-        " were not compared. Add photos between them, set pairs to exhaustive, raise max_features, or lower"
-        " min_registered_share"
+        " Likely reasons: too little overlap between neighbouring photos, a camera that did not move, blur, surfaces"
+        " without texture, or pairs that were not compared. Add photos from places between them, set pairs to"
+        " exhaustive, raise max_features, or lower min_registered_share"
     )
 
 

@@ -21,6 +21,7 @@ from scenefuse.nerf.render import render_view
 from scenefuse.nerf.rendered_maps import psnr, silhouette_iou, ssim
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
+from scenefuse.paper import recipe
 from scenefuse.stage import StageError
 from scenefuse.transforms import Sim3
 
@@ -304,6 +305,8 @@ def _errors(gradient=0.0, rate=0.0):
 
 def test_the_adaptive_grid_learns_edges_better_and_the_rest_as_well():
     plain, gradients, steps = _errors(), _errors(gradient=3.0), _errors(rate=3.0)
+    as_papers = _errors(rate=recipe.NERF.edge_rate)
+    assert as_papers[0] < 0.95 * plain[0] and as_papers[1] == pytest.approx(plain[1], rel=0.02)
     assert gradients == pytest.approx(plain, rel=0.01)  # Adam divides the factor out again
     assert steps[0] < 0.9 * plain[0] and steps[1] == pytest.approx(plain[1], rel=0.02)
 

@@ -122,6 +122,25 @@ def test_matches_along_one_line_agree_on_nothing(monkeypatch):
     assert not agreeing(line, 1.1 * line, 0.1, 0).any()
 
 
+@pytest.mark.parametrize(("right", "draws"), [(3, 5), (90, 1)])
+def test_no_more_samples_are_drawn_than_the_paper_has_and_fewer_where_many_matches_agree(monkeypatch, right, draws):
+    """Three matches of a hundred ask for 250,000 samples."""
+    monkeypatch.setattr(paper, "AT_ONCE", 1000)
+    monkeypatch.setattr(paper, "RANSAC_SAMPLES", 5000)
+    rng, drawn = np.random.default_rng(0), []
+
+    class Counted:
+        def integers(self, *arguments):
+            drawn.append(arguments)
+            return rng.integers(*arguments)
+
+    source, target = rng.uniform(-0.5, 0.5, (2, 100, 3))
+    target[:right] = 0.8 * source[:right]
+    monkeypatch.setattr(np.random, "default_rng", lambda seed: Counted())
+    agreeing(source, target, 0.02, 0)
+    assert len(drawn) == draws
+
+
 def test_too_few_matches_give_no_scale_and_say_so(copied, capsys):
     ball = np.random.default_rng(0).normal(size=(30, 3))
     scale, notes = matched_scale(Cloud(ball / np.linalg.norm(ball, axis=1, keepdims=True)), copied[1], 0)

@@ -36,7 +36,10 @@ QUALITY_WEIGHT = 0.3
 """Of a mask's quality beside its agreement, when one of several is chosen."""
 CERTAIN, AS_GOOD = 0.9, 0.06
 """For several clicks alone, where the network is not certain of its best mask (a lower quality), the largest is taken
-of those within so much of its score: who clicks on several parts means the whole."""
+of those within so much of its score: who clicks on several parts means the whole. To a certain one a loose space adds
+only what looks like it."""
+TIGHT = 0.7
+"""IoU of a mask with the space from which this is tight: true masks have 0.75 where a ring of photos bounds it."""
 FILL_WEIGHT = 0.5
 """Of how well it fills the space that the others leave, likewise."""
 CROWD, CROWDED = 4, 3.0
@@ -199,7 +202,7 @@ def _asked(
     For several clicks alone the largest of those about as good, if the method is certain of none.
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and of all masks one
     is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone, nor
-    where colours speak against it: of a side that few photos show, the space holds much of what is around the object.
+    where the network is certain of the best one and colours speak against what is added.
     """
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
@@ -210,17 +213,23 @@ def _asked(
         more = ask(view, inside, outside, None, space.box)
         found += _candidates(more, view.pixels, inside, outside, tolerance_px)
         other = max(found, key=lambda one: one.score + FILL_WEIGHT * space.filled(one.mask) - space.beyond(one.mask))
-        if mask_iou(other.mask, best.mask) < SAME and _vouched_for(view, other, best):
+        if mask_iou(other.mask, best.mask) < SAME and _may_replace(best, other, view, space):
             best = other
     mask = with_parts(ask, view, best.mask, inside, outside, known.enclosed, tolerance_px)
     return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
 
 
-def _vouched_for(view: View, other: "_Candidate", best: "_Candidate") -> bool:
-    """Whether a mask that the space prefers may stand for the best one by its prompts: to one that the network is
-    certain of it adds only what has this one's colours rather than those around."""
-    more = other.mask & ~best.mask
-    return best.quality < CERTAIN or not more.any() or own_colors(view.pixels, best.mask, more) > 0
+def _may_replace(best: "_Candidate", other: "_Candidate", view: View, space: Left) -> bool:
+    """Whether a mask that the space prefers may stand for the best one by its prompts.
+
+    Of a side that few photos show, a loose space holds much of what is around the object. So to a mask that the
+    network is certain of it adds only what looks, on the whole, more like this one than like what is around.
+    """
+    if best.quality < CERTAIN or space.filled(other.mask) > TIGHT:
+        return True
+    if mask_iou(best.mask, best.mask | other.mask) >= SAME:
+        return True
+    return own_colors(view.pixels, best.mask, other.mask & ~best.mask) > 0
 
 
 class _Candidate(NamedTuple):
