@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
-from scenefuse.masks.clicked.carry import _asked, carry
+from scenefuse.masks.clicked.carry import best_mask, carry
 from scenefuse.masks.clicked.clicks import PhotoClicks
 from scenefuse.masks.clicked.parts import with_parts
 from scenefuse.masks.clicked.space import Left
@@ -150,7 +150,7 @@ def test_a_loose_space_adds_to_a_mask_that_the_network_is_certain_of_only_what_l
         return ([head], np.array([quality])) if likely is None else ([head | stand], np.array([0.9]))
 
     space = head | stand if tight else np.ones_like(head)
-    mask, *_ = _asked(ask, view, NO_CLICKS, known, None, 2.0, Left(space, np.ones_like(head)))
+    mask, *_ = best_mask(ask, view, NO_CLICKS, known, None, 2.0, Left(space, np.ones_like(head)))
     assert (mask == (head | stand if added else head)).all()
 
 
@@ -163,7 +163,7 @@ def test_the_space_cuts_what_leaked_from_a_mask_that_the_network_is_certain_of()
     def ask(view, inside, outside, box, likely):
         return ([head | stand], np.array([0.95])) if likely is None else ([wider], np.array([0.95]))
 
-    mask, *_ = _asked(ask, view, NO_CLICKS, known, None, 2.0, Left(head, np.ones_like(head)))
+    mask, *_ = best_mask(ask, view, NO_CLICKS, known, None, 2.0, Left(head, np.ones_like(head)))
     assert (mask == wider).all()
 
 

@@ -155,7 +155,7 @@ def _make(
         kept = clicks.only(keep)
         if len(known.inside) < LEAST_KNOWN and not kept.prompt:
             break
-        found = _asked(ask, view, kept, known, clicks.box, tolerance_px, space)
+        found = best_mask(ask, view, kept, known, clicks.box, tolerance_px, space)
         voter = voter_of(photos, k, *found, kept)
         wrong = keep & ~_agreeing(voter.mask, clicks, tolerance_px)
         if not wrong.any():
@@ -188,7 +188,7 @@ def _extended(
     return voter_of(photos, k, mask, voter.quality, agrees(mask, inside, outside, tolerance_px), voter.clicks)
 
 
-def _asked(
+def best_mask(
     ask: Ask,
     view: View,
     clicks: PhotoClicks,
@@ -197,12 +197,24 @@ def _asked(
     tolerance_px: float,
     space: Left | None,
 ) -> tuple[Mask, float, float]:
-    """The best of the masks for pixels clicked and carried on, without parts that hold none; quality, agreement.
+    """The best of the masks for pixels clicked and carried on, without parts that hold none (method K1).
 
     For several clicks alone the largest of those about as good, if the method is certain of none.
     The space that other photos leave bounds what has no sparse points. Its box prompts once more, and of all masks one
     is taken that agrees as well, fills the space better and is not beyond it; but not for another seam alone, nor
     where the network is certain of the best one and colours speak against what is added.
+
+    Args:
+        ask: the method: SAM 2 or GrabCut.
+        view: the photo, with RGB pixels.
+        clicks: its own.
+        known: pixels of points that other photos' masks tell.
+        box: (2, 2) corners of a box that was drawn, or None.
+        tolerance_px: a click this far on the wrong side of a mask's outline is no contradiction.
+        space: that the masks of other photos leave, or None.
+
+    Returns:
+        The mask (H, W); its quality as the method judges it, 0 where it is empty; its agreement with what prompts it.
     """
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
