@@ -231,7 +231,15 @@ def best_mask(
     return mask, best.quality * bool(mask.any()), agrees(mask, inside, outside, tolerance_px)
 
 
-def _may_replace(best: "_Candidate", other: "_Candidate", view: View, space: Left) -> bool:
+class _Candidate(NamedTuple):
+    """A mask (H, W), its quality, and how good it is by this and its agreement with what prompts it."""
+
+    mask: Mask
+    quality: float
+    score: float
+
+
+def _may_replace(best: _Candidate, other: _Candidate, view: View, space: Left) -> bool:
     """Whether a mask that the space prefers may stand for the best one by its prompts.
 
     Of a side that few photos show, a loose space holds much of what is around the object. So to a mask that the
@@ -242,14 +250,6 @@ def _may_replace(best: "_Candidate", other: "_Candidate", view: View, space: Lef
     if mask_iou(best.mask, best.mask | other.mask) >= SAME:
         return True
     return own_colors(view.pixels, best.mask, other.mask & ~best.mask) > 0
-
-
-class _Candidate(NamedTuple):
-    """A mask (H, W), its quality, and how good it is by this and its agreement with what prompts it."""
-
-    mask: Mask
-    quality: float
-    score: float
 
 
 def _candidates(
