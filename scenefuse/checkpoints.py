@@ -143,8 +143,8 @@ def require_finite(state: State) -> None:
     """Raise StageError if any tensor or number of a state is not finite."""
     if not _finite(state):
         raise StageError(
-            "the training diverged: its weights are no longer finite numbers; lower its learning rates, and check the"
-            " photos, masks, cameras and depths it was given"
+            "the training diverged: its weights are no longer finite numbers; check the photos, masks, cameras and"
+            " depths it was given, and report it if they are right"
         )
 
 

@@ -23,7 +23,7 @@ from scenefuse.io.pictures import read_rgb
 from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
-from scenefuse.mvs.views import load_views
+from scenefuse.mvs.views import chosen_by, load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import psnr
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
@@ -109,9 +109,11 @@ def one(
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if variant.long else "stage4")
         seconds, fusing = time.monotonic() - start, settings["cloud"]
+        psnr_last, psnr_unused = held_out_psnr(folder, last, settings)
         measured = {
-            "psnr_2": held_out_psnr(folder, work / "stage2", settings),
-            "psnr_4": held_out_psnr(folder, last, settings),
+            "psnr_2": held_out_psnr(folder, work / "stage2", settings)[0],
+            "psnr_4": psnr_last,
+            "psnr_4_unused": psnr_unused,
             "silhouettes": value(read_json(last.with_suffix(".json")), "silhouette_iou"),
             **cloud(folder, masks, last, truth, fusing, seed),
             "seconds": seconds,
@@ -167,17 +169,22 @@ def cloud(
     }
 
 
-def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> float:
-    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every variant."""
+def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> tuple[float, float]:
+    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every variant.
+
+    Of all of them, and of those by which stage 3 chose no depth (for the variants without feedback as well).
+    """
     views = load_views(
         folder / "undistorted", folder / "masks", settings["nerf"]["width_px"], settings["hold_out_every"]
     )
     scores = []
-    for index in np.flatnonzero(views.held_out):
+    held_out = np.flatnonzero(views.held_out)
+    for index in held_out:
         picture = read_rgb(stage / "renders" / f"{Path(views.names[index]).stem}.png")
         render, photo = (torch.from_numpy(p).float() / 255 for p in (picture, views.images[index]))
         scores.append(psnr(render, photo, torch.from_numpy(views.masks[index])))
-    return float(np.mean(scores))
+    unused = np.array(scores)[~chosen_by(views.held_out)[held_out]]
+    return float(np.mean(scores)), float(unused.mean()) if len(unused) else np.nan
 
 
 def white(masks: Path, folder: Path) -> Path:
@@ -243,6 +250,7 @@ HEAD = {
     "within_4": "within 1 %",
     "psnr_2": "PSNR, stage 2 (dB)",
     "psnr_4": "stage 4 (dB)",
+    "psnr_4_unused": "on photos that chose no depth (dB)",
     "silhouettes": "silhouettes",
     "refined": "depths that photos moved",
     "inconsistent": "inconsistent depths",
