@@ -13,7 +13,7 @@ from torch.nn import functional
 from scenefuse.depth.inputs import DepthPhotos
 from scenefuse.depth.networks import convolutions
 from scenefuse.stage import quantity
-from scenefuse.transforms import rotation_angle_deg
+from scenefuse.transforms import Array, rotation_angle_deg
 
 
 class PoseNetwork(nn.Module):
@@ -66,18 +66,34 @@ def pose_error(found: Tensor, known: Tensor, unit: float) -> Tensor:
 
 @torch.no_grad()
 def pose_quantities(network: PoseNetwork, photos: DepthPhotos, poses: np.ndarray) -> dict[str, Any]:
-    """The network's relative rotations and translations against those of (V, 4, 4) poses object_from_cam."""
+    """The network's relative rotations and translations against those of (V, 4, 4) poses object_from_cam.
+
+    The same motion for all pairs tells nothing: beside the errors stand how far those found differ from their own mean,
+    and what the mean of the true ones leaves.
+    """
     small = small_photos(photos)
     order = np.flatnonzero(photos.trained)
     pairs = np.column_stack([order, photos.sources[order, 0].cpu().numpy()])
     target, source = torch.as_tensor(pairs).T
     found = network(small[target], small[source]).double().cpu().numpy()
     true = np.linalg.inv(poses[pairs[:, 1]]) @ poses[pairs[:, 0]]
-    turned = [rotation_angle_deg(a[:3, :3] @ b[:3, :3].T) for a, b in zip(found, true)]
-    moved = [rotation_angle_deg(b[:3, :3]) for b in true]
+    turns, true_turns = found[:, :3, :3], true[:, :3, :3]
     off = np.linalg.norm(found[:, :3, 3] - true[:, :3, 3], axis=1) / np.linalg.norm(true[:, :3, 3], axis=1)
     return {
-        "pose_network_rotation_error_deg": quantity(float(np.median(turned)), "deg"),
-        "pose_network_rotation_to_find_deg": quantity(float(np.median(moved)), "deg"),
+        "pose_network_rotation_error_deg": quantity(_apart_deg(turns, true_turns), "deg"),
+        "pose_network_rotation_to_find_deg": quantity(_apart_deg(true_turns, np.eye(3)), "deg"),
+        "pose_network_rotation_varies_deg": quantity(_apart_deg(turns, _mean(turns)), "deg"),
+        "rotation_error_of_one_motion_for_all_deg": quantity(_apart_deg(true_turns, _mean(true_turns)), "deg"),
         "pose_network_translation_error": quantity(float(np.median(off)), "1"),
     }
+
+
+def _apart_deg(turns: Array, others: Array) -> float:
+    """Median angle between rotations (N, 3, 3) and others, (N, 3, 3) or one (3, 3), in degrees."""
+    return float(np.median([rotation_angle_deg(turn) for turn in turns @ others.swapaxes(-1, -2)]))
+
+
+def _mean(turns: Array) -> Array:
+    """The rotation (3, 3) nearest to all of (N, 3, 3)."""
+    u, _, vt = np.linalg.svd(turns.sum(0))
+    return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)

@@ -110,15 +110,22 @@ def column_of(item: Collected) -> Column:
 
 
 def _told(item: Collected) -> str:
-    """Of a run of the paper's recipe: whose poses it went on with, how many rays it drew, how much prior it had."""
+    """Of a run of the paper's recipe: whose poses it went on with, what it drew of the paper's rays, and its prior."""
     fields = item.stages
     source = find(fields, "stage1.pose_source")
     said = {"chain": "poses are the pose network's, chained", "sfm": "poses are SfM's"}.get(str(source), "")
-    drawn, papers, prior = (
-        find(fields, f"stage2.{name}") for name in ("rays_per_epoch", "rays_per_epoch_paper", "prior_confident_share")
+    own, papers = (
+        (find(fields, f"stage2.rays_per_epoch{name}"), find(fields, f"stage2.seconds_estimated{name}"))
+        for name in ("", "_paper")
     )
-    if drawn is not None and papers is not None:
-        said += f"; {drawn} rays an epoch of stages 2 and 4, where every pixel of the object once is {papers}"
+    if None not in own + papers:
+        said += (
+            f"; stages 2 and 4 draw {own[0]} rays an epoch ({own[1]:.0f} s a stage, estimated before), where every"
+            f" pixel of the object once is {papers[0]} ({papers[1]:.0f} s)"
+        )
+    if find(fields, "stage2.field_is_the_papers") is False:
+        said += ", in a smaller field than the paper's"
+    prior = find(fields, "stage2.prior_confident_share")
     return said + (f"; stage 2 has a depth for {100 * prior:.0f} % of the masks" if said and prior is not None else "")
 
 

@@ -7,13 +7,16 @@ python tests/benchmarks/paper_preset.py --shipped results --chained paper/result
 
 Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/report/paper_tables.py); here
 are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table says
-so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: cameras that all stand in
-their middle, depth that is the same all over a photo, a random cloud in the place of the object's points.
+so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: one motion, a random one,
+from each frame to the next (`one motion for all`: the best one), depth that is the same all over a photo, a random
+cloud in the place of the object's points, in the shipped run's crop or, for a run of the preset, in its own.
 """
 
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pandas as pd
 
@@ -24,10 +27,12 @@ from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import registration_error, true_depth
 from scenefuse.paper.published import OBJECTS, published
+from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.report.collected import Collected, collect
 from scenefuse.report.paper_tables import NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Sim3
+from scenefuse.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.workspace import read_workspace
 
 SCENE = "demo"
 SCORES = {"0.5": "05pct", "1": "1pct", "2": "2pct"}
@@ -36,11 +41,15 @@ POSES = {
     TRAJECTORY: "trajectory_error_chain_over_extent",
     TURNED: "rotation_error_chain_deg",
     "rotation error of one motion (deg)": "pose_network_rotation_error_deg",
+    "how far one motion is from their mean (deg)": "pose_network_rotation_varies_deg",
     "shift error of one motion over its length": "pose_network_translation_error",
 }
 CHAINED, FROM_SFM, SHIPPED = "paper preset, chained poses", "paper preset, SfM's poses", SCENEFUSE
+NULLS = {CHAINED: f"{NULL} of the preset, chained poses", FROM_SFM: f"{NULL} of the preset, SfM's poses"}
 # Of the true depth maps that the null is measured on.
 WIDTH_PX = 160
+# Random motions that the null of a trajectory is the median of.
+MOTIONS = 200
 
 
 class Run:
@@ -133,20 +142,45 @@ def of_tables(cells: dict[tuple[str, str], tuple[float, str]]) -> dict[str, Any]
     }
 
 
-def of_chance(shipped: Run, chained: Run) -> dict[str, Any]:
-    """The same measures of nothing, see the module's text."""
-    known, null = shipped.known, null_of(shipped.folder, shipped.collected(), shipped.seed)
-    rows: dict[str, Any] = {} if null is None else of_tables(null.cells)
+def of_chance(run: Run) -> dict[str, Any]:
+    """The paper's tables' measures of nothing, on the crop of a run."""
+    crop = run.folder / "registration/full/crop.ply"
+    if not (crop.is_file() and (run.folder / "object.ply").is_file()):
+        return {}
+    null = null_of(run.folder, run.collected(), run.seed)
+    return {} if null is None else of_tables(null.cells)
+
+
+def of_chance_in_stages(shipped: Run, chained: Run) -> dict[str, Any]:
+    """Measures of the four stages, of nothing: see the module's text."""
+    rows: dict[str, Any] = {}
     if (chained.folder / "stage1.json").is_file():
-        motion = value(read_json(chained.folder / "stage1.json"), "pose_network_rotation_to_find_deg")
-        rows |= {f"rotation error of one motion (deg), stage {number}": motion for number in (1, 3)}
-    if known is not None:
-        centres = np.array([view.centre for view, _ in known.posed])
-        extent = np.linalg.norm(np.ptp(centres, axis=0))
-        still = float(np.sqrt(((centres - centres.mean(0)) ** 2).sum(1).mean()) / extent)
-        rows |= {f"{TRAJECTORY}, stage {number}": still for number in (1, 3)}
-        rows |= {f"depth error, stage {number} (%)": flat_depth_error(known) for number in (1, 2, 3, 4)}
+        report = read_json(chained.folder / "stage1.json")
+        still, same = "pose_network_rotation_to_find_deg", "rotation_error_of_one_motion_for_all_deg"
+        for number in (1, 3):
+            rows[f"rotation error of one motion (deg), stage {number}"] = value(report, still)
+            rows[f"one motion for all: its error (deg), stage {number}"] = value(report, same)
+    known = np.stack([view.world_from_cam for view in read_workspace(shipped.folder / "undistorted").views])
+    repeated = one_motion_repeated(known, shipped.seed)
+    rows |= {f"{name}, stage {number}": error for name, error in repeated.items() for number in (1, 3)}
+    if shipped.known is not None:
+        rows |= {f"depth error, stage {number} (%)": flat_depth_error(shipped.known) for number in (1, 2, 3, 4)}
     return rows
+
+
+def one_motion_repeated(known: Array, seed: int) -> dict[str, float]:
+    """Median errors of chains of one random motion each, as far turned as a frame is against the next, of poses
+    (V, 4, 4)."""
+    turn = np.median([rotation_angle_deg(a[:3, :3] @ b[:3, :3].T) for a, b in pairwise(known)])
+    rng, errors = np.random.default_rng(seed), []
+    for _ in range(MOTIONS):
+        axis, step = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+        motion = np.eye(4)
+        motion[:3, :3], motion[:3, 3] = cv2.Rodrigues(np.radians(turn) * axis)[0], step
+        chain = np.stack([np.linalg.matrix_power(motion, k) for k in range(len(known))])
+        errors.append({key: value({key: item}, key) for key, item in trajectory_error("chain", chain, known).items()})
+    medians = pd.DataFrame(errors).median()
+    return {name: float(medians[POSES[name]]) for name in (TRAJECTORY, TURNED)}
 
 
 def flat_depth_error(known: ObjectTruth) -> float:
@@ -185,7 +219,8 @@ def paper_preset(
         runs = {column: Run(results, name, evaluation, settings["seed"]) for column, results in folders.items()}
         columns: dict[str, dict[str, Any]] = {PAPER: of_tables(published(name))}
         columns |= {column: found.measures() for column, found in runs.items()}
-        columns[NULL] = of_chance(runs[SHIPPED], runs[CHAINED])
+        columns[NULL] = of_chance(runs[SHIPPED]) | of_chance_in_stages(runs[SHIPPED], runs[CHAINED])
+        columns |= {null: of_chance(runs[column]) for column, null in NULLS.items()}
         measures = dict.fromkeys(key for column in (FROM_SFM, *columns) for key in columns[column])
         for measure in measures:
             row = {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}

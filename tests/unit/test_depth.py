@@ -26,7 +26,7 @@ from scenefuse.depth.self_supervision import (
 )
 from scenefuse.depth.training import Networks, Recipe, Supervision, predict, train_networks
 from scenefuse.io.maps import read_depth
-from scenefuse.stage import StageError
+from scenefuse.stage import StageError, value
 
 INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])
 
@@ -237,6 +237,25 @@ def test_training_mends_a_wrong_first_depth_and_the_pose_network_learns_the_pose
     length = Recipe(epochs=40, warmup_epochs=1, batch_photos=6, coarse_share=0.3)
     train_networks(networks, photos, supervision, length, tmp_path / "state.pt", 0)
     assert depth_off() < 0.5 * before[0] and turned_off() < 0.7 * before[1]
+
+
+def test_one_motion_for_all_pairs_is_told_from_motions_that_were_found():
+    views, photos = plane_views(6)[0], _photos()
+    network = PoseNetwork(3.0)
+    with torch.no_grad():
+        network.last.weight.zero_()
+        network.last.bias.copy_(torch.tensor([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def measured(poses):
+        found = pose_quantities(network, photos, poses)
+        names = ("pose_network_rotation_error_deg", "rotation_error_of_one_motion_for_all_deg")
+        return value(found, "pose_network_rotation_varies_deg"), *(value(found, name) for name in names)
+
+    varies, error, best = measured(views.object_from_cam)
+    assert varies == pytest.approx(0, abs=1e-3) and 0 < best < error
+    straight = views.object_from_cam.copy()
+    straight[:, :3, :3] = np.eye(3)
+    assert measured(straight) == pytest.approx((0, np.degrees(0.3), 0), abs=1e-3)
 
 
 def test_a_resumed_training_equals_an_uninterrupted_one(tmp_path, uninterrupted, capsys):
