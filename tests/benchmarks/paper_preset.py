@@ -29,7 +29,7 @@ from scenefuse.metrics.truth import registration_error, true_depth
 from scenefuse.paper.published import OBJECTS, published
 from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.report.collected import Collected, collect
-from scenefuse.report.paper_tables import NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
+from scenefuse.report.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.stage import read_json, run, value
 from scenefuse.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.workspace import read_workspace
@@ -76,9 +76,15 @@ class Run:
             points = self.known.fit.truth_from_model.apply(read_cloud(self.folder / "object.ply").points)
             cloud = cloud_results(points, self.known, self.settings.samples, self.seed)
             rows |= {f"cloud: F {name} %": value(cloud, f"cloud_f_score_{key}") for name, key in SCORES.items()}
-        fine = self.folder / "registration/full/fine.json"
-        if fine.is_file() and self.known is not None:
-            rows |= self._pose_errors(read_json(fine), self.known)
+        registered = self.folder / "registration/full"
+        if (registered / "coarse.json").is_file():
+            rows["said of its matches"] = "; ".join(value(read_json(registered / "coarse.json"), "notes"))
+        if (registered / "fine.json").is_file() and self.known is not None:
+            rows |= self._pose_errors(read_json(registered / "fine.json"), self.known)
+        if (self.folder / "truth.json").is_file():
+            truth = read_json(self.folder / "truth.json")
+            for when in ("before", "after"):
+                rows[f"scene around the object, {when}: F 1 %"] = value(truth, f"scene_f_score_{when}_1pct")
         return rows | of_tables(column_of(self.collected()).cells)
 
     def _pose_errors(self, fine: dict[str, Any], known: ObjectTruth) -> dict[str, float]:
@@ -140,6 +146,15 @@ def of_tables(cells: dict[tuple[str, str], tuple[float, str]]) -> dict[str, Any]
         measure if variant == "full" else f"{measure}, {variant}": number
         for (measure, variant), (number, _) in cells.items()
     }
+
+
+def on_presets_crop(preset: Path, name: str) -> dict[str, Any]:
+    """The shipped run's numbers on the crop of a run of the preset, as its paper.tsv has them."""
+    path = preset / "summary/paper.tsv"
+    if not path.is_file():
+        return {}
+    table = pd.read_csv(path, sep="\t", na_values="-").query("object == @name").dropna(subset=COMMON)
+    return of_tables({(row.measure, row.variant): (row[COMMON], "") for _, row in table.iterrows()})
 
 
 def of_chance(run: Run) -> dict[str, Any]:
@@ -221,6 +236,7 @@ def paper_preset(
         columns |= {column: found.measures() for column, found in runs.items()}
         columns[NULL] = of_chance(runs[SHIPPED]) | of_chance_in_stages(runs[SHIPPED], runs[CHAINED])
         columns |= {null: of_chance(runs[column]) for column, null in NULLS.items()}
+        columns[COMMON] = on_presets_crop(from_sfm, name)
         measures = dict.fromkeys(key for column in (FROM_SFM, *columns) for key in columns[column])
         for measure in measures:
             row = {column: _five_digits(cells.get(measure)) for column, cells in columns.items()}

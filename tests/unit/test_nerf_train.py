@@ -329,20 +329,19 @@ def test_the_order_of_depths_that_nothing_confirms_is_learned_only_where_it_is_a
     assert ranked < 0.8 * barely
 
 
-def test_beside_the_depths_that_it_is_of_an_order_has_little_left_to_teach(sphere):
-    """As docs/paper.md says of the paper's relative and absolute terms: at its recipe's weights, 2 % of the loss."""
+def test_by_the_paper_s_recipe_the_order_is_learned_beside_the_depths_that_it_is_of(sphere):
+    """Both losses of the same maps, each with a scale of its own as monocular maps have, at the recipe's weights."""
     cube, hull = sphere_volume(sphere)
     known = photos_of(sphere, cube, prior=1.0)
-    off = known.depths * (1 + 0.1 * torch.randn(known.depths.shape, generator=torch.Generator().manual_seed(2)))
-    photos = replace(known, depths=off, order=off)
+    scales = 1 + 0.15 * torch.randn((len(known), 1, 1), generator=torch.Generator().manual_seed(2))
+    photos = replace(known, depths=scales * known.depths, order=scales * known.depths)
 
     def left(weights):
         nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), 0, "cpu")
         training = Training(photos, Schedule(2, 60 * 512 // 2), RECIPE, weights, warm=False, seed=0)
         return train(nerf, training, checkpoint=None, report=lambda line: None)["rank"]
 
-    without = left(replace(recipe.LOSSES, rank_weight=1e-9))
-    assert 0.95 * without < left(recipe.LOSSES) < without
+    assert left(recipe.LOSSES) < 0.9 * left(replace(recipe.LOSSES, rank_weight=1e-9))
 
 
 def test_from_directions_that_no_photo_has_colours_are_those_that_photos_agree_on():
