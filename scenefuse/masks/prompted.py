@@ -92,7 +92,7 @@ def masks_from_prompts(
         carried = carry(ask, photos, clicked, limit)
         placed = np.concatenate([np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())])
         placed = placed[near_most(placed, photos.points[carried.kind > 0])]
-        # What two masks by GrabCut agree on is no end of the object: they leak into the same ground.
+        # GrabCut's carried masks leak: what two of them agree on is no end of the object.
         ends = carried.ends if network else carried.ends[:0]
         target = target_from_votes(carried.kind, photos, up, seed, placed, ends)
         if network:
