@@ -7,7 +7,7 @@ from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 
-from scenefuse.version import VERSION
+from scenefuse.core.version import VERSION
 
 ALL = "pip install 'scenefuse[all]'"
 OWN_SETTINGS, SCENES = Path("config/config.yaml"), Path("config/scenes.tsv")
@@ -35,7 +35,7 @@ def main() -> None:
 
 def _register() -> None:
     """lay one cloud on another, and fuse both"""
-    from scenefuse.stage import run
+    from scenefuse.core.stage import run
     from scenefuse.two_clouds.register import register
 
     run(register)
@@ -43,16 +43,16 @@ def _register() -> None:
 
 def _nerf() -> None:
     """train a NeRF on posed photos"""
+    from scenefuse.core.stage import run
     from scenefuse.nerf.train_nerf import train_nerf
-    from scenefuse.stage import run
 
     run(train_nerf)
 
 
 def _pick() -> None:
     """click in a page what an object is in its photos"""
+    from scenefuse.core.stage import run
     from scenefuse.pick.pick import pick
-    from scenefuse.stage import run
 
     _need_project("--configfile", "-h", "--help")
     if _takes_own_settings() and not Path("Snakefile").is_file():
@@ -62,15 +62,15 @@ def _pick() -> None:
 
 def _init() -> None:
     """make a folder for a project of your own"""
+    from scenefuse.core.stage import run
     from scenefuse.new_project import init
-    from scenefuse.stage import run
 
     run(init)
 
 
 def _need_project(*elsewhere: str) -> None:
     """End with a sentence where the folder holds no project, and no option with one of these beginnings is given."""
-    from scenefuse.io.settings import ROOT
+    from scenefuse.core.settings import ROOT
 
     if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
         where = f"there is no {SCENES} here ({Path.cwd()})"
@@ -97,7 +97,7 @@ def _configfiles() -> list[str]:
 
 def _run() -> None:
     """run the workflow in this folder, by Snakemake and with its options"""
-    from scenefuse.io.settings import ROOT
+    from scenefuse.core.settings import ROOT
 
     if find_spec("snakemake") is None:
         raise ModuleNotFoundError(name="snakemake")

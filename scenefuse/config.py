@@ -13,13 +13,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from scenefuse.core.stage import setting
+from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.demo.bodies import Kind
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.demo.clicks import ClickSettings
 from scenefuse.demo.prompts import PromptSettings
-from scenefuse.depth.refine_depth import FeedbackSettings
-from scenefuse.depth.train_depth import DepthTrainingSettings
-from scenefuse.fusion.modes import FusionSettings
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.completion import MetricSettings
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
@@ -28,23 +29,22 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
+from scenefuse.nerf.prior.refine_depth import FeedbackSettings
+from scenefuse.nerf.prior.train_depth import DepthTrainingSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
+from scenefuse.paper.compare_with_paper import ComparisonSettings
+from scenefuse.photos.frames import FrameSettings
 from scenefuse.poses.find_poses import PoseSettings
-from scenefuse.registration.agreement import AgreementSettings
-from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.crop.crop_cloud import CropSettings
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.scale import ScaleSettings
-from scenefuse.registration.shared_features.align_models import AlignmentSettings
-from scenefuse.report.compare_with_paper import ComparisonSettings
+from scenefuse.register.agreement import AgreementSettings
+from scenefuse.register.coarse import CoarseSettings
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.scale import ScaleSettings
+from scenefuse.register.shared_features.align_models import AlignmentSettings
 from scenefuse.sfm.features import FeatureSettings
-from scenefuse.sfm.frames import FrameSettings
 from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.pairs import MatchSettings
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
 from scenefuse.sfm.undistort import UndistortSettings
-from scenefuse.stage import setting
 
 # Six groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.
 

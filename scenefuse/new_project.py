@@ -7,10 +7,10 @@ from typing import Literal
 
 import tyro
 
-from scenefuse.io.formats import READERS
-from scenefuse.io.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
-from scenefuse.io.settings import ROOT, schema_of
-from scenefuse.stage import StageError
+from scenefuse.cloud.formats import READERS
+from scenefuse.core.settings import ROOT, schema_of
+from scenefuse.core.stage import StageError
+from scenefuse.photos.photo_files import VIDEO_SUFFIXES, in_folders, photo_files
 
 SCENES = ("scene", "photos", "cameras", "cloud", "crs")
 OBJECTS = ("object", "scene", "photos", "cameras", "cloud", "prompts", "fiducials")

@@ -1,7 +1,7 @@
 """Click what an object is in its photos, in a page of this machine's browser, without editing tables."""
 
+from scenefuse.core.stage import run
 from scenefuse.pick.pick import pick
-from scenefuse.stage import run
 
 if __name__ == "__main__":
     run(pick)

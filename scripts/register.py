@@ -1,6 +1,6 @@
 """Register two clouds of any known format on their own, without the workflow, and fuse them."""
 
-from scenefuse.stage import run
+from scenefuse.core.stage import run
 from scenefuse.two_clouds.register import register
 
 if __name__ == "__main__":

@@ -11,10 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import quantity
+from scenefuse.core.transforms import Array
 from scenefuse.demo import textures
 from scenefuse.demo.cameras import Cameras
-from scenefuse.stage import quantity
-from scenefuse.transforms import Array
 
 Kind = Literal["real", "ideal"]
 # Defocus of a blurred photo, the standard deviation of a Gaussian in pixels: from, to.

@@ -10,7 +10,7 @@ import open3d as o3d
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.stage import StageError, quantity, read_json, threads, value
+from scenefuse.core.stage import StageError, quantity, read_json, threads, value
 
 
 @dataclass(frozen=True)

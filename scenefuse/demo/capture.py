@@ -11,12 +11,12 @@ import pycolmap
 from numpy.typing import NDArray
 from PIL import Image
 
+from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, write_json
+from scenefuse.core.transforms import look_at
 from scenefuse.demo import bodies, textures
 from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
 from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
-from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, write_json
-from scenefuse.transforms import look_at
 
 
 @dataclass(frozen=True)

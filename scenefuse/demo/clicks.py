@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import StageError, atomic_file, setting
 from scenefuse.demo.cameras import read_cameras, visible
 from scenefuse.demo.world import build_world
-from scenefuse.stage import StageError, atomic_file, setting
 
 # A point counts as hidden when something lies this far before it, in metres.
 HIDDEN_M = 0.06

@@ -7,9 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from scenefuse.core.stage import StageError, atomic_file, setting
 from scenefuse.demo.clicks import random_misses
-from scenefuse.io.pictures import read_mask
-from scenefuse.stage import StageError, atomic_file, setting
+from scenefuse.photos.pictures import read_mask
 
 # Nobody aims at the last pixel of a part: spots are this deep inside, as a share of the deepest one's depth.
 AIMED_DEPTH = 0.2

@@ -10,12 +10,12 @@ import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
 from scenefuse.demo import textures as t
 from scenefuse.demo.meshes import Part, blob, box, grid, rotation, tube
 from scenefuse.demo.objects import OBJECTS
 from scenefuse.demo.textures import noise_at
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array
 
 # Height of the ground at east, north.
 Height = Callable[[Array, Array], Array]

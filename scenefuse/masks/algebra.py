@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
 
 Mask = NDArray[np.bool_]
 

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from scenefuse.mvs.visual_hull import Box
-from scenefuse.transforms import Array
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Box
 
 REACH = 1.5
 """Ground is looked for so far beside the box, in half widths of it: farther off it may be another level."""

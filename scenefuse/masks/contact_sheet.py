@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.mvs.visual_hull import Mask
-from scenefuse.workspace import View
+from scenefuse.geometry.visual_hull import Mask
+from scenefuse.photos.workspace import View
 
 WIDTH_PX = 240
 """Of one photo on the sheet."""

@@ -10,8 +10,8 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
+from scenefuse.geometry.visual_hull import Mask
 from scenefuse.masks.pixels import distance_to
-from scenefuse.mvs.visual_hull import Mask
 
 Trimap = NDArray[np.uint8]
 COLOUR_BINS = 32

@@ -5,8 +5,9 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 
-from scenefuse.masks.clicked.clicks import PhotoClicks
-from scenefuse.masks.clicked.parts import prompted_parts
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Hull, Mask, silhouette
+from scenefuse.marks.labels import PhotoClicks
 from scenefuse.masks.grabcut import (
     Trimap,
     cleaned,
@@ -19,10 +20,9 @@ from scenefuse.masks.grabcut import (
     second_trimap,
     stamp_seeds,
 )
+from scenefuse.masks.parts import prompted_parts
 from scenefuse.masks.target import Target
-from scenefuse.mvs.visual_hull import Hull, Mask, silhouette
-from scenefuse.transforms import Array
-from scenefuse.workspace import Rows, View, Workspace
+from scenefuse.photos.workspace import Rows, View, Workspace
 
 FIRST_ROUNDS = 4
 """Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one."""

@@ -8,20 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cores import use_threads
-from scenefuse.io.pictures import write_picture
-from scenefuse.masks.algebra import kept_part, mask_folders
-from scenefuse.masks.contact_sheet import draw_contact_sheet
-from scenefuse.masks.prompted import Prompted, masks_from_prompts
-from scenefuse.masks.sam2 import Sam2, load_network
-from scenefuse.masks.sam2_weights import why_unavailable
-from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
-from scenefuse.masks.supplied import supplied_masks
-from scenefuse.masks.target import points_in_masks, target_from_points
-from scenefuse.mvs.visual_hull import Mask
-from scenefuse.sfm.fiducials import read_points
-from scenefuse.sfm.frames import original_sizes
-from scenefuse.stage import (
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import (
     StageError,
     atomic_directory,
     atomic_file,
@@ -32,7 +20,19 @@ from scenefuse.stage import (
     value,
     write_json,
 )
-from scenefuse.workspace import View, Workspace, read_workspace
+from scenefuse.geometry.visual_hull import Mask
+from scenefuse.marks.fiducials import read_points
+from scenefuse.masks.algebra import kept_part, mask_folders
+from scenefuse.masks.contact_sheet import draw_contact_sheet
+from scenefuse.masks.prompted import Prompted, masks_from_prompts
+from scenefuse.masks.sam2 import Sam2, load_network
+from scenefuse.masks.sam2_weights import why_unavailable
+from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
+from scenefuse.masks.supplied import supplied_masks
+from scenefuse.masks.target import points_in_masks, target_from_points
+from scenefuse.photos.frames import original_sizes
+from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.workspace import View, Workspace, read_workspace
 
 
 @dataclass(frozen=True)

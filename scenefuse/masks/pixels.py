@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.mvs.visual_hull import Mask
-from scenefuse.transforms import Array
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Mask
 
 
 def held(mask: Mask, pixels: Array, tolerance_px: float) -> NDArray[np.bool_]:

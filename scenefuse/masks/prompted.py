@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicked.carry import carry, one_photo
-from scenefuse.masks.clicked.click_depth import with_depth
-from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
-from scenefuse.masks.clicked.parts import Ask, prompted_parts
-from scenefuse.masks.clicked.stereo_points import with_stereo_points
-from scenefuse.masks.clicked.votes import near_most
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Mask
+from scenefuse.marks.fiducials import Clicks, Labels, ScenePoints, marked_size, triangulate_consistent
+from scenefuse.marks.labels import PhotoClicks, clicks_per_photo
+from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.grabcut_passes import ask_grabcut
+from scenefuse.masks.parts import Ask, prompted_parts
+from scenefuse.masks.propagation import carry, one_photo
 from scenefuse.masks.sam2 import Sam2, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
+from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
-from scenefuse.mvs.visual_hull import Mask
-from scenefuse.sfm.fiducials import Clicks, Labels, ScenePoints, marked_size, triangulate_consistent
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array
-from scenefuse.workspace import Workspace, read_model
+from scenefuse.masks.votes import near_most
+from scenefuse.photos.workspace import Workspace, read_model
 
 LEAST_POINTS = 3
 """Prompts that span an object."""

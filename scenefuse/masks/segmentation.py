@@ -6,15 +6,15 @@ from typing import Literal
 
 import numpy as np
 
-from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.core.stage import StageError, setting
+from scenefuse.geometry.visual_hull import Hull, Mask, carve, mask_iou, silhouette
+from scenefuse.marks.labels import PhotoClicks
 from scenefuse.masks.grabcut import along_edges, cleaned
 from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
 from scenefuse.masks.sam2 import LOGITS_PX, Sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target
-from scenefuse.mvs.visual_hull import Hull, Mask, carve, mask_iou, silhouette
-from scenefuse.stage import StageError, setting
-from scenefuse.workspace import View, Workspace
+from scenefuse.photos.workspace import View, Workspace
 
 HULL_TOLERANCE = 0.1
 """Share of the photos that may contradict a voxel of the hull: some masks are wrong somewhere."""

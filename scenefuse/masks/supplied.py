@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from scenefuse.io.mask_files import mask_files, matte_of
-from scenefuse.io.pictures import read_raw
-from scenefuse.mvs.visual_hull import Mask
+from scenefuse.core.stage import StageError
+from scenefuse.geometry.visual_hull import Mask
+from scenefuse.photos.mask_files import mask_files, matte_of
+from scenefuse.photos.pictures import read_raw
+from scenefuse.photos.workspace import View, read_cameras
 from scenefuse.sfm.undistort import undistort_picture
-from scenefuse.stage import StageError
-from scenefuse.workspace import View, read_cameras
 
 STRETCH = 0.02
 """Relative difference of a mask's proportions from its photo's beyond which it belongs to another picture."""

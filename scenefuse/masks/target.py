@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.visual_hull import Box, Mask
 from scenefuse.masks.box import Ground, find_ground, in_hull, span, upright_box
-from scenefuse.mvs.visual_hull import Box, Mask
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array
-from scenefuse.workspace import View, Workspace
+from scenefuse.photos.workspace import View, Workspace
 
 BOX_MARGIN = 0.15
 """Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends."""

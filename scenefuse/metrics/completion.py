@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, plane_normals, sampled, spacing
+from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
+from scenefuse.core.stage import quantity, threads
+from scenefuse.core.transforms import Array
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.registration.agreement import NORMAL_NEIGHBOURS, AgreementSettings
-from scenefuse.stage import quantity, threads
-from scenefuse.transforms import Array
+from scenefuse.register.agreement import NORMAL_NEIGHBOURS, AgreementSettings
 
 # Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
 WIDE_SAMPLE = 1500

@@ -5,12 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.fusion.fuse_object import FROM_OBJECT
-from scenefuse.io.clouds import read_cloud
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.fuse.fuse_object import FROM_OBJECT
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
-from scenefuse.registration.agreement import registration_metrics
-from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.register.agreement import registration_metrics
 
 
 def compute_metrics(

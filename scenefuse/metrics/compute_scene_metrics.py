@@ -2,10 +2,10 @@
 
 from pathlib import Path
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of
-from scenefuse.stage import quantity, read_json, value, write_json
 
 
 def compute_scene_metrics(

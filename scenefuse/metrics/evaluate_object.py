@@ -6,11 +6,13 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.cloud.clouds import Cloud, read_cloud, sampled
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.core.stage import quantity, read_json, setting, value, write_json
+from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.demo.cameras import read_cameras as read_true_cameras
-from scenefuse.fusion.changes import after_fusion
-from scenefuse.io.clouds import Cloud, read_cloud, sampled
-from scenefuse.io.pictures import read_gray
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.fuse.changes import after_fusion
+from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics.object_truth import (
     MARGIN,
     ObjectTruth,
@@ -29,11 +31,9 @@ from scenefuse.metrics.truth import (
     registration_error,
     scores_at,
 )
-from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.photos.pictures import read_gray
+from scenefuse.photos.workspace import read_cameras, read_views
 from scenefuse.sfm.undistort import undistort_picture
-from scenefuse.stage import quantity, read_json, setting, value, write_json
-from scenefuse.transforms import Array, Sim3, box_around
-from scenefuse.workspace import read_cameras, read_views
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.cloud.clouds import sampled_rows
+from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.core.stage import quantity, read_json, setting, value, write_json
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.io.clouds import sampled_rows
-from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.metrics.truth import (
     HIDDEN,
     Mesh,
@@ -24,9 +26,7 @@ from scenefuse.metrics.truth import (
     read_posed,
     sample_surface,
 )
-from scenefuse.sfm.geodesy import LocalFrame, scene_frame
-from scenefuse.stage import quantity, read_json, setting, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.photos.geodesy import LocalFrame, scene_frame
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.cloud.clouds import sampled
+from scenefuse.core.stage import quantity, read_json, value
+from scenefuse.core.transforms import Array
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
-from scenefuse.io.clouds import sampled
-from scenefuse.io.maps import read_depth
 from scenefuse.metrics.truth import (
     HIDDEN,
     CameraFit,
@@ -26,8 +27,7 @@ from scenefuse.metrics.truth import (
     scores_at,
     true_depth,
 )
-from scenefuse.stage import quantity, read_json, value
-from scenefuse.transforms import Array
+from scenefuse.photos.maps import read_depth
 
 # How far around the object's true box a scene's points count as its own, as a share of its diagonal: farther off than
 # any stray point that a person would take for a part of it.

@@ -6,7 +6,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.transforms import Array
+from scenefuse.core.transforms import Array
 
 CANDIDATES = 150
 

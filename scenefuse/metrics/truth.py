@@ -9,11 +9,11 @@ import open3d as o3d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from scenefuse.core.stage import StageError, quantity, threads
+from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.demo.cameras import Cameras
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
-from scenefuse.stage import StageError, quantity, threads
-from scenefuse.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.workspace import View, read_views
+from scenefuse.photos.workspace import View, read_views
 
 # The posed photos of a model that the truth knows, by name, each with the place of its true camera.
 Posed = list[tuple[View, int]]

@@ -1,1 +1,1 @@
-"""Dense stereo: view selection, plane sweep, depth maps, their consistency, dense cloud; visual hull."""
+"""Dense stereo: view selection, plane sweep, depth maps, dense cloud."""

@@ -11,17 +11,17 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, read_cloud, spacing
-from scenefuse.io.maps import read_depth, write_depth
-from scenefuse.io.tiles.tiled_cloud import WHOLE
-from scenefuse.io.tiles.write_tiles import write_tiled
-from scenefuse.io.units import length_unit
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
+from scenefuse.cloud.tiles.tiled_cloud import WHOLE
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.core.units import length_unit
+from scenefuse.geometry.votes import neighbours, vote
 from scenefuse.mvs.temporary_workspace import linked_workspace
-from scenefuse.mvs.votes import neighbours, vote
+from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.workspace import View, read_views
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.stage import StageError, quantity, read_json, setting, threads, value, write_json
-from scenefuse.transforms import Array
-from scenefuse.workspace import View, read_views
 
 FEW_FUSED = 0.01
 """Share of the measured pixels below which the cameras or the limits are probably wrong."""

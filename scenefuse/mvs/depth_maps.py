@@ -8,14 +8,14 @@ import numpy as np
 import pycolmap
 import torch
 
-from scenefuse.cores import use_threads
-from scenefuse.io.maps import read_depth, write_depth, write_normals
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.temporary_workspace import MAPS, collect_maps, linked_workspace
 from scenefuse.mvs.view_selection import Reference, select_views
+from scenefuse.photos.maps import read_depth, write_depth, write_normals
+from scenefuse.photos.workspace import View, Workspace, read_workspace
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
-from scenefuse.workspace import View, Workspace, read_workspace
 
 
 def estimate_depth_maps(

@@ -7,7 +7,7 @@ into its windows.
 import torch
 from torch import Tensor
 
-from scenefuse.mvs.matcher import Matcher, support_weights, supported_mean
+from scenefuse.geometry.matcher import Matcher, support_weights, supported_mean
 
 PEAK_PX = 1.5
 """How far beside a match, in pixels of the middle one of the source photos, it must be worse."""

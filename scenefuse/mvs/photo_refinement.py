@@ -7,12 +7,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.mvs.consistency import back_project
-from scenefuse.mvs.matcher import Matcher
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.consistency import back_project
+from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import refine_by_matching
-from scenefuse.mvs.views import Views
-from scenefuse.transforms import Array
-from scenefuse.workspace import View
+from scenefuse.photos.views import Views
+from scenefuse.photos.workspace import View
 
 SOURCES, BEST_SOURCES = 8, 3
 """Photos that a photo is matched with, and of these the ones that count: others may not see the place."""

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from scenefuse.mvs.matcher import Matcher, box
+from scenefuse.core.stage import setting
+from scenefuse.core.transforms import Array
+from scenefuse.geometry.matcher import Matcher, box
 from scenefuse.mvs.measured import is_measured
-from scenefuse.stage import setting
-from scenefuse.transforms import Array
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 PLANE_PX, NORMAL_PX = 9, 11
 """Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single

@@ -5,8 +5,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay, QhullError
 
-from scenefuse.mvs.views import Views
-from scenefuse.transforms import Array
+from scenefuse.core.transforms import Array
+from scenefuse.photos.views import Views
 
 LONGEST_SIDE = 0.06
 """Of a triangle between sparse points, over the photo's longer side; farther apart they need not be one surface."""

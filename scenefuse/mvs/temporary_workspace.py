@@ -5,8 +5,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from scenefuse.stage import StageError, scratch_directory
-from scenefuse.workspace import posed_images, read_model
+from scenefuse.core.stage import StageError, scratch_directory
+from scenefuse.photos.workspace import posed_images, read_model
 
 MAPS = ("depth_maps", "normal_maps")
 

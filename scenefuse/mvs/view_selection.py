@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array
-from scenefuse.workspace import View, Workspace
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
+from scenefuse.photos.workspace import View, Workspace
 
 LEAST_SHARED = 8
 """Sparse points that a photo has to have, and to share with a source: fewer do not tell depths and angles."""

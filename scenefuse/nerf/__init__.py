@@ -1,1 +1,1 @@
-"""Stages 2 and 4: rays, field, training, rendered depth maps; and the object's cloud made of these."""
+"""The four training stages: depth prior (`prior/`), rays, field, training, rendered maps; and the object's cloud."""

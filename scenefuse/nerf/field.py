@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from scenefuse.core.stage import setting
 from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
-from scenefuse.stage import setting
 
 # Of the density network's 16 outputs the first is the density's logarithm (Mueller et al. 2022, section 5.4).
 GEOMETRY_FEATURES = 15

@@ -12,16 +12,16 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from scenefuse.cores import use_threads
-from scenefuse.io.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
-from scenefuse.io.maps import read_depth, read_normals
-from scenefuse.mvs.consistency import compare, extent, surface_points
+from scenefuse.cloud.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
+from scenefuse.geometry.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import sparse_depths
-from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
-from scenefuse.stage import StageError, quantity, read_json, setting, threads, write_json
+from scenefuse.photos.maps import read_depth, read_normals
+from scenefuse.photos.views import Views, load_views
 
 Maps = NDArray[np.float32]
 

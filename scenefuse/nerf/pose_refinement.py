@@ -10,8 +10,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.stage import quantity
-from scenefuse.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.stage import quantity
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
 
 
 def corrected(rotation: Tensor, center: Tensor, correction: Tensor) -> tuple[Tensor, Tensor]:

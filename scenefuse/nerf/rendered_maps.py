@@ -9,16 +9,16 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.io.maps import write_depth, write_normals
-from scenefuse.io.pictures import write_picture
-from scenefuse.mvs.consistency import compare, extent, normals_from_depth, surface_points
-from scenefuse.mvs.views import Views, chosen_by
+from scenefuse.core.stage import StageError, quantity
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
 from scenefuse.nerf.appearance import falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
-from scenefuse.stage import StageError, quantity
-from scenefuse.transforms import Sim3
+from scenefuse.photos.maps import write_depth, write_normals
+from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.views import Views, chosen_by
 
 Maps = NDArray[np.float32]
 

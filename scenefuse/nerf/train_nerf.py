@@ -10,19 +10,19 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.maps import read_depth, read_normals
-from scenefuse.io.pictures import read_gray, read_rgb
-from scenefuse.io.settings import build, read_settings
-from scenefuse.io.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
+from scenefuse.photos.maps import read_depth, read_normals
+from scenefuse.photos.pictures import read_gray, read_rgb
+from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
 
 NO_CLOUD = 3
 SHEET_ROWS, TILE_PX = 6, 320

@@ -11,17 +11,18 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.checkpoints import State, key_of
-from scenefuse.cores import use_threads
-from scenefuse.depth.prior import DepthPrior, Unconfirmed, read_prior
+from scenefuse.core.checkpoints import State, key_of
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
+from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
-from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.pose_refinement import refined_poses
+from scenefuse.nerf.prior.prior import DepthPrior, Unconfirmed, read_prior
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.rendered_maps import (
     RenderedMaps,
@@ -34,8 +35,7 @@ from scenefuse.nerf.rendered_maps import (
 )
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, go_on_from, keep_memory, new_nerf, train
 from scenefuse.nerf.volume import Volume, find_volume, hidden_pixels, silhouettes
-from scenefuse.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.photos.views import Views, load_views
 
 # A rendered depth is confident from here on; what later stages and the export call confident.
 CONFIDENT = 0.5

@@ -14,7 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from scenefuse.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
+from scenefuse.core.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
+from scenefuse.core.progress import Progress
+from scenefuse.core.stage import setting
 from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
 from scenefuse.nerf.field import EdgeRates, Field, FieldSettings, coarse_to_fine
@@ -23,8 +25,6 @@ from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.pose_refinement import corrected
 from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
-from scenefuse.progress import Progress
-from scenefuse.stage import setting
 
 # Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
 ADAM_BETAS, ADAM_EPSILON = (0.9, 0.99), 1e-15

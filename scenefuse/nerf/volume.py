@@ -7,7 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.mvs.visual_hull import (
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.visual_hull import (
     LEAST_OWN,
     LEAST_WHOLE,
     NO_POINTS,
@@ -17,9 +19,7 @@ from scenefuse.mvs.visual_hull import (
     least_framing,
 )
 from scenefuse.nerf.rays import dilate
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array, Sim3
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 # Cells per side of the hull that the cube is fitted to: the margin is wider than one of them.
 FIRST_CELLS = 64

@@ -1,1 +1,1 @@
-"""The paper's four training stages by its letter (`object.recipe: paper`); docs/paper.md says where it cannot be."""
+"""The paper by its letter: four training stages, registration, published numbers and the comparison with them."""

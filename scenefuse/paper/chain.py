@@ -9,14 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scenefuse.depth.inputs import DepthPhotos
-from scenefuse.depth.pose_network import PoseNetwork, small_photos
-from scenefuse.mvs.views import Views
+from scenefuse.core.stage import StageError, atomic_directory, quantity
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.nerf.prior.inputs import DepthPhotos
+from scenefuse.nerf.prior.pose_network import PoseNetwork, small_photos
+from scenefuse.photos.views import Views
+from scenefuse.photos.workspace import read_workspace, write_model
 from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.stage import StageError, atomic_directory, quantity
-from scenefuse.transforms import Array, Sim3, fit_sim3
-from scenefuse.workspace import read_workspace, write_model
 
 
 @torch.no_grad()

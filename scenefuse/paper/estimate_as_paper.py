@@ -9,16 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scenefuse.checkpoints import key_of
-from scenefuse.depth.consistency import consistency_between_views, residuals_at_points
-from scenefuse.depth.crops import Crops
-from scenefuse.depth.inputs import DepthPhotos, depth_photos
-from scenefuse.depth.maps import Content, align_maps, map_quantities, print_quality, tolerance_of, write_maps
-from scenefuse.depth.networks import parameters
-from scenefuse.depth.pose_network import pose_quantities
-from scenefuse.depth.self_supervision import sample
-from scenefuse.depth.training import Networks, loss_quantities, optimise, predict, prepare_torch, save_networks
-from scenefuse.mvs.views import Views, load_views
+from scenefuse.core.checkpoints import key_of
+from scenefuse.core.stage import atomic_directory, quantity, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.nerf.prior.consistency import consistency_between_views, residuals_at_points
+from scenefuse.nerf.prior.crops import Crops
+from scenefuse.nerf.prior.inputs import DepthPhotos, depth_photos
+from scenefuse.nerf.prior.maps import Content, align_maps, map_quantities, print_quality, tolerance_of, write_maps
+from scenefuse.nerf.prior.networks import parameters
+from scenefuse.nerf.prior.pose_network import pose_quantities
+from scenefuse.nerf.prior.self_supervision import sample
+from scenefuse.nerf.prior.training import Networks, loss_quantities, optimise, predict, prepare_torch, save_networks
 from scenefuse.paper.chain import chain_quantities, chained, place_chain, write_posed
 from scenefuse.paper.monocular import (
     MonocularSettings,
@@ -29,8 +30,7 @@ from scenefuse.paper.monocular import (
     supervision_of,
 )
 from scenefuse.paper.recipe import BATCH_PHOTOS
-from scenefuse.stage import atomic_directory, quantity, write_json
-from scenefuse.transforms import Array
+from scenefuse.photos.views import Views, load_views
 
 PoseSource = Literal["chain", "sfm"]
 

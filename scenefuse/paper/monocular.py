@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from scenefuse.depth.inputs import DepthPhotos
-from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
-from scenefuse.depth.pose_network import PoseNetwork, small_photos
-from scenefuse.depth.self_supervision import masked_mean, smoothness
-from scenefuse.depth.training import (
+from scenefuse.core.stage import StageError, setting
+from scenefuse.nerf.prior.inputs import DepthPhotos
+from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
+from scenefuse.nerf.prior.pose_network import PoseNetwork, small_photos
+from scenefuse.nerf.prior.self_supervision import masked_mean, smoothness
+from scenefuse.nerf.prior.training import (
     Networks,
     Objective,
     PhotoScale,
@@ -24,9 +25,8 @@ from scenefuse.depth.training import (
     error_against_target,
     reprojection_error,
 )
-from scenefuse.mvs.views import Views
 from scenefuse.paper.recipe import BATCH_PHOTOS, WARMUP_EPOCHS
-from scenefuse.stage import StageError, setting
+from scenefuse.photos.views import Views
 
 # What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
 NEAR, FAR = 0.5, 2.0

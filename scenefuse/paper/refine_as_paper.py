@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefuse.checkpoints import key_of
-from scenefuse.depth.maps import print_quality, read_maps
-from scenefuse.depth.pose_network import pose_quantities
-from scenefuse.depth.refine_depth import EarlierStages, blend_depths, read_rendered
-from scenefuse.depth.training import load_networks, loss_quantities, optimise, predict, prepare_torch
-from scenefuse.mvs.views import load_views
+from scenefuse.core.checkpoints import key_of
+from scenefuse.core.stage import quantity, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.nerf.prior.maps import print_quality, read_maps
+from scenefuse.nerf.prior.pose_network import pose_quantities
+from scenefuse.nerf.prior.refine_depth import EarlierStages, blend_depths, read_rendered
+from scenefuse.nerf.prior.training import load_networks, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.paper.chain import chained
 from scenefuse.paper.estimate_as_paper import (
     PoseSource,
@@ -30,8 +31,7 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
-from scenefuse.stage import quantity, write_json
-from scenefuse.transforms import Array
+from scenefuse.photos.views import load_views
 
 
 def refine_as_paper(

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import torch
 
+from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.mvs.photo_refinement import RefinementSettings
-from scenefuse.mvs.views import load_views
 from scenefuse.nerf.field import Field, FieldSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_object_nerf
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.recipe import FIELD, LOSSES, NERF
-from scenefuse.stage import quantity, read_json, write_json
+from scenefuse.photos.views import load_views
 
 # Samples that a field's speed is measured on.
 PROBE_SAMPLES = 1 << 16

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
 
 Kind = Literal["labels", "points", "lengths"]
 """Labels say inside, outside or box; points have names and are clicked in several photos, so are ends of lengths."""

@@ -11,11 +11,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 
-from scenefuse.io.tables import composed, read_cells, read_text
+from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.tables import composed, read_cells, read_text
+from scenefuse.marks.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
+from scenefuse.marks.lengths import COLUMNS, read_end_clicks
 from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, length_label, merged
-from scenefuse.sfm.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
-from scenefuse.sfm.survey.lengths import COLUMNS, read_end_clicks
-from scenefuse.stage import StageError, atomic_file
 
 HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS, "lengths": COLUMNS}
 

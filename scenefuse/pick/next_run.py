@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from scenefuse.io.settings import ROOT
+from scenefuse.core.settings import ROOT
 
 TIME_LIMIT_S = 300
 OWN_SETTINGS = "config/config.yaml"

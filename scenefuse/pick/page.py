@@ -7,15 +7,15 @@ from typing import Any
 
 from nicegui import ui
 
+from scenefuse.core.stage import StageError
 from scenefuse.pick.clicks import Kind, Rows, with_box, with_end, with_label, with_length, with_point, without_nearest
 from scenefuse.pick.document import Document, FileChanged
 from scenefuse.pick.overlays import CARRIED, CLICKED, overlay
 from scenefuse.pick.photo_map import PhotoMap
 from scenefuse.pick.photo_strip import PhotoStrip
-from scenefuse.pick.pictures import Picture
+from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.session import Board, Session
 from scenefuse.pick.side_panel import SidePanel
-from scenefuse.stage import StageError
 
 STYLE = """
 body { overflow: hidden; background: #202020; }

@@ -9,9 +9,9 @@ import numpy as np
 from nicegui import ui
 from nicegui.elements.leaflet.leaflet_layer import Layer
 
+from scenefuse.core.transforms import Array
 from scenefuse.pick.clicks import Click, spoken
-from scenefuse.pick.pictures import Picture
-from scenefuse.transforms import Array
+from scenefuse.pick.photo_tiles import Picture
 
 MAGNIFIED = 4
 """Zoom steps beyond the photo's own pixels."""

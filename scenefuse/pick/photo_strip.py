@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 
 from nicegui import ui
 
-from scenefuse.pick.pictures import Picture
+from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.session import Session, thumbnails_left
 
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import tyro
 
+from scenefuse.core.stage import StageError
 from scenefuse.pick.session import Session
-from scenefuse.stage import StageError
 
 
 def pick(

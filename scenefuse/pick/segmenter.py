@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import StageError, scratch_directory, threads
 from scenefuse.pick.clicks import Rows
-from scenefuse.pick.pictures import Picture, at_most, read_upright
-from scenefuse.stage import StageError, scratch_directory, threads
+from scenefuse.pick.photo_tiles import Picture, at_most, read_upright
 
 if TYPE_CHECKING:
-    from scenefuse.masks.clicked.clicks import PhotoClicks
+    from scenefuse.marks.labels import PhotoClicks
 
 Mask = NDArray[np.bool_]
 KEPT = 24
@@ -154,9 +154,9 @@ class Segmenter:
         Raises:
             StageError: the photo cannot be read.
         """
-        from scenefuse.masks.clicked.carry import one_photo
-        from scenefuse.masks.clicked.votes import LEAST_AGREEMENT, LEAST_QUALITY
-        from scenefuse.workspace import View
+        from scenefuse.masks.propagation import one_photo
+        from scenefuse.masks.votes import LEAST_AGREEMENT, LEAST_QUALITY
+        from scenefuse.photos.workspace import View
 
         self.load()
         self._waiting += 1
@@ -200,7 +200,7 @@ class Segmenter:
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":
     """The clicks of one photo, in pixels of a copy of it of another size."""
-    from scenefuse.masks.clicked.clicks import PhotoClicks
+    from scenefuse.marks.labels import PhotoClicks
 
     own = [row for row in rows if row.photo == picture.name]
     scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3

@@ -8,8 +8,8 @@ from urllib.parse import parse_qs, urlsplit
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import FileResponse, Response
 
+from scenefuse.core.stage import StageError
 from scenefuse.pick.session import Session
-from scenefuse.stage import StageError
 
 HOST = "127.0.0.1"
 

@@ -11,15 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from scenefuse.io.project import read_project
-from scenefuse.io.settings import read_settings
-from scenefuse.pick.cameras import Cameras
-from scenefuse.pick.carried import carried_masks
+from scenefuse.core.settings import read_settings
+from scenefuse.core.stage import StageError
+from scenefuse.marks.project import read_project
 from scenefuse.pick.document import Document
-from scenefuse.pick.pictures import Picture, Thumbnails, Tiles
+from scenefuse.pick.expected_place import Cameras
+from scenefuse.pick.photo_tiles import Picture, Thumbnails, Tiles
 from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.sources import Source, sources_of
-from scenefuse.stage import StageError
+from scenefuse.pick.workflow_masks import carried_masks
 
 MASK_SIDE_PX = 1024
 """Longer side of the photos that masks are shown in; SAM 2 sees no more."""

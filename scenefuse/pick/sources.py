@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from scenefuse.io.photo_files import frame_name, thin_out, upright_size
-from scenefuse.io.project import Project
+from scenefuse.core.stage import StageError, read_json
+from scenefuse.marks.project import Project
+from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
+from scenefuse.photos.photos import photo_names, without_copies
 from scenefuse.pick.clicks import Kind, Sizes
-from scenefuse.pick.pictures import Picture
-from scenefuse.sfm.photos import photo_names, without_copies
-from scenefuse.stage import StageError, read_json
+from scenefuse.pick.photo_tiles import Picture
 
 OF_OBJECT: dict[Kind, str] = {
     "labels": "Click each part of the object, and beside it where something like it touches it. One photo is enough to"

@@ -11,17 +11,17 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from scenefuse.depth.training import prepare_torch
+from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, write_json
+from scenefuse.core.transforms import Sim3, fit_sim3, rotation_angle_deg, rotation_between
+from scenefuse.nerf.prior.training import prepare_torch
+from scenefuse.photos.workspace import View, Workspace, read_workspace
 from scenefuse.poses.bundle_adjustment import AdjustedBundle, adjust_bundle, link_tracks
 from scenefuse.poses.correspondences import PhotoFeatures, find_features, find_pairs
 from scenefuse.poses.pair_scales import learn_pair_scales
 from scenefuse.poses.pose_graph import average_poses, largest_component, spanning_tree_poses
-from scenefuse.sfm.bundle.adjustment import TOLERANCE
-from scenefuse.sfm.bundle.lens import HELD, KNOWN, STRAIGHT, choose_lens, describe_lens
+from scenefuse.sfm.adjustment import TOLERANCE
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.stage import StageError, atomic_directory, quantity, setting, write_json
-from scenefuse.transforms import Sim3, fit_sim3, rotation_angle_deg, rotation_between
-from scenefuse.workspace import View, Workspace, read_workspace
+from scenefuse.sfm.lens import HELD, KNOWN, STRAIGHT, choose_lens, describe_lens
 
 Array = NDArray[np.float64]
 Content = dict[str, Any]

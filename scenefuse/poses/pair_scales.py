@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from scenefuse.checkpoints import learning_rate_factor
-from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
-from scenefuse.depth.self_supervision import masked_mean, points_in_cam, sample, smoothness
+from scenefuse.core.checkpoints import learning_rate_factor
+from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
+from scenefuse.nerf.prior.self_supervision import masked_mean, points_in_cam, sample, smoothness
+from scenefuse.photos.workspace import View
 from scenefuse.poses.correspondences import PhotoFeatures, TwoViewPair
-from scenefuse.workspace import View
 
 # Nearest and farthest depth of the network, in units of the typical one.
 NEAR, FAR = 0.2, 20.0

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.core.job_records import JobRecords, why_unfinished
+from scenefuse.core.stage import StageError
 from scenefuse.report.values import Fields, find, load
-from scenefuse.stage import StageError
 
 # What each step leaves, in the order in which the steps run.
 _OBJECT_FILES = (

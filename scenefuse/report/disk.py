@@ -12,8 +12,8 @@ import pandas as pd
 from PIL import Image
 from PIL.ExifTags import Base
 
-from scenefuse.io.photo_files import photo_files
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
+from scenefuse.photos.photo_files import photo_files
 
 # Fitted by hand to what the demo took (docs/results.md, The room on the disk).
 FEATURE_BYTES = 450

@@ -6,19 +6,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.fusion.evidence import NERF_ONLY
-from scenefuse.fusion.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
-from scenefuse.io.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.core.stage import atomic_directory, read_json
+from scenefuse.core.transforms import Array, box_corners
+from scenefuse.fuse.evidence import NERF_ONLY
+from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
+from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
+from scenefuse.photos.workspace import read_views
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
-from scenefuse.stage import atomic_directory, read_json
-from scenefuse.transforms import Array, box_corners
-from scenefuse.workspace import read_views
 
 SCENE_COLOR, ADDED_COLOR, UNCONFIRMED_COLOR = (205, 208, 212), (240, 120, 25), (150, 60, 170)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)

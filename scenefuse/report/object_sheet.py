@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud
-from scenefuse.io.maps import read_depth
-from scenefuse.io.pictures import read_mask, read_rgb
-from scenefuse.io.sheets import Image, Sheet, depth_colors, draw_sheet
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.photos.maps import read_depth
+from scenefuse.photos.pictures import read_mask, read_rgb
+from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet
+from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.stage import StageError
-from scenefuse.transforms import Array, Sim3, rotation_between
-from scenefuse.workspace import read_views
 
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 

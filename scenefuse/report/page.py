@@ -7,9 +7,9 @@ from pathlib import Path
 
 from PIL import Image as Picture
 
+from scenefuse.core.stage import StageError
 from scenefuse.report.view.view_page import view_library
 from scenefuse.report.view.view_script import VIEW_SCRIPT, VIEW_STYLE
-from scenefuse.stage import StageError
 
 STYLE = """
 :root { --ink: #1d2329; --soft: #5b6670; --line: #dfe3e7; --accent: #c7560b; }

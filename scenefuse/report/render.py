@@ -13,9 +13,9 @@ from numba import njit
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud
-from scenefuse.stage import threads
-from scenefuse.transforms import look_at
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import look_at
 
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]

@@ -6,7 +6,8 @@ from typing import Any
 
 import pandas as pd
 
-from scenefuse.fusion.missing import CLASSES
+from scenefuse.core.version import VERSION
+from scenefuse.fuse.missing import CLASSES
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.diagnosis import diagnose
@@ -22,7 +23,6 @@ from scenefuse.report.tables import (
     truth_numbers,
 )
 from scenefuse.report.values import Fields, find, number, unit_of
-from scenefuse.version import VERSION
 
 WIDTH = 100
 _COLUMNS = ("value", *BESIDE)

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.fusion.changes import after_fusion
-from scenefuse.fusion.fuse_object import is_placed
-from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
+from scenefuse.fuse.changes import after_fusion
+from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.report.object_sheet import inner
 from scenefuse.report.values import find, flatten, load, number, unit_of
-from scenefuse.stage import StageError, read_json, value
-from scenefuse.transforms import Array, Sim3, box_around, rotation_between
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
 REACH = (0.35, 0.35, 0.15)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.values import Fields, find, number, unit_of

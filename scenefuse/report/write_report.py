@@ -5,14 +5,14 @@ from dataclasses import replace
 from html import escape
 from pathlib import Path
 
+from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.paper.paper_section import paper_section
 from scenefuse.report.collected import ALONE
 from scenefuse.report.page import document, embedded
-from scenefuse.report.paper_section import paper_section
 from scenefuse.report.values import number
 from scenefuse.report.view.view_file import View, read_view
 from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import thin
-from scenefuse.stage import StageError, atomic_file
 
 PAGE_POINTS = 700_000
 """Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points."""

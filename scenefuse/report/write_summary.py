@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from scenefuse.core.stage import atomic_file
 from scenefuse.report.collected import Collected, RunInputs, collect_run, read_fields, status_of
 from scenefuse.report.disk import disk_table
 from scenefuse.report.summary_text import summary_text
@@ -14,7 +15,6 @@ from scenefuse.report.tables import (
     scenes_table,
 )
 from scenefuse.report.values import Fields, find
-from scenefuse.stage import atomic_file
 
 
 def write_summary(*, run: RunInputs, summary: Path) -> None:

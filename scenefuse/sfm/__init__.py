@@ -1,1 +1,1 @@
-"""Structure from motion: photos, features, matches, mapping, georeferencing, undistortion; gravity and fiducials."""
+"""Structure from motion: features, matches, mapping, lenses, spread, gravity, undistortion."""

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 import pycolmap
 
+from scenefuse.core.stage import StageError, atomic_file, setting, threads
+from scenefuse.photos.photos import SHAPE_TOLERANCE, Photo, check_unchanged, read_photos
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.photos import SHAPE_TOLERANCE, Photo, check_unchanged, read_photos
-from scenefuse.stage import StageError, atomic_file, setting, threads
 
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
 FEW_FEATURES = 100

@@ -11,15 +11,15 @@ import pycolmap
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from scenefuse.io.mask_files import mask_files, matte_of
-from scenefuse.io.pictures import write_picture
+from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.photos.mask_files import mask_files, matte_of
+from scenefuse.photos.photos import JPEG_QUALITY, SHAPE_TOLERANCE
+from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
+from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up
-from scenefuse.sfm.photos import JPEG_QUALITY, SHAPE_TOLERANCE
-from scenefuse.sfm.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
-from scenefuse.stage import StageError, atomic_directory, quantity, write_json
-from scenefuse.transforms import Array
-from scenefuse.workspace import View, write_model
 
 Picture = NDArray[np.uint8]
 Lens = tuple[pycolmap.Camera, View]

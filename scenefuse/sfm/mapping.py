@@ -12,23 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from scenefuse.sfm.bundle.adjustment import (
-    ITERATIONS,
-    MAX_REPROJECTION_ERROR_PX,
-    ROUGH_TOLERANCE,
-    TOLERANCE,
-    adjust,
-    drop_outliers,
-)
-from scenefuse.sfm.bundle.explained import STRONG_PAIR, doubtful_photos, explained_matches
-from scenefuse.sfm.bundle.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
-from scenefuse.sfm.frames import original_sizes
-from scenefuse.sfm.given.cameras import place_of, triangulated
-from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.matches import MIN_INLIERS
-from scenefuse.sfm.photos import orientations_in, read_photos
-from scenefuse.sfm.survey.lengths import read_lengths
-from scenefuse.stage import (
+from scenefuse.core.stage import (
     StageError,
     atomic_directory,
     quantity,
@@ -38,6 +22,22 @@ from scenefuse.stage import (
     threads,
     write_json,
 )
+from scenefuse.marks.lengths import read_lengths
+from scenefuse.photos.frames import original_sizes
+from scenefuse.photos.photos import orientations_in, read_photos
+from scenefuse.sfm.adjustment import (
+    ITERATIONS,
+    MAX_REPROJECTION_ERROR_PX,
+    ROUGH_TOLERANCE,
+    TOLERANCE,
+    adjust,
+    drop_outliers,
+)
+from scenefuse.sfm.explained import STRONG_PAIR, doubtful_photos, explained_matches
+from scenefuse.sfm.given_cameras import place_of, triangulated
+from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
+from scenefuse.sfm.matches import MIN_INLIERS
 
 # Fewest matches of the first pair of photos; COLMAP's own.
 INIT_MIN_INLIERS = 100

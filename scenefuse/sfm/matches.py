@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pycolmap
 
+from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.photos.photos import read_photos
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.pairs import MatchSettings, Pair, choose_pairs
-from scenefuse.sfm.photos import read_photos
-from scenefuse.stage import StageError, atomic_file, quantity, read_json, threads, value, write_json
 
 # Largest descriptor distance of a match (the paper's).
 MAX_DISTANCE = 0.7

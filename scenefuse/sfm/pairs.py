@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial.distance import cdist
 
-from scenefuse.sfm.geodesy import local_frame
-from scenefuse.sfm.photos import Photo, gps_positions
-from scenefuse.stage import setting
+from scenefuse.core.stage import setting
+from scenefuse.photos.geodesy import local_frame
+from scenefuse.photos.photos import Photo, gps_positions
 
 Pair = tuple[str, str]
 

@@ -10,12 +10,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
+from scenefuse.core.transforms import Array
+from scenefuse.photos.photos import JPEG_QUALITY, check_unchanged, read_photos
+from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.interrupt import cancellable
-from scenefuse.sfm.photos import JPEG_QUALITY, check_unchanged, read_photos
-from scenefuse.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
-from scenefuse.transforms import Array
-from scenefuse.workspace import View, read_workspace
 
 # A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
 # alone scales by a few percent, which bilinear sampling does better without.

@@ -10,21 +10,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.fusion.changes import FROM_OBJECT, FROM_SCENE, with_source
-from scenefuse.fusion.evidence import FIELDS, unchecked, with_normals
-from scenefuse.fusion.fuse_object import GREY, possible
-from scenefuse.fusion.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
-from scenefuse.io.cloud_file import CloudFile
-from scenefuse.io.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, records_of, spacing
-from scenefuse.io.formats import las_crs
-from scenefuse.io.import_cloud import unit_and_name
-from scenefuse.io.readers.columns import COLOR
-from scenefuse.io.settings import build, read_settings
-from scenefuse.io.tiles.tiled_cloud import Rows
-from scenefuse.io.tiles.write_tiles import reserved
-from scenefuse.stage import StageError, quantity, scratch_directory, write_json
-from scenefuse.transforms import Sim3
-from scenefuse.version import VERSION
+from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, records_of, spacing
+from scenefuse.cloud.formats import las_crs
+from scenefuse.cloud.import_cloud import unit_and_name
+from scenefuse.cloud.readers.columns import COLOR
+from scenefuse.cloud.tiles.tiled_cloud import Rows
+from scenefuse.cloud.tiles.write_tiles import reserved
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, quantity, scratch_directory, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.core.version import VERSION
+from scenefuse.fuse.changes import FROM_OBJECT, FROM_SCENE, with_source
+from scenefuse.fuse.evidence import FIELDS, unchecked, with_normals
+from scenefuse.fuse.fuse_object import GREY, possible
+from scenefuse.fuse.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
 
 FILES = ("completed.ply", "completed.laz", "completed.json")
 CHUNK = 1_000_000

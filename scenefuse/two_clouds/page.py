@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.fusion.changes import together
+from scenefuse.core.stage import atomic_file, value
+from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.fuse.changes import together
 from scenefuse.report.page import document, embedded
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view.view_file import View
 from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
-from scenefuse.stage import atomic_file, value
-from scenefuse.transforms import Array, Sim3, rotation_between
 from scenefuse.two_clouds.complete import Completed, with_fields
 
 VIEW_POINTS = 300_000

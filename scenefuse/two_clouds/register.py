@@ -9,13 +9,16 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from scenefuse.io.alignment_picture import draw_alignment
-from scenefuse.io.cloud_file import CloudFile
-from scenefuse.io.clouds import Cloud, has_unit_normals, without_strays, write_cloud, write_laz
-from scenefuse.io.formats import las_crs
-from scenefuse.io.import_cloud import unit_and_name
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.register import (
+from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.clouds import Cloud, has_unit_normals, without_strays, write_cloud, write_laz
+from scenefuse.cloud.formats import las_crs
+from scenefuse.cloud.import_cloud import unit_and_name
+from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.core.version import VERSION
+from scenefuse.geometry.alignment_picture import draw_alignment
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.register.register import (
     Known,
     Registration,
     RegistrationSettings,
@@ -27,11 +30,8 @@ from scenefuse.registration.register import (
     second_place,
     summary,
 )
-from scenefuse.stage import StageError, atomic_file, quantity, value, write_json
-from scenefuse.transforms import Array, Sim3
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
-from scenefuse.version import VERSION
 
 REGISTERED, UNREGISTERED = 0, 3
 NOTHING = Known()
@@ -178,7 +178,7 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     whole = CloudFile.of(scene, marked, SEARCHED)
     crs = las_crs(scene)
     if crs is not None:
-        from scenefuse.io.crs import check_place
+        from scenefuse.cloud.crs import check_place
 
         check_place(crs, whole.survey.sample, scene)
     notes = [*cloud.notes, *strays, *whole.notes, *_notes(object, scene)]

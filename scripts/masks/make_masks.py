@@ -1,7 +1,7 @@
 """Make a mask of the object for every photo."""
 
+from scenefuse.core.stage import run
 from scenefuse.masks.make_masks import make_masks
-from scenefuse.stage import run
 
 if __name__ == "__main__":
     run(make_masks)

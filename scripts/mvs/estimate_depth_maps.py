@@ -1,7 +1,7 @@
 """Estimate depth and normal maps for one chunk of a scene's photos."""
 
+from scenefuse.core.stage import run
 from scenefuse.mvs.depth_maps import estimate_depth_maps
-from scenefuse.stage import run
 
 if __name__ == "__main__":
     run(estimate_depth_maps)

@@ -1,7 +1,7 @@
 """Match features between chosen pairs of photos."""
 
+from scenefuse.core.stage import run
 from scenefuse.sfm.matches import match_features
-from scenefuse.stage import run
 
 if __name__ == "__main__":
     run(match_features)

@@ -11,19 +11,19 @@ import numpy as np
 import pandas as pd
 import yaml
 
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.core.settings import ROOT, build, read_settings
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.settings import ROOT, build, read_settings
 from scenefuse.metrics.truth import fit_cameras, read_posed, registration_error
-from scenefuse.registration.agreement import AgreementSettings, registration_metrics
-from scenefuse.registration.coarse import CoarseSettings, register_coarsely
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.fine import EvidenceFiles, register_finely
-from scenefuse.registration.paper import register_as_paper
-from scenefuse.registration.problem import Inputs
-from scenefuse.registration.scale import ScaleSettings
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Sim3
+from scenefuse.paper.register_as_paper import register_as_paper
+from scenefuse.register.agreement import AgreementSettings, registration_metrics
+from scenefuse.register.coarse import CoarseSettings, register_coarsely
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.fine import EvidenceFiles, register_finely
+from scenefuse.register.problem import Inputs
+from scenefuse.register.scale import ScaleSettings
 
 OBJECTS = ("house", "balloon", "sculpture")
 

@@ -10,16 +10,16 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import ROOT, build, read_settings
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.settings import ROOT, build, read_settings
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.mvs.visual_hull import mask_iou
+from scenefuse.photos.workspace import read_workspace
 from scenefuse.report.object_sheet import inner, upright
 from scenefuse.report.render import orbit_camera, point_radii, render
-from scenefuse.stage import read_json, run, value
-from scenefuse.workspace import read_workspace
 
 EXAMPLE = ROOT / "config/examples/alexander"
 WRONG = {"DSC05138.JPG"}

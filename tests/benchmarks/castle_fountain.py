@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.cameras import Cameras
-from scenefuse.io.clouds import read_cloud
 from scenefuse.metrics.truth import CameraFit, fit_cameras, read_posed, registration_error
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Sim3
 
 
 def cameras(truth: dict, capture: str) -> Cameras:

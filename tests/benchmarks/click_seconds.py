@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from scenefuse.io.pictures import read_rgb
-from scenefuse.masks.clicked.carry import one_photo
-from scenefuse.masks.clicked.clicks import PhotoClicks
+from scenefuse.core.stage import run
+from scenefuse.marks.labels import PhotoClicks
+from scenefuse.masks.propagation import one_photo
 from scenefuse.masks.sam2 import Sam2Onnx, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings
-from scenefuse.stage import run
-from scenefuse.workspace import View
+from scenefuse.photos.pictures import read_rgb
+from scenefuse.photos.workspace import View
 
 REPEATS = 5
 

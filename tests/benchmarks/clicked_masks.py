@@ -14,20 +14,20 @@ import numpy as np
 import pandas as pd
 from scipy import ndimage
 
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, read_json, run, value
+from scenefuse.core.transforms import Array
 from scenefuse.demo.prompts import PromptSettings, clicks_on, random_misses
-from scenefuse.io.mask_files import mask_files
-from scenefuse.io.pictures import read_mask
-from scenefuse.io.settings import build, read_settings
+from scenefuse.geometry.visual_hull import Mask, mask_iou
+from scenefuse.marks.fiducials import Labels
 from scenefuse.masks import prompted
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.mvs.visual_hull import Mask, mask_iou
-from scenefuse.sfm.fiducials import Labels
-from scenefuse.sfm.frames import original_sizes
-from scenefuse.stage import StageError, read_json, run, value
-from scenefuse.transforms import Array
-from scenefuse.workspace import Workspace, read_workspace
+from scenefuse.photos.frames import original_sizes
+from scenefuse.photos.mask_files import mask_files
+from scenefuse.photos.pictures import read_mask
+from scenefuse.photos.workspace import Workspace, read_workspace
 
 RIGHT = 0.97
 """IoU from which a mask is right."""

@@ -14,8 +14,8 @@ from pathlib import Path
 from support.browser import chromium
 from support.clicking_page import LOCAL, MASK, Page, served
 
-from scenefuse.io.photo_files import photo_files, upright_size
-from scenefuse.stage import run
+from scenefuse.core.stage import run
+from scenefuse.photos.photo_files import photo_files, upright_size
 
 PATIENCE_S = 900
 ACTION_S = 2.0

@@ -21,20 +21,20 @@ import open3d as o3d
 import pandas as pd
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
+from scenefuse.core.stage import StageError, read_json, run, threads, value
+from scenefuse.core.transforms import Array, Sim3, step_to_planes
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.fusion.changes import FROM_OBJECT, together
-from scenefuse.fusion.evidence import MEASURED, around
-from scenefuse.fusion.fuse_object import fuse_by_distance, fuse_by_evidence, uncertainty_on_scene
-from scenefuse.fusion.modes import FusionSettings
-from scenefuse.fusion.photo_check import LEAST_PHOTOS, moved_photos, read_photos
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing
+from scenefuse.fuse.changes import FROM_OBJECT, together
+from scenefuse.fuse.evidence import MEASURED, around
+from scenefuse.fuse.fuse_object import fuse_by_distance, fuse_by_evidence, uncertainty_on_scene
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.geometry.photo_check import LEAST_PHOTOS, moved_photos, read_photos
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
-from scenefuse.registration.uncertainty import Uncertainty
-from scenefuse.stage import StageError, read_json, run, threads, value
-from scenefuse.transforms import Array, Sim3, step_to_planes
-from scenefuse.workspace import read_workspace
+from scenefuse.photos.workspace import read_workspace
+from scenefuse.register.uncertainty import Uncertainty
 
 # Points drawn on the true surface, as the workflow's evaluation draws them.
 SAMPLES = 60000

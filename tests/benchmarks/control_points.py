@@ -25,25 +25,25 @@ import pyproj
 import tyro
 from numpy.typing import NDArray
 
+from scenefuse.core.stage import read_json, value
+from scenefuse.core.transforms import Array
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.georef.control import Control, Sighting, read_sighted, seen_at, sight
+from scenefuse.georef.control_file import ControlFile, SurveyedPoint
+from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
+from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.georef.residuals import rms
 from scenefuse.metrics.evaluate_scene import within
 from scenefuse.metrics.truth import HIDDEN, cast_together, read_mesh, sample_surface
-from scenefuse.sfm.bundle.lens import LENSES
+from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.photos import Photo, list_photos, read_photos
+from scenefuse.photos.workspace import read_model
 from scenefuse.sfm.features import FeatureSettings, extract_features
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
 from scenefuse.sfm.gravity import estimate_up
+from scenefuse.sfm.lens import LENSES
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import match_features
 from scenefuse.sfm.pairs import MatchSettings
-from scenefuse.sfm.photos import Photo, list_photos, read_photos
-from scenefuse.sfm.survey.control import Control, Sighting, read_sighted, seen_at, sight
-from scenefuse.sfm.survey.control_file import ControlFile, SurveyedPoint
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
-from scenefuse.sfm.survey.residuals import rms
-from scenefuse.stage import read_json, value
-from scenefuse.transforms import Array
-from scenefuse.workspace import read_model
 
 
 @dataclass(frozen=True)

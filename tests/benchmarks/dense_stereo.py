@@ -20,9 +20,10 @@ import pandas as pd
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.demo.cameras import read_cameras, visible
-from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.maps import read_depth
 from scenefuse.metrics.evaluate_scene import within
 from scenefuse.metrics.truth import (
     HIDDEN,
@@ -37,9 +38,8 @@ from scenefuse.metrics.truth import (
     sample_surface,
     true_depth,
 )
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Array, Sim3
-from scenefuse.workspace import View, Workspace, read_workspace
+from scenefuse.photos.maps import read_depth
+from scenefuse.photos.workspace import View, Workspace, read_workspace
 
 ROOT = Path(__file__).resolve().parents[2]
 SAMPLES = 60000

@@ -18,24 +18,24 @@ import numpy as np
 import pandas as pd
 import pycolmap
 
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import quantity, run, write_json
 from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
-from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
-from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
-from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.prior.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.nerf.prior.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
-from scenefuse.stage import quantity, run, write_json
 
 # A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
 SMALL = {"width_px": 160, "crop_px": 72}
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
-    ("scenefuse.depth.train_depth", "load_views"): "loading",
-    ("scenefuse.depth.train_depth", "network_inputs"): "plane sweep",
-    ("scenefuse.depth.train_depth", "train_networks"): "training",
-    ("scenefuse.depth.refine_depth", "train_networks"): "training",
+    ("scenefuse.nerf.prior.train_depth", "load_views"): "loading",
+    ("scenefuse.nerf.prior.train_depth", "network_inputs"): "plane sweep",
+    ("scenefuse.nerf.prior.train_depth", "train_networks"): "training",
+    ("scenefuse.nerf.prior.refine_depth", "train_networks"): "training",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
     ("scenefuse.nerf.train_object_nerf", "read_prior"): "prior",
     ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",

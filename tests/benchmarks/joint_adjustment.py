@@ -18,12 +18,12 @@ from support.photo_trials import FIRST_SEED, MEASURES, drawn, modelled, off_by, 
 from support.photographed_place import Rows
 from support.planted_photos import PhotoTrial, fitted, truth
 
-from scenefuse.registration.shared_features.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
-from scenefuse.registration.shared_features.landmarks import match_landmarks
-from scenefuse.registration.shared_features.reprojection import match_errors, observations
-from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, Freedom, adjustment_options, drop_outliers
-from scenefuse.stage import run, value
-from scenefuse.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.stage import run, value
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.register.shared_features.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
+from scenefuse.register.shared_features.landmarks import match_landmarks
+from scenefuse.register.shared_features.reprojection import match_errors, observations
+from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, Freedom, adjustment_options, drop_outliers
 
 # Ids of the object's camera, photos and points in the joint model lie so far above those of the scene's.
 ABOVE = 1_000_000

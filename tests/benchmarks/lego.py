@@ -12,18 +12,18 @@ import cv2
 import numpy as np
 import torch
 
-from scenefuse.cores import use_threads
-from scenefuse.io.settings import build, read_settings
-from scenefuse.mvs.views import load_views
+from scenefuse.core.cores import use_threads
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import run
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.rendered_maps import psnr, ssim
 from scenefuse.nerf.train_object_nerf import NerfSettings, photo_tensors
 from scenefuse.nerf.training import Nerf, Training, keep_memory, new_nerf, train
 from scenefuse.nerf.volume import find_volume, silhouettes
+from scenefuse.photos.views import load_views
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
-from scenefuse.stage import run
 
 GOALS_DB = (25, 28, 30, 32)
 ROOT = Path(__file__).resolve().parents[2]

@@ -16,9 +16,10 @@ import numpy as np
 import torch
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
-from scenefuse.cores import use_threads
-from scenefuse.io.settings import build, read_settings
-from scenefuse.mvs.matcher import Matcher
+from scenefuse.core.cores import use_threads
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import run
+from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf import encoding, kernels
 from scenefuse.nerf.encoding import encode, encode_reference, hash_grid, kernels_on
@@ -27,8 +28,7 @@ from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.render import UNIFORM_SHARE, march, no_prior
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, keep_memory, new_nerf, train
-from scenefuse.stage import run
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 LEVELS, LOG2_TABLE, COARSEST, FINEST, SAMPLES = 16, 19, 16, 1024, 32768
 

@@ -17,16 +17,16 @@ import cv2
 import numpy as np
 import pycolmap
 
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, quantity, run, value, write_json
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
-from scenefuse.depth.train_depth import DepthTrainingSettings, train_depth
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, read_settings
 from scenefuse.metrics.object_truth import cloud_results, read_object_truth
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.prior.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.nerf.prior.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.poses.find_poses import PoseSettings, find_poses
-from scenefuse.stage import StageError, quantity, run, value, write_json
 
 
 def workspace(frames: Path, masks: Path, folder: Path) -> None:

@@ -17,19 +17,19 @@ import numpy as np
 import pandas as pd
 import torch
 
-from scenefuse.depth.refine_depth import EarlierStages, FeedbackSettings, refine_depth
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.pictures import read_rgb
-from scenefuse.io.settings import build, read_settings
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
-from scenefuse.mvs.views import chosen_by, load_views
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
+from scenefuse.nerf.prior.refine_depth import EarlierStages, FeedbackSettings, refine_depth
 from scenefuse.nerf.rendered_maps import psnr
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper
 from scenefuse.paper.monocular import MonocularSettings
-from scenefuse.stage import StageError, read_json, run, value
+from scenefuse.photos.pictures import read_rgb
+from scenefuse.photos.views import chosen_by, load_views
 
 POSE_RATE = 5e-4
 # Of stage 1 in config/paper.yaml.

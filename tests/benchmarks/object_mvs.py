@@ -13,17 +13,17 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from scenefuse.io.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
-from scenefuse.io.maps import read_depth, read_normals, write_depth
-from scenefuse.io.settings import build, read_settings
+from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import StageError, read_json, run, value
+from scenefuse.geometry.consistency import compare
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.mvs.consistency import compare
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
-from scenefuse.mvs.views import Views, load_views
 from scenefuse.nerf.object_cloud import CloudSettings, SurfaceMaps, clean, fuse_depths
-from scenefuse.stage import StageError, read_json, run, value
+from scenefuse.photos.maps import read_depth, read_normals, write_depth
+from scenefuse.photos.views import Views, load_views
 
 # Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,
 # window, angle, sources, best sources) only the window changed much.

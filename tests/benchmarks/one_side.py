@@ -18,12 +18,12 @@ import pandas as pd
 import yaml
 from support.marks import frame_of_its_own, marks_of
 
+from scenefuse.cloud.clouds import read_cloud, write_cloud, write_laz
+from scenefuse.core.settings import ROOT
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.io.clouds import read_cloud, write_cloud, write_laz
-from scenefuse.io.settings import ROOT
 from scenefuse.metrics.object_truth import ObjectTruth, read_object_truth, scene_scores, surface_to_find
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Sim3
 
 SCENE, SAMPLES = "demo", 60000
 

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from support.planted import plant
 
-from scenefuse.io.clouds import write_cloud
-from scenefuse.stage import run
+from scenefuse.cloud.clouds import write_cloud
+from scenefuse.core.stage import run
 
 ROOT = Path(__file__).resolve().parents[2]
-IMPORT = "import scenefuse.registration.register"
+IMPORT = "import scenefuse.register.register"
 
 
 def package(*, runs: int = 3, largest: int = 4) -> None:

@@ -8,11 +8,11 @@ import tempfile
 from dataclasses import replace
 from pathlib import Path
 
-from scenefuse.io.settings import build, read_settings
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import read_json, run, value
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.paper.recipe import LOSSES
 from scenefuse.paper.train_nerf_as_paper import as_paper, rays_of_an_epoch
-from scenefuse.stage import read_json, run, value
 
 # So small a weight teaches nothing, and the loss is still measured.
 NOTHING = 1e-9

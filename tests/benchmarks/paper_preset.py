@@ -5,7 +5,7 @@ snakemake --configfile config/paper.yaml --directory paper --cores 2
 snakemake --configfile config/paper.yaml config/paper_from_sfm.yaml --directory paper_from_sfm --cores 2
 python tests/benchmarks/paper_preset.py --shipped results --chained paper/results --from-sfm paper_from_sfm/results
 
-Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/report/paper_tables.py); here
+Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/paper/paper_tables.py); here
 are two runs of the preset side by side, and errors against the truth. Where a stage ended in an error, the table says
 so, and what follows is empty; without a truth, so are errors. `null` is what chance gives: one motion, a random one,
 from each frame to the next (`one motion for all`: the best one), depth that is the same all over a photo, a random
@@ -20,19 +20,19 @@ import cv2
 import numpy as np
 import pandas as pd
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.settings import build, read_settings
-from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.job_records import JobRecords, why_unfinished
+from scenefuse.core.settings import build, read_settings
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import registration_error, true_depth
+from scenefuse.paper.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.paper.published import OBJECTS, published
+from scenefuse.photos.workspace import read_workspace
 from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.report.collected import Collected, collect
-from scenefuse.report.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.workspace import read_workspace
 
 SCENE = "demo"
 SCORES = {"0.5": "05pct", "1": "1pct", "2": "2pct"}

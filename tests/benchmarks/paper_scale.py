@@ -8,9 +8,9 @@ from unittest.mock import patch
 import pandas as pd
 from support.planted import plant
 
-from scenefuse.registration import paper
-from scenefuse.registration.scale import rms
-from scenefuse.stage import run
+from scenefuse.core.stage import run
+from scenefuse.paper import register_as_paper as paper
+from scenefuse.register.scale import rms
 
 EDGES = (0.9, 0.7, 0.5)
 SHOWN = ((1.0, False), (0.6, False), (0.4, False), (0.6, True))

@@ -19,13 +19,14 @@ import open3d as o3d
 import pandas as pd
 from scipy.spatial.transform import Rotation
 
+from scenefuse.core.stage import run, threads, value
+from scenefuse.core.transforms import Array, fit_sim3, look_at
 from scenefuse.demo import bodies, textures
 from scenefuse.demo.cameras import Cameras, pinhole
 from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
-from scenefuse.depth.pose_network import pose_quantities
-from scenefuse.depth.training import optimise, predict, prepare_torch
-from scenefuse.mvs.views import Views
+from scenefuse.nerf.prior.pose_network import pose_quantities
+from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
 from scenefuse.paper.chain import chained
 from scenefuse.paper.monocular import (
     MonocularSettings,
@@ -35,9 +36,8 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
+from scenefuse.photos.views import Views
 from scenefuse.poses.find_poses import trajectory_error
-from scenefuse.stage import run, threads, value
-from scenefuse.transforms import Array, fit_sim3, look_at
 
 # As the demo's photos, at the width of the paper's stage 1.
 WIDTH, HEIGHT, FOCAL = 192, 144, 168.0

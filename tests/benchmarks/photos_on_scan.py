@@ -20,16 +20,16 @@ import pyproj
 import yaml
 from plyfile import PlyData
 
+from scenefuse.cloud.clouds import Cloud, write_laz
+from scenefuse.core.settings import ROOT
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Array
 from scenefuse.demo.cameras import read_cameras
 from scenefuse.demo.world import ORIGIN
-from scenefuse.io.clouds import Cloud, write_laz
-from scenefuse.io.settings import ROOT
-from scenefuse.sfm.geodesy import LocalFrame, scene_frame
-from scenefuse.sfm.georeference import camera_poses, georegister
-from scenefuse.sfm.photos import read_photos, write_photos
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Array
+from scenefuse.georef.georeference import camera_poses, georegister
+from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.photos.geodesy import LocalFrame, scene_frame
+from scenefuse.photos.photos import read_photos, write_photos
 
 SCENE, CRS = "demo", 32632
 GEOID_M, NOISE_M, HALF_M = 47.3, 0.02, 45.0

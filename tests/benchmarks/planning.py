@@ -13,8 +13,8 @@ from pathlib import Path
 
 from support.user_project import Project
 
-from scenefuse.io.settings import ROOT
-from scenefuse.stage import StageError, run
+from scenefuse.core.settings import ROOT
+from scenefuse.core.stage import StageError, run
 
 
 def planning(*, objects: tuple[int, ...] = (40, 400)) -> None:

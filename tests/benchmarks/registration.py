@@ -16,18 +16,18 @@ import open3d as o3d
 import pandas as pd
 from support.planted import AXES, SHAPES, Trial, deviations, errors, plant
 
-from scenefuse.io.clouds import Cloud
-from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.paper import paper_coarse, paper_fine
-from scenefuse.registration.problem import Evidence, Problem
-from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.scale import ScaleSettings, estimates, prior
-from scenefuse.registration.uncertainty import Uncertainty
-from scenefuse.stage import run
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import run
+from scenefuse.core.transforms import Sim3
+from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.paper.register_as_paper import paper_coarse, paper_fine
+from scenefuse.register.coarse import CoarseSettings, find_hypotheses
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.refinement import refine_hypotheses
+from scenefuse.register.scale import ScaleSettings, estimates, prior
+from scenefuse.register.uncertainty import Uncertainty
 
 UP = np.array([0.0, 0.0, 1.0])
 COVERAGES = (0.3, 0.5, 0.7, 0.9)

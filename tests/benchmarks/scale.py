@@ -26,24 +26,24 @@ import pandas as pd
 from support.copc_file import write_copc
 from support.planted import Trial, errors, plant
 
-from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene
-from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fusion.modes import FusionSettings
-from scenefuse.io.clouds import Cloud, laz_in_parts, read_cloud, records_of, write_cloud
-from scenefuse.io.import_cloud import import_scene_cloud
-from scenefuse.io.tiles.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud
-from scenefuse.io.tiles.write_tiles import reserved
-from scenefuse.job_records import JobRecords
-from scenefuse.registration.coarse import CoarseSettings, register_coarsely
-from scenefuse.registration.crop.crop_cloud import CropSettings
-from scenefuse.registration.crop.crop_scene import CropInputs, around_marks, crop_scene
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.fine import register_finely
-from scenefuse.registration.problem import Inputs
-from scenefuse.registration.register import Known
-from scenefuse.registration.scale import ScaleSettings
-from scenefuse.stage import quantity, read_json, run, value, write_json
-from scenefuse.transforms import Array, Sim3
+from scenefuse.cloud.clouds import Cloud, laz_in_parts, read_cloud, records_of, write_cloud
+from scenefuse.cloud.import_cloud import import_scene_cloud
+from scenefuse.cloud.tiles.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud
+from scenefuse.cloud.tiles.write_tiles import reserved
+from scenefuse.core.job_records import JobRecords
+from scenefuse.core.stage import quantity, read_json, run, value, write_json
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.crop.crop_cloud import CropSettings
+from scenefuse.crop.crop_scene import CropInputs, around_marks, crop_scene
+from scenefuse.fuse.complete_scene import CompletionInputs, complete_scene
+from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.register.coarse import CoarseSettings, register_coarsely
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.fine import register_finely
+from scenefuse.register.problem import Inputs
+from scenefuse.register.register import Known
+from scenefuse.register.scale import ScaleSettings
 from scenefuse.two_clouds.register import register as register_files
 
 OBJECT_POINTS = 100_000

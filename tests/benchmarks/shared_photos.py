@@ -16,12 +16,12 @@ from support.photographed_place import Kind
 from support.planted import AXES, deviations
 from support.planted_photos import PhotoTrial, Truth, truth
 
-from scenefuse.registration.decision import MOST_BENT, FineSettings
-from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
-from scenefuse.registration.uncertainty import Uncertainty, with_bending
-from scenefuse.sfm.bundle.spread import Spread, spread_of
-from scenefuse.stage import run, value
-from scenefuse.transforms import Sim3
+from scenefuse.core.stage import run, value
+from scenefuse.core.transforms import Sim3
+from scenefuse.register.decision import MOST_BENT, FineSettings
+from scenefuse.register.shared_features.align_models import AlignmentSettings, align_landmarks
+from scenefuse.register.uncertainty import Uncertainty, with_bending
+from scenefuse.sfm.spread import Spread, spread_of
 
 # As in registration.py.
 SCALE_PCT, ROTATION_DEG, SHIFT_PCT = 2.0, 2.0, 1.0

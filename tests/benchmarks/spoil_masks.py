@@ -12,8 +12,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scenefuse.io.pictures import read_mask
-from scenefuse.stage import StageError, run
+from scenefuse.core.stage import StageError, run
+from scenefuse.photos.pictures import read_mask
 
 EVERY = 4
 

@@ -14,13 +14,13 @@ import numpy as np
 import pandas as pd
 from support.marks import frame_of_its_own, marks_of
 
+from scenefuse.cloud.clouds import read_cloud, write_cloud, write_laz
+from scenefuse.core.stage import read_json, run, value
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.io.clouds import read_cloud, write_cloud, write_laz
 from scenefuse.metrics.object_truth import read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.truth import registration_error
-from scenefuse.registration.register import Known
-from scenefuse.stage import read_json, run, value
-from scenefuse.transforms import Sim3
+from scenefuse.register.register import Known
 from scenefuse.two_clouds.register import REGISTERED, register
 
 SAMPLES = 60000

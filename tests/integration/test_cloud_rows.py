@@ -14,9 +14,9 @@ from support.cloud_files import UTM
 from support.planted import errors, plant
 from support.user_project import CLICKS, Project, planned
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.stage import read_json, value
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.core.stage import read_json, value
+from scenefuse.core.transforms import Sim3
 
 ORIGIN = Sim3(1.0, np.eye(3), UTM)
 """Of the planted scene, in the coordinates of its file."""

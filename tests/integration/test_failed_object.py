@@ -16,8 +16,8 @@ import yaml
 from support.changed_scene import write_changes
 from support.user_project import CLICKS
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.stage import quantity, write_json
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.stage import quantity, write_json
 
 GATHERED = ("completed.", "view.", "yard/metrics.json", "summary/")
 STATUS = {

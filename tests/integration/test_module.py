@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.user_project import CLICKS, planned
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 OTHER = """

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from support.user_project import write_clouds
 
-from scenefuse.io.clouds import read_cloud
+from scenefuse.cloud.clouds import read_cloud
 
 pytest.importorskip("snakemake_executor_plugin_cluster_generic", reason="pip install -r tests/requirements.txt")
 

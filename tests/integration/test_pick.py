@@ -12,9 +12,9 @@ from support.browser import chromium
 from support.clicking_page import LOCAL, MASK, Page, served
 from support.user_project import CLICKS, Project
 
-from scenefuse.pick.pictures import Picture
-from scenefuse.sfm.survey.lengths import read_ends
-from scenefuse.workspace import View, write_model
+from scenefuse.marks.lengths import read_ends
+from scenefuse.photos.workspace import View, write_model
+from scenefuse.pick.photo_tiles import Picture
 
 NAME, SIZE = "Füße und Kopf.jpg", (600, 400)
 DISC = ((250, 120), (200, 220), (300, 220))

@@ -30,5 +30,5 @@ def test_planning_imports_nothing_heavy(dry_run, monkeypatch):
     # Every job on a cluster plans again. Without a survey, clicks are all that is looked into.
     monkeypatch.setenv("PYTHONPROFILEIMPORTTIME", "1")
     imported = set(re.findall(r"^import time: .*\| +(\S+)$", dry_run(1), re.MULTILINE))
-    assert "scenefuse.sfm.fiducials" in imported
+    assert "scenefuse.marks.fiducials" in imported
     assert imported & {"torch", "open3d", "pycolmap", "pyproj", "cv2", "numba", "scipy"} == set()

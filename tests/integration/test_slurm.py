@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from support.user_project import write_clouds
 
-from scenefuse.io.clouds import read_cloud
+from scenefuse.cloud.clouds import read_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 ISOLATED = ("unshare", "--mount", "--pid", "--fork", "--kill-child", "--mount-proc")

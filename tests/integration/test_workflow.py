@@ -9,7 +9,7 @@ import pytest
 import yaml
 from support.user_project import planned
 
-from scenefuse.io.clouds import read_cloud
+from scenefuse.cloud.clouds import read_cloud
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from scenefuse.fusion.changes import FROM_OBJECT, with_source
-from scenefuse.fusion.evidence import KEPT, REPLACED, unchecked
-from scenefuse.io.clouds import write_cloud
+from scenefuse.cloud.clouds import write_cloud
+from scenefuse.fuse.changes import FROM_OBJECT, with_source
+from scenefuse.fuse.evidence import KEPT, REPLACED, unchecked
 
 
 def write_changes(folder, scene, added, rows=(), removed=(), evidence=0):

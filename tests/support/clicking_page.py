@@ -8,8 +8,8 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from scenefuse.pick.pictures import Picture
-from scenefuse.sfm.fiducials import read_points
+from scenefuse.marks.fiducials import read_points
+from scenefuse.pick.photo_tiles import Picture
 
 ROOT = Path(__file__).resolve().parents[2]
 # The page comes from this machine, and from nowhere else.

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from scenefuse.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3
 
 OFF = 0.01
 """How far off the marks are clicked, one standard deviation over the object's diagonal."""

@@ -9,8 +9,8 @@ from support.photographed_place import Kind
 from support.planted import errors
 from support.planted_photos import PhotoTrial, Plan, calibrated, mapped, plant_photos
 
-from scenefuse.sfm.bundle.lens import Choice
-from scenefuse.transforms import Array, Sim3
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.sfm.lens import Choice
 
 # The seeds of development are to be looked at; what is published has seeds that nobody has tuned anything on.
 FIRST_SEED = {"development": 0, "published": 100_000}

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from support.planted import SHAPES
 
+from scenefuse.core.transforms import Array, Sim3, look_at
 from scenefuse.demo.meshes import Part, box, grid, join
-from scenefuse.transforms import Array, Sim3, look_at
 
 Kind = Literal["grid", "orbit", "row"]
 Rows = NDArray[np.int64]

@@ -3,7 +3,7 @@
 import cv2
 import numpy as np
 
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 BLANK = 1.5
 """Where x is larger, the plane has no texture."""

@@ -9,12 +9,12 @@ import open3d as o3d
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
 from scenefuse.demo import objects
 from scenefuse.demo.meshes import Part, blob, box, grid, join, lathe, tube
-from scenefuse.io.clouds import Cloud
-from scenefuse.registration.free_space import FreeSpace, without_edges
-from scenefuse.transforms import Sim3, rotation_angle_deg, rotation_between
-from scenefuse.workspace import View
+from scenefuse.geometry.free_space import FreeSpace, without_edges
+from scenefuse.photos.workspace import View
 
 OUTER_POINTS = 60000
 # The seven parts of an error, in the order of a stated covariance.

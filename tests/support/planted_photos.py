@@ -19,10 +19,10 @@ from support.photographed_place import (
     scene_photos,
 )
 
-from scenefuse.registration.shared_features.landmarks import Landmarks, landmarks_of
-from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust, drop_outliers
-from scenefuse.sfm.bundle.lens import HELD, Choice, choose_lens
-from scenefuse.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.register.shared_features.landmarks import Landmarks, landmarks_of
+from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust, drop_outliers
+from scenefuse.sfm.lens import HELD, Choice, choose_lens
 
 OUTLIERS = 0.05
 # Points that a truth is fitted to, and photos of a side, at least.

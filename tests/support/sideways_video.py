@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scenefuse.mvs.views import Views
+from scenefuse.photos.views import Views
 
 WIDTH, HEIGHT, FOCAL, DISTANCE, STEP = 64, 48, 58.0, 3.0, 0.15
 # By how many columns the wall moves from one frame to the next.

@@ -8,14 +8,14 @@ import pycolmap
 import pyproj
 from scipy.spatial.transform import Rotation
 
-from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
-from scenefuse.sfm.bundle.lens import HELD
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.given.place import Place
-from scenefuse.sfm.photos import Photo, write_photos
-from scenefuse.stage import quantity, write_json
-from scenefuse.transforms import Array, Sim3, box_corners, fit_sim3
-from scenefuse.workspace import View
+from scenefuse.core.stage import quantity, write_json
+from scenefuse.core.transforms import Array, Sim3, box_corners, fit_sim3
+from scenefuse.photos.cameras.place import Place
+from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.photos import Photo, write_photos
+from scenefuse.photos.workspace import View
+from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.lens import HELD
 
 FRAME = LocalFrame(47.37, 8.55, 430.0)
 WIDTH, HEIGHT, FOCAL = 800, 600, 700.0

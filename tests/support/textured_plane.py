@@ -6,8 +6,8 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from scenefuse.mvs.consistency import back_project
-from scenefuse.mvs.views import Views
+from scenefuse.geometry.consistency import back_project
+from scenefuse.photos.views import Views
 
 
 def _texture(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import yaml
 
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, write_cloud
 
 CLICKS = "label\tphoto\tx_px\ty_px\n" + "".join(f"inside\t0.jpg\t{x}\t20\n" for x in (20, 30, 40))
 """Clicks on an object, in a photo of `Project.photos`."""

@@ -8,13 +8,13 @@ import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_models
-from scenefuse.registration.shared_features.landmarks import match_landmarks, read_landmarks
-from scenefuse.registration.shared_features.reprojection import match_errors, minimise_reprojection, observations
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.photos import Photo
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3, rotation_angle_deg
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3, rotation_angle_deg
+from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.photos import Photo
+from scenefuse.register.shared_features.align_models import AlignmentSettings, align_models
+from scenefuse.register.shared_features.landmarks import match_landmarks, read_landmarks
+from scenefuse.register.shared_features.reprojection import match_errors, minimise_reprojection, observations
 
 SETTINGS = AlignmentSettings()
 
@@ -335,7 +335,7 @@ def test_a_cap_keeps_the_points_seen_most(pair):
 def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
     obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
     whole = match_landmarks(obj, scene, 0.85)
-    monkeypatch.setattr("scenefuse.registration.shared_features.landmarks.BLOCK", 37)
+    monkeypatch.setattr("scenefuse.register.shared_features.landmarks.BLOCK", 37)
     np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85), whole)
 
 

@@ -14,14 +14,14 @@ from benchmarks import completed_scene, frames_scaling, lego, object_ablation, o
 from scipy.spatial.transform import Rotation
 from support.planted import AXES, deviations
 
-from scenefuse.fusion.fuse_object import FusionSettings
-from scenefuse.io.clouds import Cloud
-from scenefuse.io.settings import read_settings
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.settings import read_settings
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.fuse.fuse_object import FusionSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
-from scenefuse.stage import StageError
-from scenefuse.transforms import Sim3, rotation_between
 
 BENCHMARKS = Path(__file__).resolve().parents[1] / "benchmarks"
 

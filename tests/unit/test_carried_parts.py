@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
-from scenefuse.masks.clicked.carry import best_mask, carry
-from scenefuse.masks.clicked.clicks import PhotoClicks
-from scenefuse.masks.clicked.parts import with_parts
-from scenefuse.masks.clicked.space import Left
-from scenefuse.masks.clicked.stereo_points import with_stereo_points
-from scenefuse.masks.clicked.votes import Known, known_points, voter_of
-from scenefuse.mvs.visual_hull import mask_iou
-from scenefuse.workspace import View, Workspace
+from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.marks.labels import PhotoClicks
+from scenefuse.masks.parts import with_parts
+from scenefuse.masks.propagation import best_mask, carry
+from scenefuse.masks.space import Left
+from scenefuse.masks.stereo_points import with_stereo_points
+from scenefuse.masks.votes import Known, known_points, voter_of
+from scenefuse.photos.workspace import View, Workspace
 
 NO_CLICKS = PhotoClicks(np.zeros((0, 2)), np.zeros(0, dtype=bool))
 

@@ -8,9 +8,9 @@ import signal
 import pytest
 import torch
 
-from scenefuse import checkpoints
-from scenefuse.checkpoints import checkpointed, key_of, learning_rate_factor, load_checkpoint, save_checkpoint
-from scenefuse.stage import StageError
+from scenefuse.core import checkpoints
+from scenefuse.core.checkpoints import checkpointed, key_of, learning_rate_factor, load_checkpoint, save_checkpoint
+from scenefuse.core.stage import StageError
 
 
 def state_of(value: float = 1.0, rows: int = 4) -> dict:

@@ -10,22 +10,22 @@ import pycolmap
 import pytest
 from support.photographed_plane import photographs
 
-from scenefuse.masks.clicked.carry import carry, one_photo
-from scenefuse.masks.clicked.click_depth import with_depth
-from scenefuse.masks.clicked.clicks import PhotoClicks, clicks_per_photo
-from scenefuse.masks.clicked.parts import agrees, with_parts
-from scenefuse.masks.clicked.space import Space
-from scenefuse.masks.clicked.votes import LEAST_AGREEMENT, Voter, known_points, voter_of
+from scenefuse.core.stage import StageError
+from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.marks.fiducials import Labels, locate, read_points
+from scenefuse.marks.labels import PhotoClicks, clicks_per_photo
+from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
+from scenefuse.masks.parts import agrees, with_parts
 from scenefuse.masks.prompted import masks_from_prompts
+from scenefuse.masks.propagation import carry, one_photo
 from scenefuse.masks.sam2 import ask_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut
+from scenefuse.masks.space import Space
 from scenefuse.masks.target import far_apart, target_from_votes
-from scenefuse.mvs.visual_hull import mask_iou
-from scenefuse.sfm.fiducials import Labels, locate, read_points
-from scenefuse.stage import StageError
-from scenefuse.workspace import View, Workspace, write_model
+from scenefuse.masks.votes import LEAST_AGREEMENT, Voter, known_points, voter_of
+from scenefuse.photos.workspace import View, Workspace, write_model
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 12
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])

@@ -4,7 +4,7 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import (
+from scenefuse.cloud.clouds import (
     Cloud,
     concatenate,
     read_cloud,
@@ -14,8 +14,8 @@ from scenefuse.io.clouds import (
     write_cloud,
     write_laz,
 )
-from scenefuse.stage import StageError
-from scenefuse.transforms import Sim3
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Sim3
 
 
 def cloud(count: int = 50) -> Cloud:

@@ -6,14 +6,14 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.fusion.complete_scene import CompletionInputs, complete_scene, without_overlaps
-from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fusion.modes import FusionSettings, fuse_clouds
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.job_records import JobRecords
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
-from scenefuse.version import VERSION
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.job_records import JobRecords
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.core.version import VERSION
+from scenefuse.fuse.complete_scene import CompletionInputs, complete_scene, without_overlaps
+from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fuse.modes import FusionSettings, fuse_clouds
 
 SETTINGS = FusionSettings(mode="fill")
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))

@@ -10,13 +10,13 @@ import pytest
 from laspy.copc import load_octree_for_query
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.io.tiles import copc, tiled_cloud, write_tiles
-from scenefuse.io.tiles.copc import write_copc
-from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
-from scenefuse.io.tiles.write_tiles import write_tiled
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.stage import StageError
+from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.cloud.tiles import copc, tiled_cloud, write_tiles
+from scenefuse.cloud.tiles.copc import write_copc
+from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError
+from scenefuse.photos.geodesy import LocalFrame
 
 UTM = np.array([462_000.0, 5_260_000.0, 400.0])
 

@@ -9,16 +9,16 @@ import pycolmap
 import pytest
 from support.planted import plant
 
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.io.tiles import tiled_cloud, write_tiles
-from scenefuse.io.tiles.write_tiles import write_tiled
-from scenefuse.registration.crop.crop_cloud import CropSettings, crop_cloud
-from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.registration.crop.shapes import in_wide_hull, least_footprint
-from scenefuse.registration.crop.vote import count, read_masked_views, vote
-from scenefuse.sfm.ground import fit_ground
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
+from scenefuse.cloud.tiles import tiled_cloud, write_tiles
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.crop.shapes import in_wide_hull, least_footprint
+from scenefuse.crop.vote import count, read_masked_views, vote
+from scenefuse.geometry.ground import fit_ground
 
 Z = np.array([0.0, 0.0, 1.0])
 SETTINGS = CropSettings()
@@ -64,7 +64,7 @@ def test_parts_far_from_every_fiducial_are_kept_and_that_is_said(monkeypatch):
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     low, high = trial.scene.points.min(0), trial.scene.points.max(0)
     far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
-    monkeypatch.setattr("scenefuse.registration.crop.crop_cloud.MIN_PART", 1.1)
+    monkeypatch.setattr("scenefuse.crop.crop_cloud.MIN_PART", 1.1)
     cut = crop_cloud(trial.scene, far, Z, SETTINGS)
     assert cut.keep.all() and "no part in the box lies near a fiducial" in cut.notes[1]
 
@@ -114,7 +114,7 @@ def test_the_crop_of_a_large_scene_is_that_of_the_part_around_the_marks(tmp_path
 
 def test_a_large_scene_without_any_mark_is_one_sentence(tmp_path, monkeypatch):
     trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
-    monkeypatch.setattr("scenefuse.registration.crop.crop_scene.MOST_WHOLE", 1000)
+    monkeypatch.setattr("scenefuse.crop.crop_scene.MOST_WHOLE", 1000)
     with pytest.raises(StageError, match="nothing marks the object, and the scene has .* mark it"):
         crop_scene(**stage_files(tmp_path, trial, trial.fiducials), settings=replace(SETTINGS, whole_scene=True))
 

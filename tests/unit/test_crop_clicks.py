@@ -5,16 +5,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import Cloud, read_cloud
-from scenefuse.io.tiles import tiled_cloud, write_tiles
-from scenefuse.io.tiles.write_tiles import write_tiled
-from scenefuse.registration.crop.crop_cloud import CropSettings
-from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.registration.crop.one_photo import SceneClicks
-from scenefuse.sfm.fiducials import read_points
-from scenefuse.stage import StageError, read_json, value
-from scenefuse.transforms import look_at
-from scenefuse.workspace import View, write_model
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.cloud.tiles import tiled_cloud, write_tiles
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import look_at
+from scenefuse.crop.crop_cloud import CropSettings
+from scenefuse.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.crop.one_photo import SceneClicks
+from scenefuse.marks.fiducials import read_points
+from scenefuse.photos.workspace import View, write_model
 
 SIZE = np.array([6.0, 4.0, 3.0])
 """Of the shed, which stands about the origin of the yard."""
@@ -155,7 +155,7 @@ def test_a_click_in_a_scene_photo_without_a_camera_is_left_out_and_named(crop, m
         marked = read_points(path)
         return replace(marked, photos=[*marked.photos[:-1], "drone 3.jpg"])
 
-    monkeypatch.setattr("scenefuse.registration.crop.crop_scene.read_points", with_lost)
+    monkeypatch.setattr("scenefuse.crop.crop_scene.read_points", with_lost)
     note = value(crop(inside(*CORNERS, (1, -2, 1.5)))[1], "notes")[0]
     assert "is in drone 3.jpg, which has no camera (it could not be registered, or is none of the photos)" in note
     with pytest.raises(StageError, match=r"2 clicks inside .* 3 are needed \(.* drone 3\.jpg, which has no camera"):

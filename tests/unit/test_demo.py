@@ -10,13 +10,13 @@ import open3d as o3d
 import pytest
 from PIL import Image
 
+from scenefuse.core.stage import StageError, manifest, read_json, value
 from scenefuse.demo import capture, clicks, prompts, textures
 from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
 from scenefuse.demo.cameras import Cameras, pinhole, read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
-from scenefuse.sfm.fiducials import Labels, read_points
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.stage import StageError, manifest, read_json, value
+from scenefuse.marks.fiducials import Labels, read_points
+from scenefuse.photos.geodesy import LocalFrame
 
 FLIGHT = capture.FlightSettings(
     columns=2,

@@ -10,15 +10,15 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.maps import read_depth, read_normals, write_depth, write_normals
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.geometry.matcher import Matcher
 from scenefuse.mvs import dense_cloud
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
-from scenefuse.mvs.matcher import Matcher
 from scenefuse.mvs.plane_sweep import DepthMapSettings
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.workspace import View
+from scenefuse.photos.maps import read_depth, read_normals, write_depth, write_normals
+from scenefuse.photos.workspace import View
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0
 DEPTH = DepthMapSettings(

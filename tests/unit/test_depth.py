@@ -11,22 +11,22 @@ import pytest
 import torch
 from support.textured_plane import plane_views
 
-from scenefuse.depth import train_depth as stage
-from scenefuse.depth.consistency import align_to_points, consistency_between_views, fuse_by_inverse_variance
-from scenefuse.depth.first_depth import network_inputs
-from scenefuse.depth.inputs import depth_photos
-from scenefuse.depth.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
-from scenefuse.depth.pose_network import PoseNetwork, pose_quantities, rigid
-from scenefuse.depth.self_supervision import (
+from scenefuse.core.stage import StageError, value
+from scenefuse.nerf.prior import train_depth as stage
+from scenefuse.nerf.prior.consistency import align_to_points, consistency_between_views, fuse_by_inverse_variance
+from scenefuse.nerf.prior.first_depth import network_inputs
+from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
+from scenefuse.nerf.prior.pose_network import PoseNetwork, pose_quantities, rigid
+from scenefuse.nerf.prior.self_supervision import (
     minimum_reprojection,
     photometric_error,
     smoothness,
     ssim,
     warp,
 )
-from scenefuse.depth.training import Networks, Recipe, Supervision, predict, train_networks
-from scenefuse.io.maps import read_depth
-from scenefuse.stage import StageError, value
+from scenefuse.nerf.prior.training import Networks, Recipe, Supervision, predict, train_networks
+from scenefuse.photos.maps import read_depth
 
 INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])
 
@@ -289,7 +289,7 @@ def test_a_diverged_training_is_one_sentence_and_saves_nothing(tmp_path):
 
 def test_a_failed_save_does_not_end_the_training(tmp_path, uninterrupted, monkeypatch, capsys):
     photos, _, losses = uninterrupted
-    monkeypatch.setattr("scenefuse.checkpoints.SAVE_EVERY_SECONDS", 0.0)
+    monkeypatch.setattr("scenefuse.core.checkpoints.SAVE_EVERY_SECONDS", 0.0)
     monkeypatch.setattr(torch, "save", _full_disk)
     assert _train(tmp_path / "other/state.pt", photos)[1] == losses
     assert "could not be saved" in capsys.readouterr().out

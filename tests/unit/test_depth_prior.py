@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from support.textured_plane import plane_views, speckled, wrong_depths
 
-from scenefuse.depth.prior import Unconfirmed, read_prior
-from scenefuse.io.maps import write_depth
 from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.nerf.prior.prior import Unconfirmed, read_prior
+from scenefuse.photos.maps import write_depth
 
 MATCHING = RefinementSettings(match_reach_px=8.0)
 AS_IT_IS = RefinementSettings(match_reach_px=0.0)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from scenefuse.core.transforms import look_at
 from scenefuse.report.collected import Collected
 from scenefuse.report.diagnosis import diagnose, named
 from scenefuse.sfm.undistort import largest_gap
-from scenefuse.transforms import look_at
 
 GOOD = {
     "sparse.not_registered": [],

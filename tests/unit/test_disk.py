@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import Base
 
-from scenefuse.io.pictures import write_picture
-from scenefuse.io.settings import read_settings
+from scenefuse.core.settings import read_settings
+from scenefuse.photos.pictures import write_picture
 from scenefuse.report.disk import disk_line, disk_table, forecast, forecast_note, parts_of
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scenefuse.io.settings import problem
+from scenefuse.core.settings import problem
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "config").rglob("*.md")])
@@ -96,7 +96,9 @@ def test_what_is_gone_is_noticed(tmp_path):
     page = tmp_path / "page.md"
     page.write_text("# One thing\n[a](gone.md) [b](#one-thing) [c](#two-things) [d](https://example.org/x)\n")
     assert missing_links(page) == ["gone.md", "#two-things"]
-    text = "`scenefuse/gone.py`, `scenefuse/stage.py`, `results/x`; python scripts/gone.py --config config/gone.yaml"
+    text = (
+        "`scenefuse/gone.py`, `scenefuse/core/stage.py`, `results/x`; python scripts/gone.py --config config/gone.yaml"
+    )
     assert missing_paths(text) == ["scenefuse/gone.py"]
     assert missing_scripts(text) == ["scripts/gone.py"]
     assert missing_settings(text) == ["config/gone.yaml"]

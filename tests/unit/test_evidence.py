@@ -6,8 +6,11 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
-from scenefuse.fusion import evidence
-from scenefuse.fusion.evidence import (
+from scenefuse.cloud.clouds import Cloud, concatenate
+from scenefuse.core.stage import value
+from scenefuse.core.transforms import Sim3
+from scenefuse.fuse import evidence
+from scenefuse.fuse.evidence import (
     ELSEWHERE,
     ENCLOSED,
     FIELDS,
@@ -23,14 +26,11 @@ from scenefuse.fusion.evidence import (
     weigh,
     with_pose_uncertainty,
 )
-from scenefuse.fusion.fuse_object import evidence_report, fuse_by_evidence
-from scenefuse.fusion.modes import FusionSettings
-from scenefuse.fusion.photo_check import Matches, moved_photos, pack
-from scenefuse.fusion.settle import settle
-from scenefuse.fusion.visibility import Visibility
-from scenefuse.io.clouds import Cloud, concatenate
-from scenefuse.stage import value
-from scenefuse.transforms import Sim3
+from scenefuse.fuse.fuse_object import evidence_report, fuse_by_evidence
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.fuse.settle import settle
+from scenefuse.geometry.photo_check import Matches, moved_photos, pack
+from scenefuse.geometry.visibility import Visibility
 
 NOBODY = pack([])
 

@@ -9,13 +9,13 @@ import pytest
 import torch
 from support.textured_plane import plane_views
 
-from scenefuse.depth import refine_depth as feedback
-from scenefuse.depth import train_depth as depth
-from scenefuse.depth.candidates import best_candidate, score_candidates
-from scenefuse.depth.inputs import depth_photos
-from scenefuse.io.maps import read_depth, write_depth
-from scenefuse.mvs.views import chosen_by
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
+from scenefuse.nerf.prior import refine_depth as feedback
+from scenefuse.nerf.prior import train_depth as depth
+from scenefuse.nerf.prior.candidates import best_candidate, score_candidates
+from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.views import chosen_by
 
 SETTINGS = feedback.FeedbackSettings(epochs=1, batch_photos=4, warmup_epochs=1)
 DEPTH_SETTINGS = depth.DepthTrainingSettings(

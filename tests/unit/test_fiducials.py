@@ -5,10 +5,10 @@ import pycolmap
 import pytest
 from PIL import Image
 
-from scenefuse.sfm.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
-from scenefuse.sfm.survey.check_marks import check_marks
-from scenefuse.sfm.survey.lengths import read_end_clicks
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
+from scenefuse.marks.check_marks import check_marks
+from scenefuse.marks.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
+from scenefuse.marks.lengths import read_end_clicks
 
 LABELS = "label\tphoto\tx_px\ty_px\n"
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}

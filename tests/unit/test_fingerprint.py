@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from scenefuse.fingerprint import files_fingerprint, fingerprint, forget, imported_names
+from scenefuse.core.fingerprint import files_fingerprint, fingerprint, forget, imported_names
 
 
 @pytest.fixture
@@ -163,8 +163,8 @@ def new_words(source):
     [
         # Not only what runs it: the paper's recipe takes no more than a constant from it, register.py all stages.
         (
-            "scenefuse/registration/refinement.py",
-            {"register.py", "registration/register_as_paper.py", "registration/register_finely.py"},
+            "scenefuse/register/refinement.py",
+            {"register.py", "paper/register_as_paper.py", "register/register_finely.py"},
         ),
         ("scenefuse/masks/grabcut_passes.py", {"masks/make_masks.py", "pick.py"}),
         ("scripts/masks/make_masks.py", {"masks/make_masks.py"}),
@@ -177,5 +177,5 @@ def test_an_edit_changes_exactly_the_scripts_that_import_the_module_and_a_commen
 
 def test_an_edit_of_what_all_stages_share_changes_every_script(copied):
     scripts = {path.relative_to(copied / "scripts").as_posix() for path in (copied / "scripts").rglob("*.py")}
-    assert changed_by(one_more_statement, "scenefuse/stage.py", copied) == scripts
-    assert changed_by(new_words, "scenefuse/stage.py", copied) == set()
+    assert changed_by(one_more_statement, "scenefuse/core/stage.py", copied) == scripts
+    assert changed_by(new_words, "scenefuse/core/stage.py", copied) == set()

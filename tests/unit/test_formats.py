@@ -9,10 +9,10 @@ from pye57 import libe57
 from scipy.spatial.transform import Rotation
 from support.cloud_files import UTM, write_e57, write_pcd
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.io.formats import bytes_of, las_crs
-from scenefuse.io.readers.text import text_notes, text_parts
-from scenefuse.stage import StageError
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.formats import bytes_of, las_crs
+from scenefuse.cloud.readers.text import text_notes, text_parts
+from scenefuse.core.stage import StageError
 
 
 @pytest.fixture
@@ -344,8 +344,8 @@ def test_a_table_in_degrees_is_refused(tmp_path):
 
 
 def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, monkeypatch):
-    monkeypatch.setattr("scenefuse.io.readers.text.HEAD", 10)
-    monkeypatch.setattr("scenefuse.io.readers.text.LOOKED_AT", 5)
+    monkeypatch.setattr("scenefuse.cloud.readers.text.HEAD", 10)
+    monkeypatch.setattr("scenefuse.cloud.readers.text.LOOKED_AT", 5)
     points = np.random.default_rng(0).uniform(-5, 5, (25, 3)).round(3)
     np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f", header="x y z\n")
     parts = list(text_parts(tmp_path / "a.xyz", 10))

@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.io.photo_files import thin_out
-from scenefuse.sfm.frames import FrameSettings, extract_frames, original_sizes, sharpness
-from scenefuse.sfm.photos import read_photos
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.photos.frames import FrameSettings, extract_frames, original_sizes, sharpness
+from scenefuse.photos.photo_files import thin_out
+from scenefuse.photos.photos import read_photos
 
 SETTINGS = FrameSettings(frame_step=1, max_frames=0, max_width_px=64)
 

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.fusion.changes import read_changes
-from scenefuse.fusion.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fusion.modes import FusionSettings, feathered, fuse_clouds, match_colors
-from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud
-from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.core.stage import quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.fuse.changes import read_changes
+from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
+from scenefuse.fuse.modes import FusionSettings, feathered, fuse_clouds, match_colors
 
 SETTINGS = FusionSettings(mode="fill", density=1.0)
 

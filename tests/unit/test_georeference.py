@@ -6,14 +6,14 @@ import pyproj
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.io.crs import read_crs, to_wgs84
-from scenefuse.sfm.geodesy import GridFrame, LocalFrame, local_frame, scene_frame
-from scenefuse.sfm.georeference import camera_poses, georegister
-from scenefuse.sfm.photos import Photo, write_photos
-from scenefuse.sfm.survey.placement import GeoreferenceSettings, fit_level, place_by_gps
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3, rotation_angle_deg
-from scenefuse.workspace import View, write_model
+from scenefuse.cloud.crs import read_crs, to_wgs84
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3, rotation_angle_deg
+from scenefuse.georef.georeference import camera_poses, georegister
+from scenefuse.georef.placement import GeoreferenceSettings, fit_level, place_by_gps
+from scenefuse.photos.geodesy import GridFrame, LocalFrame, local_frame, scene_frame
+from scenefuse.photos.photos import Photo, write_photos
+from scenefuse.photos.workspace import View, write_model
 
 SETTINGS = GeoreferenceSettings(use_gps=True, gps_accuracy_m=2.0)
 FRAME = LocalFrame(47.37, 8.55, 430.0)

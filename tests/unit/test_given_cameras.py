@@ -14,14 +14,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
 
-from scenefuse.sfm.georeference import camera_poses
-from scenefuse.sfm.given.cameras import place_of, read_given
-from scenefuse.sfm.given.upright import stood_upright
+from scenefuse.core.stage import StageError, quantity, read_json, value
+from scenefuse.georef.georeference import camera_poses
+from scenefuse.photos.cameras.upright import stood_upright
+from scenefuse.photos.photos import write_photos
+from scenefuse.photos.posed_photos import PosedPhoto
+from scenefuse.photos.workspace import View, write_model
+from scenefuse.sfm.given_cameras import place_of, read_given
 from scenefuse.sfm.mapping import MappingSettings, map_photos
-from scenefuse.sfm.photos import write_photos
-from scenefuse.sfm.posed_photos import PosedPhoto
-from scenefuse.stage import StageError, quantity, read_json, value
-from scenefuse.workspace import View, write_model
 
 FLIGHT = fly(rows=3, columns=3)
 

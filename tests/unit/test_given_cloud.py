@@ -13,15 +13,15 @@ import pytest
 from support.cloud_files import UTM
 from support.surveyed import FRAME, MODEL_FROM_LOCAL, fly, on_earth, write_inputs
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.registration.frame_ledger import frame_ledger
-from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.sfm.georeference import camera_poses, georegister
-from scenefuse.sfm.given.cloud import import_posed_cloud
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import fit_sim3
-from scenefuse.workspace import read_views
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import fit_sim3
+from scenefuse.georef.georeference import camera_poses, georegister
+from scenefuse.georef.given_cloud import import_posed_cloud
+from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.photos.geodesy import scene_frame
+from scenefuse.photos.workspace import read_views
+from scenefuse.register.frame_ledger import frame_ledger
 
 FLIGHT = fly()
 SCALE = 2.5

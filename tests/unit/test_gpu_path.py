@@ -10,11 +10,11 @@ from support.pretend_gpu import OnGpu, PretendGpu, to_pretended
 from support.sideways_video import sideways_video
 from support.textured_plane import plane_views
 
-from scenefuse.depth.training import Recipe, optimise, predict
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.nerf import encoding
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.prior.training import Recipe, optimise, predict
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of

@@ -14,8 +14,8 @@ import yaml
 from scipy.spatial.transform import Rotation
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.mvs.views import load_views
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.object_cloud import CloudGates
 from scenefuse.nerf.render import RenderedView
@@ -23,9 +23,9 @@ from scenefuse.nerf.rendered_maps import RenderedMapSettings, measure_quality
 from scenefuse.nerf.train_nerf import TrainingOptions, train_nerf
 from scenefuse.nerf.training import NerfRecipe
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
+from scenefuse.photos.views import load_views
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
-from scenefuse.stage import StageError, read_json, value
 
 ROOT = Path(__file__).resolve().parents[2]
 LEGO = ROOT.parent / "shared/data/lego"

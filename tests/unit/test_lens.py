@@ -6,14 +6,14 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.registration.uncertainty import Uncertainty, with_bending
-from scenefuse.sfm.bundle import spread as bundle
-from scenefuse.sfm.bundle.adjustment import ROUGH_TOLERANCE, adjust
-from scenefuse.sfm.bundle.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
-from scenefuse.sfm.bundle.spread import Spread, read_spread, spread_of, write_spread
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Sim3
+from scenefuse.register.uncertainty import Uncertainty, with_bending
+from scenefuse.sfm import spread as bundle
+from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.features import read_calibration
-from scenefuse.stage import StageError
-from scenefuse.transforms import Sim3
+from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
+from scenefuse.sfm.spread import Spread, read_spread, spread_of, write_spread
 
 MIDDLE = [700.0, 500.0, 400.0, 0.0]
 

@@ -6,15 +6,14 @@ import numpy as np
 import pytest
 from support.planted import deviations, errors, plant
 
-from scenefuse.registration import refinement
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.likelihood import mixture
-from scenefuse.registration.likelihood.certain import certified
-from scenefuse.registration.likelihood.mixture import explain, most_likely, moved_about
-from scenefuse.registration.problem import Problem
-from scenefuse.registration.surface import prepare, with_queries
-from scenefuse.registration.uncertainty import Uncertainty
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import prepare, with_queries
+from scenefuse.register import mixture, refinement
+from scenefuse.register.certain import certified
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.mixture import explain, most_likely, moved_about
+from scenefuse.register.problem import Problem
+from scenefuse.register.uncertainty import Uncertainty
 
 SPACING = 0.01  # of the clouds, as a share of the object's diagonal
 OFF = np.array([0.01, -0.01, 0.01, 0, 0, 0, 0.015])

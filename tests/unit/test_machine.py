@@ -1,6 +1,6 @@
 from PIL import Image
 
-from scenefuse import machine
+from scenefuse.core import machine
 
 
 def test_memory_of_a_container_bounds_that_of_the_machine(tmp_path, monkeypatch):

@@ -14,7 +14,9 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.io.pictures import read_rgb
+from scenefuse.core.stage import StageError, read_json, sha256, value, write_json
+from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
+from scenefuse.marks.fiducials import marked_size, read_points
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.box import find_ground, upright_box
@@ -32,10 +34,8 @@ from scenefuse.masks.sam2_weights import (
 )
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.masks.target import target_from_points
-from scenefuse.mvs.visual_hull import carve, mask_iou, silhouette
-from scenefuse.sfm.fiducials import marked_size, read_points
-from scenefuse.stage import StageError, read_json, sha256, value, write_json
-from scenefuse.workspace import View, Workspace, read_model, read_workspace
+from scenefuse.photos.pictures import read_rgb
+from scenefuse.photos.workspace import View, Workspace, read_model, read_workspace
 
 WIDTH, HEIGHT, FOCAL, PHOTOS = 120, 90, 110.0, 8
 SETTINGS = MaskSettings(method="grabcut", grabcut_width_px=120, hull_voxels=40, min_photos=4, max_click_residual_px=2)

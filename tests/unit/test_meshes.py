@@ -8,9 +8,9 @@ import pytest
 from plyfile import PlyData, PlyElement
 from support.cloud_files import UTM
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.readers.meshes import MESH_POINTS
-from scenefuse.stage import StageError
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.cloud.readers.meshes import MESH_POINTS
+from scenefuse.core.stage import StageError
 
 # A roof: a large face that looks west and up, a small one that looks east.
 CORNERS = np.array([[0, 0, 0], [0, 4, 0], [4, 4, 4], [4, 0, 4], [5, 0, 0], [5, 4, 0]], dtype=np.float64)

@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.io.clouds import Cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.core.stage import quantity, read_json, write_json
+from scenefuse.core.transforms import Sim3
 from scenefuse.metrics.completion import (
     Completion,
     MetricSettings,
@@ -17,9 +19,7 @@ from scenefuse.metrics.completion import (
 from scenefuse.metrics.compute_metrics import compute_metrics
 from scenefuse.metrics.compute_scene_metrics import compute_scene_metrics
 from scenefuse.metrics.primitives import primitive_fitting_score
-from scenefuse.registration.agreement import MOST_TOGETHER, registration_metrics, self_consistency
-from scenefuse.stage import quantity, read_json, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.register.agreement import MOST_TOGETHER, registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
     variation_spacings=8.0,

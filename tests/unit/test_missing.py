@@ -10,15 +10,15 @@ import pytest
 from support.changed_scene import write_changes
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
-from scenefuse.fusion.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
-from scenefuse.fusion.missing import CONTRADICTED, NEVER_SEEN, UNTEXTURED, find_missing_surface
-from scenefuse.fusion.next_photos import Plan, plan_stations
-from scenefuse.fusion.photo_check import pack
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
-from scenefuse.workspace import View, write_model
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.fuse.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
+from scenefuse.fuse.missing import CONTRADICTED, NEVER_SEEN, UNTEXTURED, find_missing_surface
+from scenefuse.fuse.next_photos import Plan, plan_stations
+from scenefuse.geometry.photo_check import pack
+from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.workspace import View, write_model
 
 UP = np.array([0.0, 0.0, 1.0])
 NOBODY = pack([])
@@ -211,8 +211,8 @@ def test_of_a_large_scene_what_is_far_from_the_object_is_thinned(files, monkeypa
     write_cloud(inputs.scene, concatenate([own, ground[np.argsort(wide[:, 0])]]))
     write_changes(inputs.fused.parent, own, own[:0])
     for name, number in (("tiles.tiled_cloud.WHOLE", 2000), ("tiles.tiled_cloud.TILE", 500)):
-        monkeypatch.setattr(f"scenefuse.io.{name}", number)
-    monkeypatch.setattr("scenefuse.fusion.find_missing.AT_ONCE", 3000)
+        monkeypatch.setattr(f"scenefuse.cloud.{name}", number)
+    monkeypatch.setattr("scenefuse.fuse.find_missing.AT_ONCE", 3000)
     find_missing(inputs=inputs, outputs=outputs)
     found = read_json(outputs.report)
     assert value(found, "missing") == pytest.approx(value(whole, "missing"), abs=0.02) and value(found, "stations") > 0

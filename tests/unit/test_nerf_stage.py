@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 from support.painted_sphere import sphere_views
 
-from scenefuse.io.clouds import read_cloud
-from scenefuse.io.maps import read_depth, write_depth
+from scenefuse.cloud.clouds import read_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -19,7 +19,7 @@ from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, 
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.photos.maps import read_depth, write_depth
 
 ROOT = Path(__file__).resolve().parents[2]
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)

@@ -10,9 +10,11 @@ import torch
 from support.painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphere_volume
 
 import scenefuse.nerf.training as training_module
-from scenefuse import checkpoints
-from scenefuse.cores import use_threads
-from scenefuse.mvs.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others, surface_points
+from scenefuse.core import checkpoints
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others, surface_points
 from scenefuse.nerf.encoding import encode
 from scenefuse.nerf.field import EdgeRates, Field, FieldSettings
 from scenefuse.nerf.losses import LossWeights
@@ -22,8 +24,6 @@ from scenefuse.nerf.rendered_maps import psnr, silhouette_iou, ssim
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
 from scenefuse.paper import recipe
-from scenefuse.stage import StageError
-from scenefuse.transforms import Sim3
 
 
 @pytest.fixture(scope="module")

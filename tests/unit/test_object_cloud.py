@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 
-from scenefuse.io.clouds import Cloud
-from scenefuse.io.maps import write_depth, write_normals
-from scenefuse.mvs.views import Views
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import StageError
 from scenefuse.nerf.object_cloud import (
     CloudGates,
     CloudInputs,
@@ -20,7 +19,8 @@ from scenefuse.nerf.object_cloud import (
     read_maps,
     with_plane_normals,
 )
-from scenefuse.stage import StageError
+from scenefuse.photos.maps import write_depth, write_normals
+from scenefuse.photos.views import Views
 
 SETTINGS = CloudSettings(min_views=3, spacing=0.01, gates=CloudGates(point_agreement=0.02, min_component=0.02))
 

@@ -8,14 +8,14 @@ import pyproj
 import pytest
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.registration.crop.crop_cloud import CropSettings
-from scenefuse.registration.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.sfm.georeference import camera_poses, georegister
-from scenefuse.sfm.given.cloud import import_posed_cloud
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.crop.crop_cloud import CropSettings
+from scenefuse.crop.crop_scene import CropInputs, crop_scene
+from scenefuse.georef.georeference import camera_poses, georegister
+from scenefuse.georef.given_cloud import import_posed_cloud
+from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.photos.geodesy import scene_frame
 
 FLIGHT = fly()
 BESIDE = np.array([2.5, -1.5, 47.0])

@@ -15,10 +15,10 @@ from packaging.requirements import Requirement
 from support.planted import plant
 from support.user_project import planned
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.stage import StageError
+from scenefuse.core.version import VERSION
 from scenefuse.new_project import init
-from scenefuse.stage import StageError
-from scenefuse.version import VERSION
 
 ROOT = Path(__file__).resolve().parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
@@ -118,7 +118,7 @@ def test_a_wheel_holds_the_library_and_the_workflow_and_not_the_tables_of_the_de
     for folder in ("scripts", "workflow", "profiles", "envs"):
         files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
         assert {f"scenefuse/shipped/{path.relative_to(ROOT).as_posix()}" for path in files} <= held
-    assert {"scenefuse/shipped/Snakefile", "scenefuse/shipped/config/config.yaml", "scenefuse/stage.py"} <= held
+    assert {"scenefuse/shipped/Snakefile", "scenefuse/shipped/config/config.yaml", "scenefuse/core/stage.py"} <= held
     assert not [name for name in held if name.endswith("/config/objects.tsv") or name.split("/")[0] == "tests"]
 
 
@@ -147,14 +147,13 @@ def test_jobs_of_an_installed_package_run_its_own_code(installed, tmp_path):
     assert status == 0, output
     assert len(read_cloud(tmp_path / "project/results/scenes/yard/dense.ply")) == 500
     log = (tmp_path / "project/results/logs/import_scene_cloud/yard.log").read_text()
-    assert log.startswith(f"python {installed}/scenefuse/shipped/scripts/io/import_scene_cloud.py")
+    assert log.startswith(f"python {installed}/scenefuse/shipped/scripts/cloud/import_scene_cloud.py")
 
 
 def test_code_has_the_same_fingerprint_in_a_clone_and_installed(installed):
-    ask = (
-        "import sys; from pathlib import Path; from scenefuse.fingerprint import fingerprint; root = Path(sys.argv[1]);"
-    )
-    ask += "print(fingerprint(root / 'scripts/fusion/fuse_object.py', root))"
+    ask = "import sys; from pathlib import Path; from scenefuse.core.fingerprint import fingerprint;"
+    ask += "root = Path(sys.argv[1]);"
+    ask += "print(fingerprint(root / 'scripts/fuse/fuse_object.py', root))"
     found = set()
     for library, root in ((ROOT, ROOT), (installed, installed / "scenefuse/shipped")):
         command = [sys.executable, "-c", ask, root]

@@ -8,13 +8,13 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planted import plant
 
-from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.registration import paper
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.paper import agreeing, matched_scale, paper_coarse, paper_fine, register_as_paper
-from scenefuse.registration.problem import Evidence, Inputs, Problem
-from scenefuse.stage import quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3, rotation_angle_deg, rotation_between
+from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.core.stage import quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.paper import register_as_paper as paper
+from scenefuse.paper.register_as_paper import agreeing, matched_scale, paper_coarse, paper_fine, register_as_paper
+from scenefuse.register.problem import Evidence, Inputs, Problem
 
 SCALE = 2.5
 

@@ -12,13 +12,15 @@ from support.painted_sphere import CENTER, RADIUS, sphere_views
 from support.sideways_video import SHIFT_PX, sideways_video
 from support.textured_plane import plane_views
 
-from scenefuse.depth import training
-from scenefuse.depth.pose_network import small_photos
-from scenefuse.depth.refine_depth import EarlierStages
-from scenefuse.depth.training import Recipe, load_networks, optimise, predict
-from scenefuse.io.settings import ROOT, read_settings
+from scenefuse.core.settings import ROOT, read_settings
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
+from scenefuse.nerf.prior import training
+from scenefuse.nerf.prior.pose_network import small_photos
+from scenefuse.nerf.prior.refine_depth import EarlierStages
+from scenefuse.nerf.prior.training import Recipe, load_networks, optimise, predict
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import recipe
@@ -36,12 +38,9 @@ from scenefuse.paper.monocular import (
 )
 from scenefuse.paper.refine_as_paper import refine_as_paper
 from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
-from scenefuse.sfm import matches
-from scenefuse.sfm.bundle import adjustment
-from scenefuse.sfm.bundle.lens import KNOWN
-from scenefuse.stage import StageError, read_json, value
-from scenefuse.transforms import Sim3, rotation_between
-from scenefuse.workspace import View, read_workspace
+from scenefuse.photos.workspace import View, read_workspace
+from scenefuse.sfm import adjustment, matches
+from scenefuse.sfm.lens import KNOWN
 
 CPU = torch.device("cpu")
 

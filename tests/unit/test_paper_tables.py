@@ -9,19 +9,19 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.job_records import JobRecords
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.job_records import JobRecords
+from scenefuse.core.stage import quantity, value, write_json
+from scenefuse.core.transforms import Sim3, rotation_between
+from scenefuse.paper.compare_with_paper import ComparisonSettings, between_scenes, compare_with_paper
+from scenefuse.paper.paper_section import paper_section
+from scenefuse.paper.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
 from scenefuse.paper.published import OBJECTS, PUBLISHED, published
-from scenefuse.registration.agreement import registration_metrics
+from scenefuse.photos.workspace import View, write_model
+from scenefuse.register.agreement import registration_metrics
 from scenefuse.report.collected import RunInputs
-from scenefuse.report.compare_with_paper import ComparisonSettings, between_scenes, compare_with_paper
-from scenefuse.report.paper_section import paper_section
-from scenefuse.report.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
 from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report
-from scenefuse.stage import quantity, value, write_json
-from scenefuse.transforms import Sim3, rotation_between
-from scenefuse.workspace import View, write_model
 
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("house", "shed")

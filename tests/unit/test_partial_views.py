@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from scenefuse.fusion.photo_check import covering
+from scenefuse.core.transforms import Sim3
+from scenefuse.crop.vote import Masked, vote
+from scenefuse.geometry.photo_check import covering
+from scenefuse.geometry.visual_hull import Box, Outline, least_framing
 from scenefuse.masks.box import Ground
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.mvs.photo_refinement import choose_sources
-from scenefuse.mvs.visual_hull import Box, Outline, least_framing
 from scenefuse.nerf.volume import find_volume
-from scenefuse.registration.crop.vote import Masked, vote
-from scenefuse.transforms import Sim3
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 CELLS = 64
 FACADE = [((-15.0, 0.0, 0.0), (15.0, 1.0, 9.0))]

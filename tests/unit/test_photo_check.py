@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from support.photographed_plane import BLANK, photographs
 
-from scenefuse.fusion import photo_check
-from scenefuse.fusion.photo_check import match_in, moved_photos, pack, read_photos
-from scenefuse.fusion.visibility import see
-from scenefuse.io.clouds import Cloud
-from scenefuse.transforms import Sim3
-from scenefuse.workspace import Workspace
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry import photo_check
+from scenefuse.geometry.photo_check import match_in, moved_photos, pack, read_photos
+from scenefuse.geometry.visibility import see
+from scenefuse.photos.workspace import Workspace
 
 UP = np.array([0.0, 0, 1])
 

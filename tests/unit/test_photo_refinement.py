@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from support.textured_plane import plane_views, speckled, wrong_depths
 
-from scenefuse.mvs.consistency import back_project
+from scenefuse.geometry.consistency import back_project
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 
 

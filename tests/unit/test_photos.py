@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.io.photo_files import photo_files
-from scenefuse.sfm.photos import check_unchanged, gps_positions, inspect_photo, list_photos, read_photos
-from scenefuse.stage import StageError, read_json, value
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.photos.photo_files import photo_files
+from scenefuse.photos.photos import check_unchanged, gps_positions, inspect_photo, list_photos, read_photos
 
 
 def save(path, size=(40, 30), gps=None, shade=100, focal_35mm=None, orientation=None):

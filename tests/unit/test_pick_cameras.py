@@ -7,11 +7,11 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.pick.cameras import Cameras
-from scenefuse.pick.carried import OVERLAY_PX, CarriedMasks
+from scenefuse.photos.workspace import View, write_model
 from scenefuse.pick.clicks import Click
-from scenefuse.pick.pictures import Picture
-from scenefuse.workspace import View, write_model
+from scenefuse.pick.expected_place import Cameras
+from scenefuse.pick.photo_tiles import Picture
+from scenefuse.pick.workflow_masks import OVERLAY_PX, CarriedMasks
 
 ROOF = np.array([0.3, -0.2, 0.1])
 SIZES = {f"{k}.jpg": (1280, 960) for k in (1, 2, 3)}  # twice the model's photos

@@ -2,6 +2,7 @@
 
 import pytest
 
+from scenefuse.core.stage import StageError
 from scenefuse.pick.clicks import (
     Click,
     History,
@@ -16,7 +17,6 @@ from scenefuse.pick.clicks import (
     with_point,
     without_nearest,
 )
-from scenefuse.stage import StageError
 
 SIZES = {"a.jpg": (100, 50), "Füße 2.jpg": (100, 50)}
 HEAD = Click("inside", "a.jpg", 10, 20)

@@ -4,11 +4,11 @@ import unicodedata
 
 import pytest
 
+from scenefuse.core.stage import StageError
+from scenefuse.marks.fiducials import read_points
+from scenefuse.marks.lengths import read_ends
 from scenefuse.pick.clicks import Click, with_end, with_length
 from scenefuse.pick.document import Document, FileChanged
-from scenefuse.sfm.fiducials import read_points
-from scenefuse.sfm.survey.lengths import read_ends
-from scenefuse.stage import StageError
 
 HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
 TEXT = "label\tphoto\tx_px\ty_px\n"

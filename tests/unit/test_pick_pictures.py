@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scenefuse.io.photo_files import upright_size
-from scenefuse.pick.pictures import BACKGROUND, TILE_PX, Picture, Thumbnails, Tiles, read_upright
-from scenefuse.stage import StageError
+from scenefuse.core.stage import StageError
+from scenefuse.photos.photo_files import upright_size
+from scenefuse.pick.photo_tiles import BACKGROUND, TILE_PX, Picture, Thumbnails, Tiles, read_upright
 
 
 def stripes(width, height):

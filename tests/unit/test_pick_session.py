@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from support.user_project import HEADER, Project
 
+from scenefuse.core.stage import StageError, write_json
+from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
-from scenefuse.mvs.visual_hull import mask_iou
 from scenefuse.pick.clicks import Click, spoken
 from scenefuse.pick.next_run import as_text, command
-from scenefuse.pick.pictures import Picture
+from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.session import Session, thumbnails_left
-from scenefuse.stage import StageError, write_json
 
 GRABCUT = {"method": "grabcut", "max_click_residual_px": 4}
 

@@ -10,9 +10,9 @@ from support.photographed_place import HALF_ANGLE_DEG, HALF_SCALE_LOG
 from support.planted import errors
 from support.planted_photos import Plan, mapped, plant_photos, truth
 
-from scenefuse.registration.shared_features.align_models import AlignmentSettings, align_landmarks
-from scenefuse.stage import value
-from scenefuse.transforms import Sim3
+from scenefuse.core.stage import value
+from scenefuse.core.transforms import Sim3
+from scenefuse.register.shared_features.align_models import AlignmentSettings, align_landmarks
 
 SEED = 2
 TINY = Plan(kind="row", scene_photos=16, object_photos=14, alike=80, bend=0.0, noise_px=(0.1, 0.1), points=(1800, 1500))

@@ -8,16 +8,16 @@ import pycolmap
 import pytest
 import torch
 
-from scenefuse.depth.inputs import depth_photos
-from scenefuse.mvs.views import load_views
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Sim3
+from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.photos.views import load_views
+from scenefuse.photos.workspace import View
 from scenefuse.poses.bundle_adjustment import adjust_bundle, link_tracks
 from scenefuse.poses.correspondences import PhotoFeatures, TwoViewPair, find_pairs, match, two_view_depths
 from scenefuse.poses.find_poses import PoseSettings, find_poses, trajectory_error
 from scenefuse.poses.pair_scales import learn_pair_scales
 from scenefuse.poses.pose_graph import average_poses, largest_component, spanning_tree_poses
-from scenefuse.stage import StageError
-from scenefuse.transforms import Sim3
-from scenefuse.workspace import View
 
 FOCAL, WIDTH, HEIGHT = 300.0, 320, 240
 INTRINSICS = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])

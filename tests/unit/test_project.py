@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scenefuse.io.settings import problem, read_differences, schema_of, with_defaults
+from scenefuse.core.settings import problem, read_differences, schema_of, with_defaults
 from scenefuse.new_project import init
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -130,13 +130,13 @@ def test_a_test_uses_public_names_and_no_other_test_file(path):
 def test_private_uses_are_found():
     source = """
 from scenefuse.nerf import encoding
-from scenefuse.io.clouds import _spacing
-from scenefuse.mvs import views as photos
-import scenefuse.stage
+from scenefuse.cloud.clouds import _spacing
+from scenefuse.photos import views as photos
+import scenefuse.core.stage
 from test_depth import plane
-encoding._encode(photos._matte, scenefuse.stage._run)
+encoding._encode(photos._matte, scenefuse.core.stage._run)
 monkeypatch.setattr(encoding, "_encode", None)
-patch.setattr("scenefuse.stage._run", None)
+patch.setattr("scenefuse.core.stage._run", None)
 encoding.encode(photos.__name__, mine._own)
 """
     found = ["_encode", "_encode", "_matte", "_run", "_run", "_spacing", "test_depth"]

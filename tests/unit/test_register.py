@@ -10,13 +10,13 @@ import pytest
 from support.cloud_files import UTM, write_e57
 from support.planted import errors, plant
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.io.formats import las_crs
-from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.register import Known, RegistrationSettings, register_clouds
-from scenefuse.stage import StageError, read_json, value
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.formats import las_crs
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import Sim3
+from scenefuse.register.coarse import CoarseSettings
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.register import Known, RegistrationSettings, register_clouds
 from scenefuse.two_clouds.register import register
 
 ROOT = Path(__file__).resolve().parents[2]

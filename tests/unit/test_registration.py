@@ -9,24 +9,25 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planted import errors, plant
 
-from scenefuse.io.clouds import Cloud, write_cloud
-from scenefuse.io.maps import write_depth
-from scenefuse.registration.candidates import match, ransac_similarities, upright_candidates
-from scenefuse.registration.coarse import CoarseSettings, find_hypotheses, register_coarsely
-from scenefuse.registration.decision import FineSettings, tilt_deg
-from scenefuse.registration.fine import register_finely, scale_ledger
-from scenefuse.registration.frame_ledger import frame_ledger, round_trip
-from scenefuse.registration.free_space import read_free_space
-from scenefuse.registration.icp import ScaleRange, refine_planes, refine_points
-from scenefuse.registration.paper import register_as_paper
-from scenefuse.registration.problem import Alignment, Evidence, Inputs, Problem
-from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.scale import ScaleSettings, estimates, prior
-from scenefuse.registration.score import color_agreement, pair, score
-from scenefuse.registration.surface import prepare
-from scenefuse.registration.uncertainty import ALIKE, Uncertainty, alike, half_sampling
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.clouds import Cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.free_space import read_free_space
+from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
+from scenefuse.geometry.pairs import pair
+from scenefuse.geometry.surface import prepare
+from scenefuse.paper.register_as_paper import register_as_paper
+from scenefuse.photos.maps import write_depth
+from scenefuse.register.candidates import match, ransac_similarities, upright_candidates
+from scenefuse.register.coarse import CoarseSettings, find_hypotheses, register_coarsely
+from scenefuse.register.decision import FineSettings, tilt_deg
+from scenefuse.register.fine import register_finely, scale_ledger
+from scenefuse.register.frame_ledger import frame_ledger, round_trip
+from scenefuse.register.problem import Alignment, Evidence, Inputs, Problem
+from scenefuse.register.refinement import refine_hypotheses
+from scenefuse.register.scale import ScaleSettings, estimates, prior
+from scenefuse.register.score import color_agreement, score
+from scenefuse.register.uncertainty import ALIKE, Uncertainty, alike, half_sampling
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()

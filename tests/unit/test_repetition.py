@@ -8,16 +8,16 @@ import open3d as o3d
 import pytest
 from support.planted import errors
 
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.meshes import box, join, sheet
-from scenefuse.io.clouds import Cloud
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.problem import Alignment, Evidence, Problem
-from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.repetition.shifts import shifts_onto_itself
-from scenefuse.registration.surface import prepare
-from scenefuse.registration.uncertainty import Uncertainty
-from scenefuse.transforms import Sim3
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import prepare
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.problem import Alignment, Evidence, Problem
+from scenefuse.register.refinement import refine_hypotheses
+from scenefuse.register.shifts import shifts_onto_itself
+from scenefuse.register.uncertainty import Uncertainty
 
 STEP, BAY = np.array([0.3, 0.0, 0.17]), np.array([2.0, 0.0, 0.0])
 NOTHING, NARROW = Evidence(), ScaleRange(1.0, 0.1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from support.browser import chromium, click, touch
 
-from scenefuse.io.clouds import Cloud
+from scenefuse.cloud.clouds import Cloud
 from scenefuse.report.figures import VIEW_POINTS
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import merge, thin

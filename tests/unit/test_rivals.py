@@ -8,15 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.planted import errors
 
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.transforms import Sim3
 from scenefuse.demo.meshes import box, join, sheet
-from scenefuse.io.clouds import Cloud
-from scenefuse.registration.coarse import CoarseSettings, find_hypotheses
-from scenefuse.registration.decision import Decision, FineSettings, unless_torn
-from scenefuse.registration.problem import Evidence, Problem
-from scenefuse.registration.refinement import refine_hypotheses
-from scenefuse.registration.scale import ScaleSettings, estimates, prior
-from scenefuse.registration.uncertainty import Uncertainty
-from scenefuse.transforms import Sim3
+from scenefuse.register.coarse import CoarseSettings, find_hypotheses
+from scenefuse.register.decision import Decision, FineSettings, unless_torn
+from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.refinement import refine_hypotheses
+from scenefuse.register.scale import ScaleSettings, estimates, prior
+from scenefuse.register.uncertainty import Uncertainty
 
 UP, DIAGONAL = np.array([0.0, 0.0, 1.0]), 14.0
 TRUTH = Sim3(0.3, Rotation.random(random_state=1).as_matrix(), np.array([3.0, -8.0, 5.0])).inverse()

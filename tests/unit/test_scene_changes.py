@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from support.changed_scene import write_changes
 
-from scenefuse.fusion.changes import added_by, after_fusion, merged, read_changes
-from scenefuse.fusion.evidence import MEASURED, STEREO_ONLY
-from scenefuse.io.clouds import Cloud, concatenate, write_cloud
-from scenefuse.io.tiles import tiled_cloud
-from scenefuse.io.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, write_cloud
+from scenefuse.cloud.tiles import tiled_cloud
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.fuse.changes import added_by, after_fusion, merged, read_changes
+from scenefuse.fuse.evidence import MEASURED, STEREO_ONLY
 
 
 @pytest.fixture

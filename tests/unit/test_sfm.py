@@ -6,21 +6,21 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import fit_sim3
+from scenefuse.georef.georeference import camera_poses
+from scenefuse.photos.frames import FrameSettings, extract_frames
+from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
+from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
-from scenefuse.sfm.bundle.explained import doubtful_photos, explained_matches
+from scenefuse.sfm.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
-from scenefuse.sfm.frames import FrameSettings, extract_frames
-from scenefuse.sfm.geodesy import LocalFrame
-from scenefuse.sfm.georeference import camera_poses
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import match_features
 from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
-from scenefuse.sfm.photos import Photo, list_photos, read_photos, write_photos
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import fit_sim3
-from scenefuse.workspace import View, write_model
 
 PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)
 FEATURES = FeatureSettings(max_image_size_px=1000, max_features=800, first_octave=0, camera_mode="auto")

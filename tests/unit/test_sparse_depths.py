@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from scenefuse.mvs.consistency import compare
+from scenefuse.geometry.consistency import compare
 from scenefuse.mvs.sparse_depths import sparse_depths
-from scenefuse.mvs.views import Views
 from scenefuse.nerf.volume import find_volume, hidden_pixels, silhouettes
+from scenefuse.photos.views import Views
 
 WIDTH, HEIGHT, FOCAL = 200, 160, 220.0
 FIGURE = np.array([[-0.3, -0.3, 0.0], [0.3, 0.3, 1.0]])

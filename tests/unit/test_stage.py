@@ -9,12 +9,21 @@ import time
 import numpy as np
 import pytest
 
-from scenefuse.stage import StageError, atomic_directory, atomic_file, manifest, quantity, read_json, run, write_json
+from scenefuse.core.stage import (
+    StageError,
+    atomic_directory,
+    atomic_file,
+    manifest,
+    quantity,
+    read_json,
+    run,
+    write_json,
+)
 
 SCRIPT = """
 import time
 from pathlib import Path
-from scenefuse.stage import StageError, atomic_directory, run
+from scenefuse.core.stage import StageError, atomic_directory, run
 
 def stage(*, out: Path, fail: bool) -> None:
     '''Write a folder.

@@ -6,9 +6,9 @@ import cv2
 import numpy as np
 import pytest
 
+from scenefuse.geometry.votes import neighbours, vote
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.votes import neighbours, vote
-from scenefuse.workspace import View
+from scenefuse.photos.workspace import View
 
 WIDTH, HEIGHT, FOCAL = 200, 160, 180.0
 CARD, WALL = 8.0, 11.0

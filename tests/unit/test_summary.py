@@ -9,13 +9,13 @@ import pandas as pd
 import pytest
 from PIL import Image
 
-from scenefuse.job_records import JobRecords, why_unfinished
+from scenefuse.core.job_records import JobRecords, why_unfinished
+from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.report.collected import RunInputs
 from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, load, number
 from scenefuse.report.write_report import write_report
 from scenefuse.report.write_summary import write_summary
-from scenefuse.stage import StageError, quantity, write_json
 
 HEADER = "s\th:m:s\tmax_rss\tmax_vms\tmax_uss\tmax_pss\tio_in\tio_out\tmean_load\tcpu_time\n"
 

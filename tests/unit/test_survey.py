@@ -11,14 +11,14 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
-from scenefuse.sfm.geodesy import scene_frame
-from scenefuse.sfm.georeference import camera_poses, georegister
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.georef.control_file import read_control
+from scenefuse.georef.georeference import camera_poses, georegister
+from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.photos.geodesy import scene_frame
+from scenefuse.photos.photos import gps_accuracies, list_photos, read_photos
+from scenefuse.photos.positions import Position, positions_of
 from scenefuse.sfm.mapping import in_metres
-from scenefuse.sfm.photos import gps_accuracies, list_photos, read_photos
-from scenefuse.sfm.survey.control_file import read_control
-from scenefuse.sfm.survey.placement import GeoreferenceSettings
-from scenefuse.sfm.survey.positions import Position, positions_of
-from scenefuse.stage import StageError, read_json, value
 
 FLIGHT = fly()
 PLACES = np.array(

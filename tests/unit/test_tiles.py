@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
-from scenefuse.io.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
-from scenefuse.io.tiles import tiled_cloud, write_tiles
-from scenefuse.io.tiles.tiled_cloud import open_cloud
-from scenefuse.io.tiles.write_tiles import write_tiled
-from scenefuse.stage import StageError
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
+from scenefuse.cloud.tiles import tiled_cloud, write_tiles
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError
 
 LOW, HIGH = np.array([30.0, 40.0, -1.0]), np.array([36.0, 47.0, 3.0])
 

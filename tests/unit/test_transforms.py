@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from scenefuse.transforms import Sim3, fit_sim3, fit_sim3_robust, look_at, rotation_angle_deg, rotation_between
+from scenefuse.core.transforms import Sim3, fit_sim3, fit_sim3_robust, look_at, rotation_angle_deg, rotation_between
 
 
 def random_sim3(seed: int) -> Sim3:

@@ -11,17 +11,17 @@ import pycolmap
 import pytest
 from support.changed_scene import write_changes
 
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Sim3, look_at, rotation_between
 from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.io.maps import write_depth
-from scenefuse.io.pictures import read_gray
+from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
-from scenefuse.mvs.visual_hull import mask_iou
-from scenefuse.stage import StageError, quantity, read_json, value, write_json
-from scenefuse.transforms import Sim3, look_at, rotation_between
+from scenefuse.photos.maps import write_depth
+from scenefuse.photos.pictures import read_gray
 
 TRUTH_FROM_OBJECT = Sim3(
     2.5, rotation_between(np.array([0, 0, 1.0]), np.array([0.3, -0.5, 0.8])), np.array([3.0, 1, 2])

@@ -14,19 +14,19 @@ from scipy.spatial import cKDTree
 from support.cloud_files import UTM
 from support.planted import plant
 
-from scenefuse.fusion.modes import FusionSettings
-from scenefuse.io.cloud_file import EVERYWHERE, CloudFile
-from scenefuse.io.clouds import Cloud, read_cloud, spacing, write_cloud, write_laz
-from scenefuse.registration.coarse import CoarseSettings
-from scenefuse.registration.decision import FineSettings
-from scenefuse.registration.icp import ScaleRange
-from scenefuse.registration.register import Registration, RegistrationSettings, second_place
-from scenefuse.stage import StageError, quantity, read_json, value
-from scenefuse.transforms import Sim3
+from scenefuse.cloud.cloud_file import EVERYWHERE, CloudFile
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud, write_laz
+from scenefuse.core.stage import StageError, quantity, read_json, value
+from scenefuse.core.transforms import Sim3
+from scenefuse.core.version import VERSION
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.register.coarse import CoarseSettings
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.register import Registration, RegistrationSettings, second_place
 from scenefuse.two_clouds.complete import append_to_las, complete, write_completed
 from scenefuse.two_clouds.page import write_page
 from scenefuse.two_clouds.register import register
-from scenefuse.version import VERSION
 
 # Less work than shipped, where only the course of the computation matters.
 LITTLE = RegistrationSettings(
@@ -377,8 +377,8 @@ def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
 
 def in_parts(monkeypatch, rows, most):
     """Files are read so many rows at a time, and so many points of a part are held."""
-    monkeypatch.setattr("scenefuse.io.tiles.parts.AT_ONCE", rows)
-    monkeypatch.setattr("scenefuse.io.tiles.survey.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.cloud.tiles.parts.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.cloud.tiles.statistics.AT_ONCE", rows)
     monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
 
 

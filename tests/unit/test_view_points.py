@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, spacing
+from scenefuse.cloud.clouds import Cloud, spacing
+from scenefuse.core.stage import StageError
 from scenefuse.report.view.view_file import View, encode, read_view, write_view
 from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN, merge, thin, within
-from scenefuse.stage import StageError
 
 
 def square(count, seed=0, height=0.0, color=(90, 160, 70), **fields):

@@ -5,12 +5,12 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.depth.crops import crop_to_object
+from scenefuse.core.stage import StageError
+from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.mvs.view_selection import select_views
-from scenefuse.mvs.views import load_views, scales
-from scenefuse.mvs.visual_hull import Outline, count_silhouettes
-from scenefuse.stage import StageError
-from scenefuse.workspace import View, read_workspace
+from scenefuse.nerf.prior.crops import crop_to_object
+from scenefuse.photos.views import load_views, scales
+from scenefuse.photos.workspace import View, read_workspace
 
 WIDTH, HEIGHT, FOCAL = 80, 60, 70.0
 POINTS = np.random.default_rng(0).uniform([-1, -1, 9], [1, 1, 11], (40, 3))

@@ -8,17 +8,17 @@ import pycolmap
 import pytest
 from support.changed_scene import write_changes
 
-from scenefuse.io.clouds import Cloud, read_cloud, write_cloud
-from scenefuse.io.maps import write_depth
-from scenefuse.io.sheets import save_png
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, write_json
+from scenefuse.core.transforms import Sim3
+from scenefuse.photos.maps import write_depth
+from scenefuse.photos.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, draw_scene
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
 from scenefuse.report.view.view_file import read_view
 from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import AFTER, BOTH
 from scenefuse.report.view.view_scene import view_scene
-from scenefuse.stage import StageError, quantity, write_json
-from scenefuse.transforms import Sim3
 
 GREEN, RED, BLUE = (0, 200, 0), (220, 0, 0), (0, 0, 220)
 

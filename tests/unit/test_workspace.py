@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 import pytest
 
-from scenefuse.stage import StageError
-from scenefuse.workspace import View, read_workspace, write_model
+from scenefuse.core.stage import StageError
+from scenefuse.photos.workspace import View, read_workspace, write_model
 
 POINTS = np.array([[0.1, -0.2, 4.0], [0.4, 0.3, 5.0], [-0.5, 0.1, 6.0], [0.0, 0.0, -3.0], [9.0, 0.0, 4.0]])
 

@@ -1,5 +1,5 @@
 # Inputs of structure from motion: the photos that the tables name.
-from scenefuse.io.photo_files import frame_name, thin_out
+from scenefuse.photos.photo_files import frame_name, thin_out
 
 
 def photos_of(row, who):
@@ -90,8 +90,8 @@ def check_survey(scene):
     own = {column: Path(f) for column, f in files.items() if not made_here(f)}
     if own and not made_here(row["photos"]):
         # Takes long to import, and most scenes have no survey.
-        from scenefuse.sfm.photos import photo_names
-        from scenefuse.sfm.survey.check import check_files
+        from scenefuse.photos.photos import photo_names
+        from scenefuse.georef.check import check_files
 
         try:
             check_files(photo_names(Path(row["photos"])), **own)
@@ -107,7 +107,7 @@ def crs_of(scene):
     row = scene_row(scene)
     if not row.get("crs"):
         return {}
-    from scenefuse.io.crs import projected_crs
+    from scenefuse.cloud.crs import projected_crs
 
     try:
         where = f"{config['scenes']}, scene '{scene}', column crs"
@@ -141,7 +141,7 @@ def cloud_to_lie_on(wildcards):
 @cache
 def check_cloud_crs(scene, file):
     """Stop before hours of mapping where a cloud on which photos are to be laid names no CRS, or one in degrees."""
-    from scenefuse.sfm.survey.on_cloud import cloud_crs
+    from scenefuse.georef.on_cloud import cloud_crs
 
     try:
         cloud_crs(Path(file), crs_of(scene).get("crs"))
@@ -186,7 +186,7 @@ def names_in(folder, where):
 @cache
 def check_clicks(name, column):
     """Stop before hours of work where prompts or fiducials cannot be read, or are in photos that will not be used."""
-    from scenefuse.sfm.survey.check_marks import check_marks
+    from scenefuse.marks.check_marks import check_marks
 
     row, used = object_row(name), None
     if column == "prompts":
@@ -215,8 +215,8 @@ def check_lengths(name):
     photos = object_row(name)["photos"]
     for file in own_file("object", name, "lengths"):
         if Path(photos).is_dir() and not made_here(file):
-            from scenefuse.sfm.photos import photo_names
-            from scenefuse.sfm.survey.check import check_files
+            from scenefuse.photos.photos import photo_names
+            from scenefuse.georef.check import check_files
 
             try:
                 names = [frame_name(photo) for photo in photo_names(Path(photos))]

@@ -36,8 +36,8 @@ rule import_scene_cloud:
         source=cloud_path("scene"),
         crs=crs_flag,
         files=state_of(cloud_of("scene")),
-        script=script("io/import_scene_cloud.py"),
-        code=code("io/import_scene_cloud.py"),
+        script=script("cloud/import_scene_cloud.py"),
+        code=code("cloud/import_scene_cloud.py"),
     message:
         "Scene {wildcards.scene}: cloud of the table"
     shell:
@@ -66,8 +66,8 @@ rule import_object_cloud:
     params:
         source=cloud_path("object"),
         files=state_of(cloud_of("object")),
-        script=script("io/import_object_cloud.py"),
-        code=code("io/import_object_cloud.py"),
+        script=script("cloud/import_object_cloud.py"),
+        code=code("cloud/import_object_cloud.py"),
     message:
         "{wildcards.object}: cloud of the table"
     shell:
@@ -102,8 +102,8 @@ rule import_posed_scene_cloud:
         place=options_of("sparse", "sparse_json", "georeference_json"),
         crs=lambda wildcards: crs_flag(wildcards) if lies_on_cloud(wildcards) else "",
         files=state_of(cloud_of("scene")),
-        script=script("sfm/import_posed_cloud.py"),
-        code=code("sfm/import_posed_cloud.py"),
+        script=script("georef/import_posed_cloud.py"),
+        code=code("georef/import_posed_cloud.py"),
     message:
         "Scene {wildcards.scene}: cloud of the table, with its photos"
     shell:
@@ -136,7 +136,7 @@ use rule import_posed_scene_cloud as import_posed_object_cloud with:
         place=options_of("sparse", "sparse_json", "workspace", "masks"),
         crs="",
         files=state_of(cloud_of("object")),
-        script=script("sfm/import_posed_cloud.py"),
-        code=code("sfm/import_posed_cloud.py"),
+        script=script("georef/import_posed_cloud.py"),
+        code=code("georef/import_posed_cloud.py"),
     message:
         "{wildcards.object}: cloud of the table, among its cameras"

@@ -10,12 +10,12 @@ from pathlib import Path
 from snakemake.exceptions import WorkflowError
 from snakemake.output_index import OutputIndex
 
-from scenefuse.fingerprint import files_fingerprint, fingerprint
-from scenefuse.io.project import read_project
-from scenefuse.io.settings import PACKAGE, ROOT as SHIPPED
-from scenefuse.machine import has_gpu, megapixels, memory_mb
-from scenefuse.io.photo_files import GEO_FILE, camera_files, photo_files
-from scenefuse.stage import StageError
+from scenefuse.core.fingerprint import files_fingerprint, fingerprint
+from scenefuse.marks.project import read_project
+from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
+from scenefuse.core.machine import has_gpu, megapixels, memory_mb
+from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
+from scenefuse.core.stage import StageError
 
 # The folder above workflow/; where another workflow has fetched this one from the web, that of the installed library.
 if workflow.modifier.path_modifier.replace_prefix("results") != "results":

@@ -43,8 +43,8 @@ rule train_depth:
         ),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
-        script=script("depth/train_depth.py"),
-        code=code("depth/train_depth.py"),
+        script=script("nerf/train_depth.py"),
+        code=code("nerf/train_depth.py"),
     message:
         "{wildcards.object}: stage 1, depth and pose networks"
     shell:
@@ -81,8 +81,8 @@ rule refine_depth:
         options=settings("object.stage3", "object.hold_out_every"),
         checkpoints="results/checkpoints/{object}/stage3",
         seed=config["seed"],
-        script=script("depth/refine_depth.py"),
-        code=code("depth/refine_depth.py"),
+        script=script("nerf/refine_depth.py"),
+        code=code("nerf/refine_depth.py"),
     message:
         "{wildcards.object}: stage 3, feedback"
     shell:

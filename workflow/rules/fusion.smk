@@ -39,8 +39,8 @@ rule fuse_object:
     params:
         options=settings("fusion"),
         photos=options_of("object_workspace", "scene_workspace"),
-        script=script("fusion/fuse_object.py"),
-        code=code("fusion/fuse_object.py"),
+        script=script("fuse/fuse_object.py"),
+        code=code("fuse/fuse_object.py"),
     message:
         "{wildcards.object}: fusion"
     shell:
@@ -80,8 +80,8 @@ rule find_missing:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         photos=options_of("object_workspace", "scene_workspace", "masks"),
-        script=script("fusion/find_missing.py"),
-        code=code("fusion/find_missing.py"),
+        script=script("fuse/find_missing.py"),
+        code=code("fuse/find_missing.py"),
     message:
         "{wildcards.object}: what is still missing"
     shell:
@@ -114,8 +114,8 @@ rule complete_scene:
         runtime=by_size(60, scene=0.05),
     params:
         objects=object_folders,
-        script=script("fusion/complete_scene.py"),
-        code=code("fusion/complete_scene.py"),
+        script=script("fuse/complete_scene.py"),
+        code=code("fuse/complete_scene.py"),
     message:
         "Scene {wildcards.scene}: all objects in it"
     shell:
@@ -142,7 +142,7 @@ use rule complete_scene as complete_scene_with_object with:
         "results/benchmarks/complete_scene_with_object/{object}.tsv"
     params:
         objects=lambda wildcards: f"results/objects/{wildcards.object}",
-        script=script("fusion/complete_scene.py"),
-        code=code("fusion/complete_scene.py"),
+        script=script("fuse/complete_scene.py"),
+        code=code("fuse/complete_scene.py"),
     message:
         "{wildcards.object}: the scene with it"

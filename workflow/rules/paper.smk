@@ -214,8 +214,8 @@ use rule register_as_paper as register_variant_as_paper with:
         options=scale_of_paper,
         gravity=options_of("workspace_json"),
         seed=config["seed"],
-        script=script("registration/register_as_paper.py"),
-        code=code("registration/register_as_paper.py"),
+        script=script("paper/register_as_paper.py"),
+        code=code("paper/register_as_paper.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: registration by the paper's recipe"
 
@@ -255,8 +255,8 @@ rule compare_with_paper:
         options=flags(config["evaluation"]["paper"]),
         files=state_of_compared,
         seed=config["seed"],
-        script=script("report/compare_with_paper.py"),
-        code=code("report/compare_with_paper.py"),
+        script=script("paper/compare_with_paper.py"),
+        code=code("paper/compare_with_paper.py"),
     message:
         "Summary: the paper's tables"
     shell:

@@ -38,8 +38,8 @@ rule align_models:
     params:
         options=settings("registration.alignment"),
         seed=config["seed"],
-        script=script("registration/align_models.py"),
-        code=code("registration/align_models.py"),
+        script=script("register/align_models.py"),
+        code=code("register/align_models.py"),
     message:
         "{wildcards.object}: alignment from shared features"
     shell:
@@ -71,9 +71,9 @@ rule crop_scene:
     params:
         options=crop_options,
         model=options_of("sparse"),
-        script=script("registration/crop_scene.py"),
+        script=script("crop/crop_scene.py"),
         files=state_of(crop_inputs),
-        code=code("registration/crop_scene.py"),
+        code=code("crop/crop_scene.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: crop"
     shell:
@@ -106,8 +106,8 @@ rule register_coarsely:
         options=variant_options("scale", "coarse"),
         gravity=options_of("workspace_json"),
         seed=config["seed"],
-        script=script("registration/register_coarsely.py"),
-        code=code("registration/register_coarsely.py"),
+        script=script("register/register_coarsely.py"),
+        code=code("register/register_coarsely.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: scale and coarse registration"
     shell:
@@ -156,8 +156,8 @@ rule register_finely:
             "alignment_json", "object_spread", "scene_spread", "workspace", "depth"
         ),
         seed=config["seed"],
-        script=script("registration/register_finely.py"),
-        code=code("registration/register_finely.py"),
+        script=script("register/register_finely.py"),
+        code=code("register/register_finely.py"),
     message:
         "{wildcards.object}, variant {wildcards.variant}: fine registration"
     shell:
@@ -199,8 +199,8 @@ rule register_as_paper:
         options="--scale rms",
         gravity=options_of("workspace_json"),
         seed=config["seed"],
-        script=script("registration/register_as_paper.py"),
-        code=code("registration/register_as_paper.py"),
+        script=script("paper/register_as_paper.py"),
+        code=code("paper/register_as_paper.py"),
     message:
         "{wildcards.object}: registration by the paper's recipe"
     shell:

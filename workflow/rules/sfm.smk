@@ -33,9 +33,9 @@ rule list_photos:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         folder=scene_folder,
-        script=script("sfm/list_photos.py"),
+        script=script("photos/list_photos.py"),
         files=state_of(scene_photos),
-        code=code("sfm/list_photos.py"),
+        code=code("photos/list_photos.py"),
     message:
         "Scene {wildcards.scene}: checking the photos"
     shell:
@@ -61,9 +61,9 @@ rule extract_frames:
     params:
         source=object_source,
         options=settings("object.frames"),
-        script=script("sfm/extract_frames.py"),
+        script=script("photos/extract_frames.py"),
         files=state_of(object_photos),
-        code=code("sfm/extract_frames.py"),
+        code=code("photos/extract_frames.py"),
     message:
         "{wildcards.object}: frames"
     shell:
@@ -287,8 +287,8 @@ rule georegister:
         files=state_of(survey_of),
         scan=state_of(cloud_to_lie_on),
         seed=config["seed"],
-        script=script("sfm/georegister.py"),
-        code=code("sfm/georegister.py"),
+        script=script("georef/georegister.py"),
+        code=code("georef/georegister.py"),
     message:
         "Scene {wildcards.scene}: georeferencing"
     shell:

@@ -13,11 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.io.clouds import Cloud, plane_normals, read_cloud, write_cloud
+from scenefuse.cloud.clouds import Cloud, plane_normals, read_cloud, write_cloud
+from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
+from scenefuse.core.transforms import Array
 from scenefuse.report.render import point_radii
 from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH
-from scenefuse.stage import StageError, quantity, read_json, threads, value, write_json
-from scenefuse.transforms import Array
 
 Bytes = NDArray[np.uint8]
 

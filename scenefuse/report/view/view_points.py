@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, concatenate, occupied_voxels, voxel_downsample
-from scenefuse.transforms import Array
+from scenefuse.cloud.clouds import Cloud, concatenate, occupied_voxels, voxel_downsample
+from scenefuse.core.transforms import Array
 
 BOTH, BEFORE, AFTER = 0, 1, 2
 REMOVED, UNKNOWN = 255, 255

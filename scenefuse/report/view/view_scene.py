@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.io.clouds import Cloud, concatenate
-from scenefuse.io.tiles.tiled_cloud import TiledCloud, open_cloud
-from scenefuse.io.units import length_unit
+from scenefuse.cloud.clouds import Cloud, concatenate
+from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.core.stage import read_json, value
+from scenefuse.core.transforms import Array
+from scenefuse.core.units import length_unit
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
-from scenefuse.stage import read_json, value
-from scenefuse.transforms import Array
 
 VIEW_POINTS = 250_000
 """Of a scene's view; see the note at that of an object."""

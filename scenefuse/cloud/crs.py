@@ -1,0 +1,169 @@
+"""Coordinate reference systems as survey files name them, and their way to WGS84."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
+
+# OpenDroneMap's way to name a UTM zone.
+UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
+# A CRS is used so far beyond its area at most, in degrees: one UTM zone.
+BEYOND_DEG = 6.0
+# Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
+NEAR_ZERO = 10_000.0
+
+
+def read_crs(text: str, where: str) -> pyproj.CRS:
+    """The CRS of a header: `EPSG:25832`, with heights `EPSG:25832+7837`, `WGS84 UTM 32N`, or a PROJ string.
+
+    Raises:
+        StageError: `text` names none, or what `usable` says.
+    """
+    crs = _named(text)
+    if crs is None:
+        raise StageError(
+            f"{where} begins with '{text.strip()[:60]}', which names no coordinate reference system; write one in the"
+            " first line: EPSG:25832, with heights EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
+        )
+    return usable(crs, where)
+
+
+def projected_crs(text: str, where: str, heights: bool) -> pyproj.CRS:
+    """The projected CRS that a cell of a table names, as `read_crs` has it; with heights of its own only if `heights`.
+
+    Raises:
+        StageError: `text` names none, one in degrees, or one with heights where there may be none.
+    """
+    crs = _named(text)
+    if crs is None:
+        raise StageError(
+            f"{where}: '{text.strip()[:60]}' names no coordinate reference system; write EPSG:25832, with heights"
+            " EPSG:25832+7837, WGS84 UTM 32N, or a PROJ string"
+        )
+    crs = usable(crs, where)
+    if not plane(crs).is_projected:
+        raise StageError(f"{where}: {crs.name} is in degrees; name a projected one, a UTM zone for instance")
+    if crs.is_compound and not heights:
+        raise StageError(
+            f"{where}: heights of GPS are not those of {crs.name}; name its plane alone, {plane(crs).to_string()}, or"
+            " give control points with such heights"
+        )
+    return crs
+
+
+def _named(text: str) -> pyproj.CRS | None:
+    """The CRS that a text names, if it does."""
+    zone = UTM.fullmatch(text.strip())
+    code = f"EPSG:{(32600 if zone[2].upper() == 'N' else 32700) + int(zone[1])}" if zone else text.strip()
+    try:
+        return pyproj.CRS.from_user_input(code)
+    except pyproj.exceptions.CRSError:
+        return None
+
+
+def usable(crs: pyproj.CRS, where: str) -> pyproj.CRS:
+    """A CRS as its register has it, where it does.
+
+    Raises:
+        StageError: its heights have another unit than its plane, it is neither projected nor geographic, or its axes
+            are a mirror image of east and north.
+    """
+    crs = registered(crs)
+    if [axis.direction for axis in plane(crs).axis_info[:2]] == ["south", "west"]:
+        raise StageError(
+            f"{where}: the axes of the CRS {crs.name} point south and west, a mirror image of the ground; name its"
+            " variant with axes to the east and north, EPSG:5514 for EPSG:5513"
+        )
+    units = {axis.unit_name for axis in crs.axis_info}
+    if plane(crs).is_projected and len(units) > 1:
+        raise StageError(
+            f"{where}: the CRS {crs.name} counts {' and '.join(sorted(units))}; give heights in the unit of the plane"
+        )
+    if not (plane(crs).is_projected or plane(crs).is_geographic):
+        raise StageError(
+            f"{where}: the CRS {crs.name} is neither projected nor geographic; give coordinates in such a one"
+        )
+    return crs
+
+
+def registered(crs: pyproj.CRS) -> pyproj.CRS:
+    """A CRS as its register has it, where it does: older WKT does not say where it is used."""
+    # Older WKT names a way to WGS84 as well; for a CRS of its register PROJ knows better ones.
+    known = (crs.source_crs if crs.is_bound and crs.source_crs is not None else crs).to_epsg()
+    return crs if known is None else pyproj.CRS.from_epsg(known)
+
+
+def plane(crs: pyproj.CRS) -> pyproj.CRS:
+    """The horizontal part of a CRS."""
+    return crs.sub_crs_list[0] if crs.is_compound else crs
+
+
+def unit_m(crs: pyproj.CRS) -> float:
+    """Metres in the unit of a CRS's heights, which is that of its plane too where it is projected."""
+    axes = crs.axis_info if len(crs.axis_info) > 2 else [] if plane(crs).is_geographic else crs.axis_info
+    return float(axes[-1].unit_conversion_factor) if axes else 1.0
+
+
+def grid_name(crs: pyproj.CRS) -> str:
+    """What `LocalFrame.grid` calls a projected CRS; "" for a geographic one, whose points go into a UTM zone."""
+    return "" if plane(crs).is_geographic else crs.to_string()
+
+
+def to_wgs84(crs: pyproj.CRS, points: Array, where: str) -> Array:
+    """(N, 3) x (easting or longitude), y, height to (N, 3) WGS84 latitude (deg), longitude (deg), height (m).
+
+    Heights keep their zero: they are only brought into metres. NaN stays NaN.
+
+    Raises:
+        StageError: points that lie nowhere near the area of the CRS, with a guess where the axes are swapped.
+    """
+    found = check_in_area(crs, points, where)
+    return np.column_stack([found[:, ::-1], points[:, 2] * unit_m(crs)])
+
+
+def check_place(crs: str, points: Array, source: Path) -> None:
+    """StageError where the middle of a file's points (N, 3) lies far from where their projected CRS is used; near the
+    CRS's zero, where it lies outside at all."""
+    known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
+    if known.is_projected:
+        middle = np.median(points, axis=0)
+        beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
+        check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)
+
+
+def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = BEYOND_DEG) -> Array:
+    """(N, 2) longitude, latitude of points (N, 3) in a CRS, so far beyond its area at most; StageError as of
+    `to_wgs84`."""
+    found = _in_degrees(crs, points[:, :2])
+    strange = ~_in_area(crs, found, beyond_deg)
+    if strange.any():
+        row = int(np.flatnonzero(strange)[0])
+        swapped = _in_area(crs, _in_degrees(crs, points[:, 1::-1]), beyond_deg).all()
+        advice = "x and y are swapped: x is easting or longitude" if swapped else "correct the CRS or the coordinates"
+        raise StageError(
+            f"{where}: {points[row, 0]:.12g} {points[row, 1]:.12g} does not lie in {crs.name}"
+            f" ({strange.sum()} of {len(points)} points); {advice}"
+        )
+    return found
+
+
+def _in_degrees(crs: pyproj.CRS, points: Array) -> Array:
+    """(N, 2) longitude, latitude; infinite where there is none."""
+    transformer = pyproj.Transformer.from_crs(plane(crs), "EPSG:4326", always_xy=True)
+    return np.column_stack(transformer.transform(points[:, 0], points[:, 1]))
+
+
+def _in_area(crs: pyproj.CRS, degrees: Array, beyond_deg: float) -> np.ndarray:
+    """(N,) whether longitude, latitude exist and lie in the area of the CRS or near it."""
+    longitude, latitude = degrees.T
+    good = np.isfinite(degrees).all(1) & (np.abs(latitude) <= 90) & (np.abs(longitude) <= 360)
+    area = plane(crs).area_of_use
+    if area is None:
+        return good
+    good &= (latitude >= area.south - beyond_deg) & (latitude <= area.north + beyond_deg)
+    wide = (area.east - area.west) % 360 or 360.0  # an area may lie on both sides of the antimeridian
+    return np.asarray(good & ((longitude - area.west + beyond_deg) % 360 <= wide + 2 * beyond_deg))

@@ -1,0 +1,247 @@
+"""A user's cloud or mesh in the place of photos: a scene's dense cloud, or an object's."""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cloud.clouds import (
+    Cloud,
+    cloud_of,
+    coincidence_note,
+    concatenate,
+    has_unit_normals,
+    precision_note,
+    spacing,
+    without_strays,
+    write_cloud,
+)
+from scenefuse.cloud.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees, las_crs, las_dimensions
+from scenefuse.cloud.readers.columns import Columns
+from scenefuse.cloud.readers.text import text_notes
+from scenefuse.cloud.tiles.parts import columns_in_parts
+from scenefuse.cloud.tiles.statistics import Survey, survey
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.core.stage import StageError, quantity, write_json
+from scenefuse.core.transforms import Array, Sim3
+
+# Fewer different points give no features to register by.
+LEAST_POINTS = 200
+# Among so many points they are looked for before they are counted among all.
+ENOUGH = 10_000
+# Positions below this share of the points, and above the same share, are strays: they do not move the origin.
+STRAY_PERCENT = 1.0
+# What `backend` says of a scene's cloud that was not made here.
+IMPORTED = "imported"
+
+
+def import_scene_cloud(
+    *, source: Path, crs: str | None = None, cloud: Path, report: Path, georeference_json: Path
+) -> None:
+    """Take a cloud for a scene. The scene's frame has its axes, and z is up; its origin is near the points.
+
+    Args:
+        source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.
+        crs: of its coordinates, where the file does not say it.
+        cloud: output PLY in the scene's frame, tile by tile (`open_cloud`), with classes and intensities of LAS;
+            however large, it is never all in memory.
+        report: output JSON: points, spacing, notes.
+        georeference_json: output JSON: `crs` (null where the file names none), `length_unit`, `origin_in_crs` and
+            `crs_from_scene`, the shift back into the file's coordinates.
+
+    Raises:
+        StageError: the file is missing, damaged, in degrees, of an unknown ending, not where its CRS is used, in
+            another CRS than `crs`, or has too few different points.
+    """
+    file = ImportedFile.of(source, LAS_DIMENSIONS)
+    sample = file.survey.sample
+    check_not_degrees(source, sample)
+    crs = crs_of(source, crs)
+    unit, name = "scene units", None
+    if crs is not None:
+        import pyproj
+
+        from scenefuse.cloud.crs import check_place, usable
+
+        usable(pyproj.CRS.from_user_input(crs), str(source))
+        unit, name = unit_and_name(crs)
+        check_place(crs, sample, source)
+    origin = near_origin(sample)
+    shift = Sim3(1.0, np.eye(3), origin)
+    content = file.write(cloud, lambda part: part.transformed(shift.inverse()), unit)
+    write_json(report, content | {"backend": quantity(IMPORTED, "")})
+    place = {
+        "length_unit": quantity(unit, ""),
+        "crs": quantity(name, ""),
+        "origin_in_crs": quantity(origin, unit),
+        "crs_from_scene": quantity(shift.matrix, unit),
+    }
+    write_json(georeference_json, place)
+
+
+def crs_of(source: Path, said: str | None) -> str | None:
+    """The CRS of a file: its own, or the one that a user says, perhaps with heights that the file does not know."""
+    known = las_crs(source)
+    if said is None:
+        return known
+    import pyproj
+
+    from scenefuse.cloud.crs import plane, projected_crs, registered
+
+    crs = projected_crs(said, f"the column crs for {source.name}", heights=True)
+    own = None if known is None else registered(pyproj.CRS.from_wkt(known))
+    if own is not None and (plane(own) != plane(crs) or (own.is_compound and own != crs)):
+        raise StageError(f"{source} is in {own.name}, but the column crs says {crs.name}; empty that cell")
+    return str(crs.to_string())
+
+
+def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
+    """Take a cloud for an object, in any frame and unit.
+
+    Args:
+        source: as of `import_scene_cloud`.
+        cloud: output PLY; the file's axes and unit, relative to an origin near the points.
+        report: output JSON: points, spacing, notes, and the shift `object_from_file`.
+
+    Raises:
+        StageError: as of `import_scene_cloud`.
+    """
+    file = ImportedFile.of(source)
+    check_not_degrees(source, file.survey.sample)
+    whole, notes = without_strays(concatenate(list(file.clouds())), source.name)
+    origin = near_origin(whole.points)
+    placed = replace(whole, points=whole.points - origin)
+    write_cloud(cloud, placed)
+    shift = Sim3(1.0, np.eye(3), -origin)
+    notes += coincidence_note(source, placed.points)
+    content = file.report(spacing(placed.points), placed.diagonal, "object units", notes)
+    content["points"] = quantity(len(placed), "1")
+    write_json(report, content | {"object_from_file": quantity(shift.matrix, "object units")})
+
+
+def near_origin(points: Array) -> Array:
+    """A round place (3,) near points (N, 3): their middle, rounded to the next power of ten above their extent.
+
+    Relative to it, float32 is a hundredth of a millimetre in a hundred metres. Points near zero keep their coordinates.
+    """
+    low, middle, high = np.percentile(points, [STRAY_PERCENT, 50, 100 - STRAY_PERCENT], axis=0)
+    step = 10.0 ** np.ceil(np.log10(max(float((high - low).max()), 1e-12)))
+    return np.asarray(np.round(middle / step) * step + 0.0)
+
+
+@dataclass(frozen=True)
+class ImportedFile:
+    """A file whose points are taken over.
+
+    Attributes:
+        survey: what is known of all its points.
+        unit_normals: whether there are normals, all of unit length; None where there are none.
+        kept: names of further columns that are taken over.
+        unused: names of further columns.
+    """
+
+    survey: Survey
+    unit_normals: bool | None
+    kept: tuple[str, ...]
+    unused: list[str]
+
+    @classmethod
+    def of(cls, source: Path, keep: Collection[str] = (), degrees: bool = False) -> "ImportedFile":
+        """Go through a file once.
+
+        Args:
+            source: the file.
+            keep: dimensions of LAS to take over, where the file says something by them.
+            degrees: whether LAS and LAZ may be in degrees.
+
+        Raises:
+            StageError: it is missing, damaged, of an unknown ending, or has too few different points.
+        """
+        unit_normals, said, names = None, set[str](), set[str]()
+
+        def look(_: Columns, surface: Columns) -> None:
+            nonlocal unit_normals
+            part = cloud_of(surface)
+            names.update(part.fields)
+            said.update(name for name in {*keep} - said if name in part.fields and part.fields[name].any())
+            if part.normals is not None:
+                unit_normals = unit_normals is not False and has_unit_normals(part)
+
+        whole = survey(source, columns_in_parts(source, degrees), look)
+        different = len(np.unique(whole.sample[:: max(1, len(whole.sample) // ENOUGH)], axis=0))
+        if different < LEAST_POINTS and (different := len(np.unique(whole.sample, axis=0))) < LEAST_POINTS:
+            raise StageError(
+                f"{source} has only {different} different positions among its {whole.count} points; {LEAST_POINTS} or"
+                " more are needed to place it"
+            )
+        own = set(LAS_DIMENSIONS) if whole.is_las else set[str]()
+        unused = (names - own | set(las_dimensions(source))) - own.intersection(keep) - {WITHHELD, ""}
+        return cls(whole, unit_normals, tuple(sorted(said & own)), sorted(unused))
+
+    def clouds(self) -> Iterator[Cloud]:
+        """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
+        for columns in self.survey.columns():
+            cloud = cloud_of(self.survey.surface(columns), self.survey.most_color)
+            normals = None
+            if self.unit_normals and cloud.normals is not None:
+                normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
+            colors = None if self.survey.most_color is None else cloud.colors
+            yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in self.kept})
+
+    def write(self, cloud: Path, move: Callable[[Cloud], Cloud], unit: str) -> dict[str, Any]:
+        """Write the points in another frame, tile by tile; the report of it.
+
+        Args:
+            cloud: output PLY.
+            move: from the file's frame into another.
+            unit: of lengths in that frame.
+        """
+
+        def placed() -> Iterator[Cloud]:
+            return map(move, self.clouds())
+
+        write_tiled(cloud, placed, self.survey.count, move(Cloud(self.survey.sample)).points)
+        tiles = open_cloud(cloud)
+        same = coincidence_note(self.survey.path, np.concatenate(tiles.samples()))
+        return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit, same)
+
+    def report(self, step: float, diagonal: float, unit: str, more: Sequence[str] = ()) -> dict[str, Any]:
+        """What was taken over, and what became of the rest; printed too.
+
+        Args:
+            step: distance between neighbouring points.
+            diagonal: of the points' box.
+            unit: of both.
+            more: further notes.
+        """
+        source = self.survey.path
+        notes = [f"{count} {why} were left out" for why, count in self.survey.left_out.items() if count]
+        notes += [*more, *text_notes(source), *precision_note(source, self.survey.sample, step)]
+        if self.unit_normals is False:
+            notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
+        if self.unused:
+            notes.append(f"not taken over, and so not in the results: {', '.join(self.unused)}")
+        for note in notes:
+            print(note, flush=True)
+        return {
+            "points": quantity(self.survey.count, "1"),
+            "spacing": quantity(step, unit),
+            "diagonal": quantity(diagonal, unit),
+            "source": quantity(source.name, ""),
+            "columns_not_used": quantity(self.unused, ""),
+            "has_colors": quantity(self.survey.most_color is not None, ""),
+            "has_normals": quantity(bool(self.unit_normals), ""),
+            "notes": quantity(notes, ""),
+        }
+
+
+def unit_and_name(crs: str) -> tuple[str, str]:
+    """The unit of a projected CRS, "m" for metres, and its name: an EPSG code where it has one, else its WKT."""
+    import pyproj
+
+    known = pyproj.CRS.from_user_input(crs)
+    unit = known.axis_info[0].unit_name if known.axis_info else "metre"
+    return "m" if unit in ("metre", "meter") else unit, known.to_string()

@@ -1,0 +1,100 @@
+"""Settings files: laid over the shipped ones, checked against the schema, and turned into the stages' dataclasses."""
+
+import dataclasses
+import difflib
+import functools
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeVar, get_type_hints
+
+import jsonschema
+import yaml
+
+from scenefuse.core.stage import StageError
+
+PACKAGE = Path(__file__).resolve().parents[1]
+SHIPPED = PACKAGE / "shipped"
+ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
+"""Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's."""
+T = TypeVar("T")
+
+
+def merge(base: Any, over: Any) -> Any:
+    """`base` with the keys of `over` laid over it, at every depth."""
+    if not (isinstance(base, dict) and isinstance(over, dict)):
+        return over
+    return base | {key: merge(base.get(key), value) for key, value in over.items()}
+
+
+@functools.cache
+def schema_of(name: str) -> dict[str, Any]:
+    """The JSON schema of `config`, or of a row of `scenes` or `objects`."""
+    return yaml.load(
+        (ROOT / f"workflow/schemas/{name}.schema.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+    )
+
+
+def problem(content: Any, schema: Mapping[str, Any]) -> str | None:
+    """The first thing in `content` that a JSON schema does not allow, as one sentence that begins with its key."""
+    for error in jsonschema.Draft202012Validator(schema).iter_errors(content):
+        key = ".".join(str(part) for part in error.absolute_path)
+        message = error.message
+        if error.validator == "additionalProperties":
+            known = list(error.schema["properties"])
+            unknown = next(name for name in error.instance if name not in known)
+            close = difflib.get_close_matches(str(unknown), known, 1)
+            advice = f"did you mean '{close[0]}'?" if close else f"known keys are: {', '.join(known)}"
+            message = f"unknown key '{unknown}'; {advice}"
+        elif error.validator == "pattern" and "advice" in error.schema:
+            message = f"'{error.instance}' will not do; {error.schema['advice']}"
+        return f"{key}: {message}" if key else message
+    return None
+
+
+def with_defaults(content: Mapping[str, Any], schema: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with the defaults of their JSON schema for every key that they leave out, at every depth."""
+    return {
+        key: with_defaults(content.get(key) or {}, part) if "properties" in part else content.get(key, part["default"])
+        for key, part in schema["properties"].items()
+    }
+
+
+def read_settings(*mine: Path | None) -> dict[str, Any]:
+    """The shipped settings with those of files laid over them, one after the other; all checked.
+
+    Raises:
+        StageError: a file is missing, is no YAML, or holds a key or value that the schema does not allow.
+    """
+    own = [read_differences(file) for file in mine if file is not None]
+    return with_defaults(functools.reduce(merge, own, {}), schema_of("config"))
+
+
+def read_differences(mine: Path) -> dict[str, Any]:
+    """The settings that a file names, checked; errors as of `read_settings`."""
+    try:
+        own = yaml.safe_load(mine.read_text()) or {}
+    except OSError:
+        raise StageError(f"the settings file {mine} cannot be read; correct its path") from None
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise StageError(f"{mine} is no YAML ({' '.join(str(error).split())}); correct it") from None
+    if not isinstance(own, dict):
+        raise StageError(f"{mine} holds no settings; write keys as in config/config.yaml, `registration:` first")
+    wrong = problem(own, schema_of("config"))
+    if wrong:
+        raise StageError(f"{mine}, {wrong}")
+    return own
+
+
+def build(settings: type[T], values: Mapping[str, Any]) -> T:
+    """A settings dataclass from the keys of its name in a section of the settings, the rest as shipped.
+
+    Lists become tuples; dataclasses inside it are built from the same keys, as a command line flattens them.
+    """
+    kinds = get_type_hints(settings)
+    own = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items() if k in kinds}
+    inner = {
+        name: build(kind, values)
+        for name, kind in kinds.items()
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+    }
+    return settings(**inner | own)

@@ -1,0 +1,124 @@
+"""Tables of a user: tab-separated text from an editor or a spreadsheet. Standard library only."""
+
+import codecs
+import csv
+import io
+import re
+import unicodedata
+from pathlib import Path
+
+from scenefuse.core.stage import StageError
+
+Row = dict[str, str]
+# What a spreadsheet writes where a comma separates decimals.
+DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
+
+
+def read_table(path: Path, key: str) -> dict[str, Row]:
+    """Rows of a tab-separated table by the column `key`; every cell is text, an empty one is ''.
+
+    Lines that begin with #, empty rows and columns, and what else a spreadsheet puts around cells are left out. A cell
+    that begins with ~/ is in the user's folder, as in a shell.
+
+    Raises:
+        StageError: the file is missing, is no text, has no such column or a column twice, a row has too few or too many
+            cells, or two rows have the same key.
+    """
+    lines = [line for line in io.StringIO(read_text(path), newline=None) if not _is_comment(line)]
+    written = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter="\t")]
+    header, *cells = [row for row in written if any(row)] or [[]]
+    header = _cells(header)
+    if key not in header:
+        tabs = "; separate columns by tabs" if len(header) == 1 and re.search("[;, ]", header[0]) else ""
+        raise StageError(f"{path} has no column '{key}'; its first line names: {', '.join(header) or 'nothing'}{tabs}")
+    twice = next((name for name in header if header.count(name) > 1), None)
+    if twice is not None:
+        raise StageError(f"{path} has two columns '{twice}'; remove one")
+    rows: dict[str, Row] = {}
+    for number, row in enumerate(cells, 1):
+        # Cells at the end may be empty, or cut off; a row of one cell is one that spaces separate.
+        row = row[: len(header)] if not any(row[len(header) :]) else row
+        row += [""] * (len(header) - len(row) if len(row) > 1 else 0)
+        if len(row) != len(header):
+            raise StageError(
+                f"{path}, row {number}: {len(row)} columns, and the header has {len(header)}; separate them by tabs"
+            )
+        content = {name: _in_own_folder(cell) for name, cell in zip(header, row)}
+        if content[key] in rows:
+            raise StageError(f"{path}: '{content[key]}' stands in two rows; names must differ")
+        rows[content[key]] = content
+    return rows
+
+
+def read_lines(path: Path) -> list[tuple[int, str]]:
+    """Lines of a text file with their numbers from 1, without those that are empty or begin with #.
+
+    Raises:
+        StageError: the file is missing, or is no text.
+    """
+    lines = enumerate(read_text(path).splitlines(), 1)
+    return [(number, line) for number, line in lines if line.strip() and not _is_comment(line)]
+
+
+def read_cells(path: Path) -> list[tuple[int, list[str]]]:
+    """The cells of each line of a tab-separated file, with its number from 1, as `read_lines` has them: without blanks
+    around them, a spreadsheet's quotes, and empty cells at the end.
+
+    Raises:
+        StageError: the file is missing, or is no text.
+    """
+    rows = []
+    for number, line in read_lines(path):
+        cells = _cells(next(csv.reader([line], delimiter="\t")))
+        if cells:
+            rows.append((number, cells))
+    return rows
+
+
+def _is_comment(line: str) -> bool:
+    """Whether a line begins with #, perhaps in a spreadsheet's quotes."""
+    return line.lstrip('"').startswith("#")
+
+
+def _cells(row: list[str]) -> list[str]:
+    """The cells of a row without blanks around them, and without empty ones at the end."""
+    cells = [cell.strip() for cell in row]
+    while cells and not cells[-1]:
+        cells.pop()
+    return cells
+
+
+def _in_own_folder(cell: str) -> str:
+    """A path below the user's folder, where a cell means that."""
+    return str(Path(cell).expanduser()) if cell.startswith("~/") else cell
+
+
+def comma_advice(cells: list[str]) -> str:
+    """What to add to an error about cells that should be numbers, where one has a decimal comma; "" where none has."""
+    odd = next((cell for cell in cells if DECIMAL_COMMA.fullmatch(cell)), None)
+    return f"; {odd} has a decimal comma, write {odd.replace(',', '.')}" if odd else ""
+
+
+def composed(name: str) -> str:
+    """A photo's name in one spelling, to find it by: macOS writes an umlaut as two characters, others as one."""
+    return unicodedata.normalize("NFC", name)
+
+
+def read_text(path: Path) -> str:
+    """A text file in UTF-8, or in UTF-16 with a byte order mark, as spreadsheets write it.
+
+    Raises:
+        StageError: the file is missing, or has another encoding.
+    """
+    try:
+        content = Path(path).read_bytes()
+    except OSError:
+        raise StageError(f"{path} does not exist or cannot be read; write it, or correct its path") from None
+    marked = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    if b"\0" in content and not marked:
+        raise StageError(f"{path} is not UTF-8 text (it looks like UTF-16); save the file as UTF-8")
+    try:
+        return content.decode("utf-16" if marked else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = content.count(b"\n", 0, error.start) + 1
+        raise StageError(f"{path}, line {line}: not {'UTF-16' if marked else 'UTF-8'} text; save it as UTF-8") from None

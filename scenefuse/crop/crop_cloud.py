@@ -1,0 +1,157 @@
+"""The points of a scene that belong to a marked object: a box or hull, without the ground and without loose parts."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import QhullError, cKDTree
+
+from scenefuse.cloud.clouds import Cloud, spacing
+from scenefuse.core.stage import setting, threads
+from scenefuse.core.transforms import Array, rotation_between
+from scenefuse.crop.level_ground import GROUND_FRACTION, ground_under, on_ground
+from scenefuse.crop.shapes import in_wide_hull, least_footprint
+from scenefuse.geometry.components import LINK_FRACTION, MIN_PART, parts
+from scenefuse.geometry.ground import Ground
+
+# Shares of the diagonal of the fiducials' box.
+MARGIN_FRACTION = 0.04  # widening of the box beside `margin`: two pairing distances of the registration
+REACH_FRACTION = 0.05  # a part this near to a fiducial belongs to the object
+# A step that would leave less than this share of the points in the box is left out: the object is there.
+LEAST_LEFT = 0.05
+
+
+@dataclass(frozen=True)
+class CropSettings:
+    """Settings of the crop."""
+
+    mode: Literal["masks", "fiducials"] = setting("masks")
+    """What marks the object in the scene: its masks (or, where a cloud of it is given with cameras and without masks,
+    this cloud), seen through the alignment from shared features, and only where photos share too few the file in the
+    column `fiducials`; or this file in any case. An object without it, and without photos on both sides, is searched in
+    the whole scene."""
+    shape: Literal["box", "oriented", "hull"] = setting("box")
+    """The fiducials' box, the same turned about the vertical to their least footprint, or their convex hull."""
+    margin: float = setting(0.05, least=0)
+    """Widening of the box on every side, as a share of its own extent."""
+    remove_ground: bool = setting(True)
+    """Whether the ground is fitted around the box and removed inside."""
+    max_residual_px: float = setting(5, unit="px", least=0)
+    """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
+    min_votes: float = setting(0.8, above=0, most=1)
+    """Share of the object's photos showing a scene point that must have it inside their mask."""
+    whole_scene: bool = False
+    """Keep the whole scene, whatever the mode: the ablation without cropping, and what is left without any mark."""
+    minimal: bool = False
+    """Keep all that lies in the least upright box around the marks, whatever the rest says: the paper's crop."""
+
+
+@dataclass(frozen=True)
+class Crop:
+    """What was cut out and how.
+
+    Attributes:
+        keep: (N,) bool over the scene's points, True on the object.
+        in_box: (N,) bool, True for all points in the box or hull, ground included.
+        on_ground: (N,) bool, True for points in it that were removed as ground.
+        shape: box, oriented or hull: what was cut out; None for the whole scene.
+        level_from_scene: (3, 3) rotation that turns the scene's up into z, and the box's sides into x and y.
+        low: (3,) least corner of the box (around the hull) in the level frame.
+        high: (3,) greatest corner.
+        ground: the fitted ground on which the object stands, or None.
+        notes: what was not done and why.
+    """
+
+    keep: NDArray[np.bool_]
+    in_box: NDArray[np.bool_]
+    on_ground: NDArray[np.bool_]
+    shape: str | None
+    level_from_scene: Array
+    low: Array
+    high: Array
+    ground: Ground | None
+    notes: list[str]
+
+
+def whole(scene: Cloud) -> Crop:
+    """The whole scene as a crop."""
+    everything = np.ones(len(scene), dtype=bool)
+    note = "nothing was cut out: the object is looked for in the whole scene, as if that showed little else"
+    return Crop(
+        everything, everything, ~everything, None, np.eye(3), scene.points.min(0), scene.points.max(0), None, [note]
+    )
+
+
+def crop_cloud(
+    scene: Cloud, fiducials: Array, up: Array, settings: CropSettings, other: NDArray[np.bool_] | None = None
+) -> Crop:
+    """The points of a scene that belong to the object marked by fiducials (F, 3), without those known to be `other`."""
+    level = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    if settings.shape == "oriented" and not settings.minimal:
+        level = least_footprint(fiducials @ level.T) @ level
+    points, marks = scene.points @ level.T, fiducials @ level.T
+    extent = np.ptp(marks, axis=0)
+    if settings.minimal:
+        low, high = marks.min(0), marks.max(0)
+        inside = ((points >= low) & (points <= high)).all(1)
+        return Crop(inside, inside, np.zeros_like(inside), "box", level, low, high, None, [])
+    diagonal = float(np.linalg.norm(extent))
+    margin = settings.margin * extent + MARGIN_FRACTION * diagonal
+    low, high = marks.min(0) - margin, marks.max(0) + margin
+    ground, notes = ground_under(points, marks, low, high) if settings.remove_ground else (None, [])
+    if ground is not None:
+        # Fiducials are clicked where the scene shows the object; what it stands on bounds it below.
+        corners = np.array([[x, y] for x in (low[0], high[0]) for y in (low[1], high[1])])
+        low[2] = min(low[2], ground.height(corners).min() - GROUND_FRACTION * diagonal)
+    in_box, shape = ((points >= low) & (points <= high)).all(1), settings.shape
+    if shape == "hull":
+        try:
+            in_box[in_box] = in_wide_hull(points[in_box], marks, low[2], margin)
+        except QhullError:
+            shape = "box"
+            notes.append("the fiducials lie in one vertical plane and span no hull: their box was cut out instead")
+    away = np.zeros(len(points), dtype=bool)
+    if ground is not None and in_box.any():
+        away = on_ground(points, marks, ground, in_box)
+        if away.sum() > (1 - LEAST_LEFT) * in_box.sum():
+            cut = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
+            share = f"{away.sum()} of the {in_box.sum()} points in the box"
+            return replace(cut, notes=[f"{share} would be ground: nothing was removed as ground", *cut.notes])
+        if not away.any():
+            notes.append("the ground around the box does not continue into it: nothing was removed as ground")
+    keep = in_box & ~away if other is None else in_box & ~away & ~other
+    keep, said = _without_loose_parts(points, keep, marks, diagonal)
+    return Crop(keep, in_box, away, shape, level, low, high, ground, notes + said)
+
+
+def _without_loose_parts(
+    points: Array, inside: NDArray[np.bool_], marks: Array, diagonal: float
+) -> tuple[NDArray[np.bool_], list[str]]:
+    """Those of the points `inside` in parts that belong to the object, and what was not done and why."""
+    rows = np.flatnonzero(inside)
+    if not len(rows):
+        return inside, []
+    link = max(LINK_FRACTION * diagonal, 3 * spacing(points[rows]))
+    near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
+    if not near.any():
+        return inside, ["no part in the box lies near a fiducial: all of them were kept"]
+    if near.mean() < LEAST_LEFT:
+        return inside, [f"parts near a fiducial have only {near.sum()} of {len(rows)} points in the box: all were kept"]
+    keep = np.zeros(len(points), dtype=bool)
+    keep[rows[near]] = True
+    return keep, []
+
+
+def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArray[np.bool_]:
+    """Which points belong to a large enough part that a fiducial touches or that mostly lies between fiducials.
+
+    The second counts for parts no one clicked, a wall under a roof for instance: half their points in the fiducials'
+    own box, seen from above.
+    """
+    part_of, counts = parts(points, link)
+    touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
+    low, high = marks.min(0)[:2], marks.max(0)[:2]
+    between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
+    wanted = (counts >= MIN_PART * len(points)) & (touched | (between >= 0.5 * counts))
+    return wanted[part_of]

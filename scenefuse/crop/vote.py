@@ -1,0 +1,190 @@
+"""Which points of a scene lie inside an object's masks, seen through its cameras and a known similarity."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.cloud.clouds import spacing
+from scenefuse.core.stage import StageError, threads
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.visual_hull import least_framing
+from scenefuse.photos.workspace import View, read_workspace, with_mask
+
+Columns = tuple[NDArray[np.float32], ...]
+
+# Photos used at most, spread evenly: more show the same sides again.
+MOST_PHOTOS = 60
+# Masks are grown by this share of the photo's width, for what the similarity and the masks err by at outlines.
+SLACK = 0.005
+# A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
+CELL_SPACINGS, HIDDEN_CELLS = 4, 2
+# Photos that must show a point.
+MIN_SHOWN = 3
+# Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
+FAR_EXTENTS = 4.0
+# How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
+NEAR_OWN, MIN_OWN = 0.15, 10
+
+
+@dataclass(frozen=True)
+class Votes:
+    """Votes of an object's masks on points of the scene.
+
+    Attributes:
+        object: (N,) bool, True for points of the object.
+        other: (N,) bool, True for points of something else; points that too few photos show are neither.
+        own: (K, 3) SfM points of the object's photos on the object, in the scene frame.
+    """
+
+    object: NDArray[np.bool_]
+    other: NDArray[np.bool_]
+    own: Array
+
+
+@dataclass(frozen=True)
+class Masked:
+    """An object's photos with their masks.
+
+    Attributes:
+        views: with `pixels` True on the mask, grown by 0.5 % of the photo's width.
+        own: (K, 3) SfM points on the object, in its frame.
+    """
+
+    views: list[View]
+    own: Array
+
+    def sight(self, scene_from_object: Sim3) -> Array:
+        """(K + V, 3) the own points and the cameras in the scene; cameras farther away than FAR_EXTENTS come nearer."""
+        own = scene_from_object.apply(self.own)
+        eyes = scene_from_object.apply(np.array([view.centre for view in self.views]))
+        far = FAR_EXTENTS * float(np.linalg.norm(np.ptp(own, axis=0)))
+        return np.concatenate([own, np.clip(eyes, own.min(0) - far, own.max(0) + far)])
+
+
+def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: float) -> Votes:
+    """Project every point of a scene into an object's masks.
+
+    A photo votes on a point that falls into its frame and that no nearer scene point hides; three votes make a
+    decision. A point is the object's when at least `min_share` of them have it inside their mask, enough photos have it
+    in their frame (`least_framing`), and one of the object's own SfM points is near; something else's when most have it
+    outside.
+
+    Args:
+        points: (N, 3) in the scene frame.
+        masked: of `read_masked_views`.
+        scene_from_object: the similarity.
+        min_share: of the photos that vote on a point, how many must have it inside the mask.
+    """
+    views, own = masked.views, masked.own
+    in_object = scene_from_object.inverse().apply(points)
+    least = least_framing(views, own)
+    framed, shown, inside = count(in_object, views, least)
+    decided = shown >= MIN_SHOWN
+    is_object = decided & (framed >= least) & (inside >= min_share * shown)
+    rows = np.flatnonzero(is_object)
+    reach = NEAR_OWN * float(np.linalg.norm(np.ptp(own, axis=0)))
+    is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
+    return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
+
+
+def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
+    """At most 60 of an object's photos, spread evenly, with their masks, and the SfM points on the object.
+
+    An SfM point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or
+    more; the outermost 1 % on each side are left out.
+
+    Args:
+        workspace: undistorted COLMAP workspace of the object.
+        masks: folder of {name}.png, non-zero on the object.
+        min_share: see `vote`.
+
+    Raises:
+        StageError: too few photos have a mask, a mask is not of its photo's size, or too few SfM points lie inside.
+    """
+    read = read_workspace(workspace)
+    files = [(masks / f"{Path(view.name).stem}.png", view, seen) for view, seen in zip(read.views, read.seen)]
+    files = [file for file in files if file[0].is_file()]
+    if len(files) < MIN_SHOWN:
+        raise StageError(
+            f"{len(files)} photos of {workspace} have a mask in {masks}, three are needed; rerun the masks"
+        )
+    observing, inside = (np.zeros(len(read.points), dtype=np.int32) for _ in range(2))
+    found = []
+    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_PHOTOS, len(files))).round().astype(int))
+    for path, view, seen in (files[k] for k in chosen):
+        one = _with_grown_mask(view, path)
+        found.append(one)
+        observed = np.unique(seen)
+        rows, pixels, _ = _in_frame(_columns(read.points[observed]), one)
+        observing[observed[rows]] += 1
+        inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
+    own = read.points[(observing >= MIN_SHOWN) & (inside >= min_share * observing)]
+    if len(own) < MIN_OWN:
+        raise StageError(
+            f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks}, {MIN_OWN} are needed; look at"
+            " the masks, and take sharper photos of the object"
+        )
+    low, high = np.percentile(own, 1, axis=0, method="lower"), np.percentile(own, 99, axis=0, method="higher")
+    return Masked(found, own[((own >= low) & (own <= high)).all(1)])
+
+
+def _with_grown_mask(view: View, path: Path) -> View:
+    """The view with its mask, grown on all sides."""
+    extent = 2 * int(np.ceil(SLACK * view.width)) + 1
+    grown = cv2.dilate(with_mask(view, path).pixels, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
+    return replace(view, pixels=grown > 0)
+
+
+def count(
+    in_object: Array, views: list[View], least: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """How many photos frame each of (N, 3) points, show it unhidden, and have it inside the mask then.
+
+    What hides is judged by the spacing of those that `least` photos frame.
+    """
+    columns = _columns(in_object)
+    framed, shown, inside = (np.zeros(len(in_object), dtype=np.int32) for _ in range(3))
+    for one in views:
+        framed[_in_frame(columns, one)[0]] += 1
+    around = np.flatnonzero(framed >= least)
+    if len(around) < 2:
+        return framed, shown, inside
+    step = spacing(in_object[around])
+    for one in views:
+        rows, pixels, depth = _in_frame(columns, one)
+        unhidden = ~_hidden(pixels, depth, step, one)
+        rows, pixels = rows[unhidden], pixels[unhidden]
+        shown[rows] += 1
+        inside[rows] += one.pixels[pixels[:, 1], pixels[:, 0]]
+    return framed, shown, inside
+
+
+def _columns(points: Array) -> Columns:
+    return tuple(np.ascontiguousarray(points.T, dtype=np.float32))
+
+
+def _in_frame(points: Columns, one: View) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
+    """Rows of the points in a photo's frame, their pixels (K, 2) and depths (K,)."""
+    x, y, z = points
+    u, v, depth = (a * x + b * y + c * z + d for a, b, c, d in one.projection.astype(np.float32))
+    rows = np.flatnonzero((depth > 0) & (u >= 0) & (u < one.width * depth) & (v >= 0) & (v < one.height * depth))
+    depth = depth[rows]
+    pixels = np.stack([u[rows] / depth, v[rows] / depth], axis=1).astype(np.int64)
+    # A quotient may round up to the edge.
+    return rows, np.minimum(pixels, [one.width - 1, one.height - 1]), depth
+
+
+def _hidden(pixels: NDArray[np.int64], depth: NDArray[np.float32], step: float, one: View) -> NDArray[np.bool_]:
+    """Which points lie behind a nearer one in the same cell of a photo; a cell is four spacings of the points wide."""
+    if len(depth) == 0:
+        return np.zeros(0, dtype=bool)
+    size = CELL_SPACINGS * step
+    cell = max(1, int(np.ceil(size * np.linalg.norm(one.projection[0, :3]) / np.median(depth))))
+    key = (pixels[:, 1] // cell) * (one.width // cell + 1) + pixels[:, 0] // cell
+    nearest = np.full(key.max() + 1, np.inf, dtype=np.float32)
+    np.minimum.at(nearest, key, depth)
+    return depth > nearest[key] + HIDDEN_CELLS * size

@@ -1,0 +1,109 @@
+"""What fusion changes in a scene: points of its cloud that are taken away or known better, and points that come in.
+
+A scene is never copied for an object: its changes name the rows of the scene's cloud, and are laid on the part of it
+that is read.
+"""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.cloud.clouds import Cloud, concatenate
+from scenefuse.cloud.formats import LAS_DIMENSIONS
+from scenefuse.cloud.tiles.tiled_cloud import Rows, TiledCloud, open_cloud
+from scenefuse.core.transforms import Array
+from scenefuse.fuse.evidence import FIELDS, KEPT, MEASURED, unchecked
+
+FROM_SCENE, FROM_OBJECT = 0, 1
+"""Values of the field `source` of an object's clouds."""
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Of one object, or of several.
+
+    Attributes:
+        rows: (M,) rising: the points of the scene's cloud that were checked.
+        removed: (M,) whether each is taken away.
+        fields: what photos know of each, name -> (M,).
+    """
+
+    rows: Rows
+    removed: NDArray[np.bool_]
+    fields: dict[str, NDArray[Any]]
+
+    def left_of(self, rows: Rows, cloud: Cloud) -> Cloud:
+        """What is left of some points of the scene, with fields of evidence, `source` 0, and what LAS knows of them.
+
+        Args:
+            rows: (N,) rising, of these points in the scene's cloud.
+            cloud: the points.
+        """
+        part, kept = with_source(unchecked(cloud), FROM_SCENE), np.ones(len(cloud), dtype=bool)
+        mine = slice(*np.searchsorted(self.rows, [rows[0], rows[-1] + 1])) if len(rows) else slice(0, 0)
+        at = np.searchsorted(rows, self.rows[mine])
+        there = rows[at] == self.rows[mine]
+        at = at[there]
+        for name, values in self.fields.items():
+            part.fields[name][at] = values[mine][there]
+        part.fields.update({name: cloud.fields[name] for name in LAS_DIMENSIONS if name in cloud.fields})
+        kept[at] = ~self.removed[mine][there]
+        return part[kept]
+
+    def removed_in(self, starts: Rows) -> Rows:
+        """(T,) how many points are taken away of each of T runs of rows from `starts` (T + 1,)."""
+        return np.diff(np.searchsorted(self.rows[self.removed], starts))
+
+
+def read_changes(checked: Path) -> Changes:
+    """The changes that an object makes, from what its fusion wrote of the scene's points; none where it is empty."""
+    tiles = open_cloud(checked)
+    fields = tiles.read(np.arange(len(tiles.low)))[1].fields
+    rows, removed = fields["row"].astype(np.int64), fields["reason"] != KEPT
+    return Changes(rows, removed, {name: fields[name] for name in FIELDS})
+
+
+def merged(changes: list[Changes]) -> Changes:
+    """The changes of several objects, in their order: a point goes if any takes it away.
+
+    Of a point that several checked, what the last one knows counts; but what photos of another measured stays known.
+    """
+    if len(changes) == 1:
+        return changes[0]
+    rows = np.concatenate([np.zeros(0, np.int64), *(one.rows for one in changes)])
+    removed = np.concatenate([np.zeros(0, bool), *(one.removed for one in changes)])
+    fields = {name: np.concatenate([one.fields[name] for one in changes]) for name in FIELDS if changes}
+    order = np.lexsort((fields["evidence"] == MEASURED, rows)) if changes else np.zeros(0, np.int64)
+    last = np.flatnonzero(np.diff(rows[order], append=-1))
+    starts = np.concatenate([[0], last[:-1] + 1]) if len(last) else last
+    gone = np.logical_or.reduceat(removed[order], starts) if len(last) else removed
+    chosen = order[last]
+    return Changes(rows[chosen], gone, {name: values[chosen] for name, values in fields.items()})
+
+
+def added_by(fused: Path) -> Cloud:
+    """The points that an object brought in, from the cloud of its surroundings."""
+    tiles = open_cloud(fused)
+    whole = tiles.read(np.arange(len(tiles.low)))[1]
+    return whole[whole.fields["source"] == FROM_OBJECT]
+
+
+def after_fusion(scene: TiledCloud, checked: Path, fused: Path, low: Array, high: Array) -> Cloud:
+    """The scene in the tiles that touch a box from `low` (3,) to `high` (3,), with what an object changes there, and
+    all that it adds."""
+    left = read_changes(checked).left_of(*scene.near(low, high))
+    return together(left, added_by(fused))
+
+
+def together(kept: Cloud, added: Cloud) -> Cloud:
+    """Both clouds in one; normals and colours that only the object has are left out, never those of the scene."""
+    return concatenate([kept, added]) if len(added) else kept
+
+
+def with_source(cloud: Cloud, source: int) -> Cloud:
+    """The cloud with its fields of evidence and `source`, wide enough for 65535 objects."""
+    known = {name: cloud.fields[name] for name in FIELDS}
+    return replace(cloud, fields=known | {"source": np.full(len(cloud), source, dtype=np.uint16)})

@@ -1,0 +1,224 @@
+"""What an object still lacks after fusion, and the photos that would close most of it."""
+
+import csv
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, voxel_downsample, write_cloud
+from scenefuse.cloud.tiles.tiled_cloud import AT_ONCE, open_cloud
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
+from scenefuse.core.transforms import Array, Sim3, rotation_between
+from scenefuse.core.units import length_unit
+from scenefuse.fuse.changes import added_by, read_changes, together
+from scenefuse.fuse.evidence import around, with_normals
+from scenefuse.fuse.fuse_object import photos_of
+from scenefuse.fuse.missing import CLASSES, Missing, find_missing_surface
+from scenefuse.fuse.next_photos import CLEARANCE, UPWARDS, Plan, plan_stations, reach_of_stations
+from scenefuse.geometry.photo_check import Photos
+from scenefuse.photos.geodesy import GridFrame, LocalFrame, scene_frame
+from scenefuse.photos.workspace import View, with_mask
+
+MASK_PX = 400
+"""Longer side of the masks that the hull is counted in: finer than its cells."""
+POSITION = ("longitude_deg", "latitude_deg", "altitude_m")
+COLUMNS = ("station", "photo", "x", "y", "z", *POSITION, "above_close_ups", "heading_deg", "pitch_deg", "shows")
+"""Of the table of photos; heading clockwise from north (from y without georeferencing), pitch up from the horizon."""
+
+
+@dataclass(frozen=True)
+class MissingInputs:
+    """What the search for missing surface reads."""
+
+    object: Path
+    """Object cloud (PLY) in its own frame."""
+    scene: Path
+    """Dense scene cloud (PLY)."""
+    fused: Path
+    """PLY of the fusion: what it added."""
+    checked: Path
+    """PLY of the fusion: what it changed in the scene."""
+    fusion_json: Path
+    """JSON of the fusion: where the object settled in the scene."""
+    crop_json: Path
+    """JSON of the crop stage, for the direction of gravity."""
+    georeference_json: Path
+    """JSON with `crs` and the scene's origin, if it has one."""
+    object_workspace: Path | None = None
+    """The object's undistorted COLMAP workspace; without it nothing is looked for."""
+    scene_workspace: Path | None = None
+    """The scene's, in the frame of its cloud, where it has photos."""
+    masks: Path | None = None
+    """Folder of the object's masks, {photo}.png; without them only points of the object's cloud are looked at."""
+
+
+@dataclass(frozen=True)
+class MissingOutputs:
+    """What it writes."""
+
+    missing: Path
+    """PLY, scene frame: the middles of the missing cells, `missing` 1 never seen, 2 untextured, 3 contradicted."""
+    next_photos: Path
+    """CSV, a row for each photo that would help: where to stand and where to look."""
+    geojson: Path
+    """GeoJSON of the same, WGS84; without features where the scene is not georeferenced."""
+    report: Path
+    """JSON: shares of the object's surface, what the photos would close, notes."""
+
+
+def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
+    """Find the surface of a fused object that no photo confirms, and the camera positions that would show most of it
+    (method F5, F6); of an unregistered object, and of one without photos, nothing is written but the reason.
+
+    Args:
+        inputs: see MissingInputs.
+        outputs: see MissingOutputs.
+    """
+    start = time.perf_counter()
+    use_threads(threads())
+    fusion, unit = read_json(inputs.fusion_json), length_unit(inputs.georeference_json)
+    if value(fusion, "status") != "fused" or inputs.object_workspace is None:
+        nothing = Cloud(np.zeros((0, 3)), np.zeros((0, 3), np.float32), None, {"missing": np.zeros(0, np.uint8)})
+        write_cloud(outputs.missing, nothing)
+        _write_table(outputs.next_photos, [])
+        _write_geojson(outputs.geojson, [])
+        status, reason = "unregistered", value(fusion, "reason")
+        if value(fusion, "status") == "fused":
+            status, reason = (
+                "not_looked_for",
+                "the object has no photos: surface that none of them confirms is not looked for",
+            )
+        write_json(outputs.report, {"status": quantity(status, ""), "reason": quantity(reason, "")})
+        return
+    obj, photos, masks = _in_scene(
+        inputs, inputs.object_workspace, Sim3.from_matrix(np.array(value(fusion, "scene_from_object")))
+    )
+    cameras = masks or photos[0].views
+    near, around_it = _surroundings(inputs, obj, cameras)
+    missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
+    up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
+    plan = plan_stations(missing, obj, around_it, cameras, up)
+    write_cloud(outputs.missing, missing.cells)
+    georeference = read_json(inputs.georeference_json)
+    gps_higher = float(value(georeference, "gps_shift")[2]) if "gps_shift" in georeference else 0.0
+    rows = photo_rows(plan, cameras, up, scene_frame(georeference), gps_higher)
+    _write_table(outputs.next_photos, rows)
+    _write_geojson(outputs.geojson, rows)
+    if around_it is not near:
+        missing = replace(missing, notes=(*missing.notes, "points far from the object were thinned to plan stations"))
+    higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
+    content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
+    content |= {"of": quantity("its surface" if masks else "what its own cloud holds", "")}
+    content |= {"seconds": quantity(time.perf_counter() - start, "s")}
+    write_json(outputs.report, content)
+
+
+def _surroundings(inputs: MissingInputs, obj: Cloud, cameras: list[View]) -> tuple[Cloud, Cloud]:
+    """The scene after fusion, with normals, beside the object; and as far as anything may stand in a station's way.
+
+    Of more than AT_ONCE points, those farther off are thinned to a quarter of a camera's clearance, without normals.
+    """
+    scene, changes, added = open_cloud(inputs.scene), read_changes(inputs.checked), added_by(inputs.fused)
+    low, high = (end(obj.points, axis=0) for end in (np.min, np.max))
+    beside, reach = obj.diagonal, reach_of_stations(obj, cameras) if cameras else 0.0
+    tiles = scene.touching(low - max(beside, reach), high + max(beside, reach))
+    if np.diff(scene.starts)[tiles].sum() <= AT_ONCE:
+        whole = with_normals(together(changes.left_of(*scene.read(tiles)), added))
+        return whole, whole
+    near = with_normals(together(changes.left_of(*scene.near(low - beside, high + beside)), added))
+    far = [Cloud(near.points)]
+    for some in np.array_split(tiles, 1 + np.diff(scene.starts)[tiles].sum() // AT_ONCE):
+        points = changes.left_of(*scene.read(some)).points
+        outside = ((points < low - beside) | (points > high + beside)).any(1)
+        far.append(voxel_downsample(Cloud(points[outside]), CLEARANCE * obj.diagonal / 4))
+    around_it = concatenate(far)
+    normals = np.zeros((len(around_it), 3), np.float32)
+    normals[: len(near)] = near.normals
+    return near, replace(around_it, normals=normals)
+
+
+def _in_scene(inputs: MissingInputs, workspace: Path, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:
+    """The object's cloud, the photos of both sides, and the object's masks, all in the scene's frame."""
+    own = with_normals(read_cloud(inputs.object))
+    obj = own.transformed(pose)
+    photos = photos_of(workspace, own.points, pose), photos_of(inputs.scene_workspace, obj.points)
+    if inputs.masks is None:
+        return obj, photos, []
+    views = [(view, inputs.masks / f"{Path(view.name).stem}.png") for view in photos[0].views]
+    return obj, photos, [_silhouette(view, path) for view, path in views if path.is_file()]
+
+
+def _silhouette(view: View, path: Path) -> View:
+    """The view, smaller, with its mask."""
+    small = with_mask(view, path).at_most(MASK_PX)
+    return replace(small, pixels=small.pixels > 127)
+
+
+def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
+    """Shares of the object's surface, and what the stations would close, with units."""
+    shares = {name: missing.share(kind) for kind, name in CLASSES.items()}
+    return {
+        "status": quantity("found", ""),
+        "surface_cells": quantity(missing.covered_cells + len(missing.cells), "cells"),
+        "cell_side": quantity(missing.side, unit),
+        "missing": quantity(sum(shares.values()), "of the object's surface"),
+        **{name: quantity(share, "of the object's surface") for name, share in shares.items()},
+        "seen_through_points": quantity(missing.seen_through, "points"),
+        "stations": quantity(len(plan.stations), ""),
+        "stations_show": quantity(sum(station.shows for station in plan.stations), "of never seen and contradicted"),
+        "reachable": quantity(plan.reachable, "of never seen and contradicted"),
+        "notes": quantity(list(missing.notes), ""),
+    }
+
+
+def photo_rows(
+    plan: Plan, close_ups: list[View], up: Array, frame: LocalFrame | GridFrame | None, gps_higher: float = 0.0
+) -> list[dict[str, Any]]:
+    """A row for each photo; up: (3,) direction opposite to gravity, scene frame; `gps_higher`: metres by which the
+    flight's GPS counts heights higher than the scene."""
+    rows, level = [], rotation_between(up, UPWARDS)
+    highest = max((float(view.centre @ up) for view in close_ups), default=0.0)
+    for number, station in enumerate(plan.stations, 1):
+        for view in station.photos:
+            ahead = level @ view.cam_from_world[2, :3]
+            row = {
+                "station": number,
+                "photo": int(view.name),
+                **{axis: float(f"{at:.7g}") for axis, at in zip("xyz", view.centre)},
+            }
+            if frame is not None and frame.crs is not None:
+                latitude, longitude, altitude = frame.inverse(view.centre[None])[0]
+                row |= {"longitude_deg": round(longitude, 8), "latitude_deg": round(latitude, 8)}
+                row["altitude_m"] = round(altitude + gps_higher, 3)
+            row["above_close_ups"] = float(f"{view.centre @ up - highest:.4g}")
+            row["heading_deg"] = round(float(np.degrees(np.arctan2(ahead[0], ahead[1]))) % 360, 1)
+            row["pitch_deg"] = round(float(np.degrees(np.arcsin(np.clip(ahead[2], -1, 1)))), 1)
+            rows.append(row | {"shows": round(station.shows, 4)})
+    return rows
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]]) -> None:
+    """CSV of the photos; a heading alone where there are none."""
+    columns = [name for name in COLUMNS if not rows or name in rows[0]]
+    with atomic_file(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+def _write_geojson(path: Path, rows: list[dict[str, Any]]) -> None:
+    """RFC 7946: points with longitude, latitude, height; no features where the scene is not georeferenced."""
+    features = [
+        {
+            "type": "Feature",
+            "geometry": {"type": "Point", "coordinates": [row[k] for k in POSITION]},
+            "properties": {k: v for k, v in row.items() if k not in (*POSITION, *"xyz")},
+        }
+        for row in rows
+        if POSITION[0] in row
+    ]
+    write_json(path, {"type": "FeatureCollection", "features": features})

@@ -1,0 +1,383 @@
+"""Fusion: a registered object comes into the scene, each point with what photos know of it."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.cloud.tiles.tiled_cloud import Rows, open_cloud
+from scenefuse.core.cores import use_threads
+from scenefuse.core.stage import quantity, read_json, threads, value, write_json
+from scenefuse.core.transforms import Array, Sim3, box_around
+from scenefuse.core.units import length_unit
+from scenefuse.fuse.changes import FROM_OBJECT, FROM_SCENE, together, with_source
+from scenefuse.fuse.evidence import (
+    KEPT,
+    MEASURED,
+    NEAR,
+    NERF_ONLY,
+    REASONS,
+    REPLACED,
+    Side,
+    Weighed,
+    around,
+    unchecked,
+    weigh,
+    with_normals,
+    with_pose_uncertainty,
+)
+from scenefuse.fuse.modes import (
+    FEATHER_SPACINGS,
+    FILL_SPACINGS,
+    GAINS,
+    NEAR_SPACINGS,
+    FusionSettings,
+    feathered,
+    fuse_clouds,
+    thinned,
+    with_colors_of,
+)
+from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
+from scenefuse.photos.workspace import read_workspace
+from scenefuse.register.frame_ledger import frame_ledger
+from scenefuse.register.uncertainty import Uncertainty
+
+GREY = 128
+"""Of the points of an object without colours in a scene that has some."""
+
+
+@dataclass(frozen=True)
+class FusionInputs:
+    """What the fusion of one object reads."""
+
+    object: Path
+    """Object cloud (PLY) in its own frame."""
+    scene: Path
+    """Dense scene cloud (PLY)."""
+    crop: Path
+    """The scene's points on the object (PLY)."""
+    crop_json: Path
+    """JSON of the crop stage, for the box."""
+    fine_json: Path
+    """JSON of the fine registration."""
+    object_workspace: Path | None = None
+    """The object's undistorted COLMAP workspace; without it the object is judged by the scene's photos."""
+    scene_workspace: Path | None = None
+    """The scene's, in the frame of its cloud; without it the scene is judged by the object's photos."""
+    georeference_json: Path | None = None
+    """JSON of the scene, for the unit of its lengths and its place in the world, or nothing."""
+    object_json: Path | None = None
+    """JSON of the object cloud, for its other frames, or nothing."""
+
+
+@dataclass(frozen=True)
+class FusionOutputs:
+    """What the fusion of one object writes."""
+
+    fused: Path
+    """PLY, the object's surroundings: the scene in the crop's box and what was added."""
+    checked: Path
+    """PLY, the changes to the scene: its points near the object, with their `row` in its cloud, what photos know of
+    them, and the `reason` why each is taken away, or 0."""
+    evidence: Path
+    """JSON: what photos say of both sides' points."""
+    report: Path
+    """JSON: counts, distances, gain, status."""
+    frames: Path | None = None
+    """JSON, the frame ledger: every transform between the object's frames."""
+
+
+@dataclass(frozen=True)
+class Fused:
+    """A part of a scene with an object in it.
+
+    Attributes:
+        scene: its points with `photos`, `match`, `deviation`, `evidence`.
+        rows: (M,) of these points, those that were checked.
+        reason: (M,) uint8, KEPT or why the point is taken away.
+        added: the object's points that come in, with the same fields.
+        gain: (3,) colour gain of the object.
+        bias: (3,) colour bias, 0..255.
+        same_distance: distance within which both show the same place.
+        weighed: of `evidence`, else None.
+    """
+
+    scene: Cloud
+    rows: NDArray[np.int64]
+    reason: NDArray[np.uint8]
+    added: Cloud
+    gain: Array
+    bias: Array
+    same_distance: float
+    weighed: Weighed | None = None
+
+    @property
+    def removed(self) -> NDArray[np.int64]:
+        """(R,) rows of the points that are taken away."""
+        return self.rows[self.reason != KEPT]
+
+    @property
+    def kept(self) -> Cloud:
+        """The part of the scene without them."""
+        left = np.ones(len(self.scene), dtype=bool)
+        left[self.removed] = False
+        return self.scene[left]
+
+
+def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: FusionSettings) -> None:
+    """Add a registered object to the scene (method F1 to F4); an unregistered one leaves the scene as it is.
+
+    Args:
+        inputs: see FusionInputs.
+        outputs: see FusionOutputs. Clouds have the fields `source` (0 scene, 1 object), `photos` (that confirm the
+            point), `match` (mean NCC of the best), `deviation` (one standard deviation, the file's unit),
+            `world_deviation` (the same; of the object's points with the uncertainty of its pose), `evidence` (0 not
+            checked, 1 measured, 2 NeRF or given cloud only, 3 stereo only).
+        settings: see FusionSettings.
+    """
+    start = time.perf_counter()
+    use_threads(threads())
+    whole, part, obj = open_cloud(inputs.scene), read_cloud(inputs.crop), read_cloud(inputs.object)
+    registration, crop_json = read_json(inputs.fine_json), read_json(inputs.crop_json)
+    settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
+    if whole.like.normals is not None:
+        obj = with_normals(obj)
+    placed, step = is_placed(registration), spacing(part.points)
+    pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
+    rows, scene = whole.near(*_region(obj, pose, crop_json, step))
+    if pose is None:
+        print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
+        fused, notes = _unchanged(obj, scene), []
+    elif settings.mode == "evidence":
+        fused = _by_evidence(obj, scene, pose, inputs, registration, settings)
+    else:
+        fused = fuse_by_distance(obj, scene, part, pose, settings)
+    if scene.colors is not None and obj.colors is None:
+        notes.append("the object has no colours: its points are grey in the scene")
+        grey = np.full((len(fused.added), 3), GREY, np.uint8)
+        fused = replace(fused, added=replace(fused.added, colors=grey))
+    if np.isin(fused.gain, GAINS).any():
+        notes.append(
+            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
+            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
+            " fusion.match_colors: false leaves them as they are"
+        )
+    for note in notes:
+        print(note, flush=True)
+    _write(fused, rows, crop_json, outputs)
+    unit = length_unit(inputs.georeference_json)
+    write_json(outputs.evidence, evidence_report(fused, unit))
+    if pose is not None and fused.weighed is not None:
+        pose = fused.weighed.settled @ pose
+    content = _report(fused, registration, len(whole), step, unit) | {
+        "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
+        "mode": quantity(settings.mode, ""),
+        "notes": quantity(([] if fused.weighed is None else list(fused.weighed.notes)) + notes, ""),
+        "object_points": quantity(len(obj), "points"),
+        "seconds": quantity(time.perf_counter() - start, "s"),
+    }
+    write_json(outputs.report, content)
+    if outputs.frames is not None:
+        ledger = frame_ledger(pose, inputs.object_json, inputs.georeference_json)
+        write_json(outputs.frames, ledger | {"status": content["registration"]})
+
+
+def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: float) -> tuple[Array, Array]:
+    """Corners (3,) of the part of the scene that fusion reads: the crop's box, and what is near the object in place."""
+    scene_from_level = Sim3(1.0, np.array(value(crop_json, "level_from_scene")).T, np.zeros(3))
+    low, high = box_around(value(crop_json, "box_low"), value(crop_json, "box_high"), scene_from_level)
+    if pose is None:
+        return low, high
+    placed = obj.transformed(pose)
+    reach = NEAR * placed.diagonal + NEAR_SPACINGS * step
+    return np.minimum(low, placed.points.min(0) - reach), np.maximum(high, placed.points.max(0) + reach)
+
+
+def _by_evidence(
+    obj: Cloud, scene: Cloud, pose: Sim3, inputs: FusionInputs, registration: dict[str, Any], settings: FusionSettings
+) -> Fused:
+    """`fuse_by_evidence` of an object in its own frame, with what its pose adds to the deviations."""
+    placed = obj.transformed(pose)
+    photos = photos_of(inputs.object_workspace, obj.points, pose), photos_of(inputs.scene_workspace, placed.points)
+    fused = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
+    covariance = value(registration, "covariance") if "covariance" in registration else None
+    if covariance is None:
+        return fused
+    added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
+    return replace(fused, added=added)
+
+
+def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
+    """What can be done of `evidence` with the photos that there are, and notes of what cannot.
+
+    An object given as a cloud was measured by something else: where no photo contradicts its points, they fill what the
+    scene lacks, marked as not confirmed. Without any photo, distances alone decide.
+    """
+    if settings.mode != "evidence" or object_photos:
+        return settings, []
+    if scene_photos:
+        note = (
+            "the object has no photos: what the scene's neither confirm nor contradict is added where nothing else is"
+        )
+        return replace(settings, nerf_only=True), [note]
+    note = "neither side has photos: no point is checked; the object's points fill what the scene lacks, by distance"
+    return replace(settings, mode="fill"), [note]
+
+
+def is_placed(registration: dict[str, Any]) -> bool:
+    """Whether a fine registration's JSON puts the object into the scene: accepted, or made without any check."""
+    return value(registration, "status") in ("registered", "ungated")
+
+
+def uncertainty_on_scene(registration: dict[str, Any]) -> Uncertainty | None:
+    """Of a pose on the scene as it is, by a fine registration's JSON; None where nothing checked the pose."""
+    known = value(registration, "on_scene") if "on_scene" in registration else {}
+    covariance = known["covariance"]["value"] if known else None
+    return None if covariance is None else Uncertainty.of(np.array(covariance))
+
+
+def fuse_by_evidence(
+    obj: Cloud,
+    scene: Cloud,
+    of_obj: Photos,
+    of_scene: Photos,
+    settings: FusionSettings,
+    uncertainty: Uncertainty | None = None,
+) -> Fused:
+    """Fuse by what photos know of the points of both sides; see `weigh`.
+
+    Args:
+        obj: the object in the scene's frame, registered.
+        scene: the scene around it, or all of it.
+        of_obj: the object's photos in the scene's frame.
+        of_scene: the scene's photos that see the object.
+        settings: see FusionSettings.
+        uncertainty: of the object's pose on the scene, where it is known.
+    """
+    certain = None if uncertainty is None else uncertainty.size(obj.diagonal)
+    rows = np.flatnonzero(around(scene, obj))
+    near = scene[rows]
+    weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only, certain)
+    step = spacing(near.points)
+    moved, gain, bias = with_colors_of(weighed.obj, near, FILL_SPACINGS * step, settings.match_colors)
+    added = thinned(moved[weighed.added], settings.density * step)
+    if len(near):
+        kept = near[weighed.reason == KEPT]
+        added = feathered(added, kept, FEATHER_SPACINGS * step, FILL_SPACINGS * step)
+    whole = unchecked(scene)
+    for name, values in whole.fields.items():
+        values[rows] = weighed.scene.fields[name]
+    return Fused(whole, rows, weighed.reason, added, gain, bias, FILL_SPACINGS * step, weighed)
+
+
+def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings: FusionSettings) -> Fused:
+    """Fuse without asking photos; see `fuse_clouds`."""
+    fusion = fuse_clouds(obj, scene, part, pose, settings)
+    rows = np.flatnonzero(~fusion.kept)
+    reason = np.full(len(rows), REPLACED, np.uint8)
+    added = unchecked(fusion.added)
+    return Fused(unchecked(scene), rows, reason, added, fusion.gain, fusion.bias, fusion.fill_distance)
+
+
+def _unchanged(obj: Cloud, scene: Cloud) -> Fused:
+    """The scene as it is, with nothing of the object."""
+    nothing = unchecked(obj[np.zeros(len(obj), dtype=bool)])
+    none = np.zeros(0, np.int64)
+    return Fused(unchecked(scene), none, none.astype(np.uint8), nothing, np.ones(3), np.zeros(3), 0.0)
+
+
+def photos_of(workspace: Path | None, points: Array, frame: Sim3 | None = None) -> Photos:
+    """The photos that see points (N, 3; the workspace's frame), moved by `frame`; none without a workspace."""
+    if workspace is None:
+        return pack([])
+    photos = read_photos(read_workspace(workspace), points)
+    return moved_photos(photos, frame) if frame else photos
+
+
+def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionOutputs) -> None:
+    """The clouds; rows: (N,) of the part of the scene in its cloud."""
+    kept, added = with_source(fused.kept, FROM_SCENE), with_source(fused.added, FROM_OBJECT)
+    write_cloud(outputs.fused, together(_in_box(kept, crop_json), added))
+    checked = fused.scene[fused.rows]
+    checked.fields["row"], checked.fields["reason"] = rows[fused.rows].astype(np.uint32), fused.reason
+    write_cloud(outputs.checked, checked)
+
+
+def _report(
+    fused: Fused, registration: dict[str, Any], scene_points: int, scene_spacing: float, unit: str
+) -> dict[str, Any]:
+    """What was added and taken away, with units."""
+    added, weighed = fused.added, fused.weighed
+    unconfirmed = None if weighed is None else int((weighed.obj.fields["evidence"] == NERF_ONLY).sum())
+    return {
+        "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
+        "registration": quantity(value(registration, "status"), ""),
+        "reason": quantity(value(registration, "reason"), ""),
+        "scene_points": quantity(scene_points, "points"),
+        "checked_points": quantity(len(fused.rows), "points"),
+        "removed_points": quantity(len(fused.removed), "points"),
+        "added_points": quantity(len(added), "points"),
+        "nerf_only_points": quantity(unconfirmed, "points"),
+        "scene_spacing": quantity(scene_spacing, unit),
+        "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
+        "settled_by": quantity(None if weighed is None else weighed.moved, "diagonals"),
+        "fill_distance": quantity(fused.same_distance, unit),
+        "color_gain": quantity(fused.gain, "1"),
+        "color_bias": quantity(fused.bias, "of 255"),
+    }
+
+
+def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
+    """What photos say of both sides' points; without `evidence`, only what was taken away.
+
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added, better in the scene, or
+    contradicted. Of the others, `object_unasked` lie where fewer than three photos could be compared. `added_photos`
+    says how many photos confirm the measured points that were added.
+    """
+    removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
+    content = {"scene_removed": quantity(removed, "points")}
+    weighed = fused.weighed
+    if weighed is None:
+        return content | {"notes": quantity(["no photo was asked"], "")}
+    kinds, left = weighed.obj.fields["evidence"], weighed.reason == KEPT
+    measured, of_scene = kinds == MEASURED, weighed.scene.fields["evidence"] == MEASURED
+    middle = float(np.median(weighed.obj.fields["deviation"][measured])) if measured.any() else None
+    return content | {
+        "object_points": quantity(len(kinds), "points"),
+        "object_measured": quantity(int(measured.sum()), "points"),
+        "object_nerf_only": quantity(int((kinds == NERF_ONLY).sum()), "points"),
+        "object_contradicted": quantity(int(weighed.contradicted.sum()), "points"),
+        "object_measured_contradicted": quantity(int((measured & weighed.contradicted).sum()), "points"),
+        "object_better_in_scene": quantity(int((measured & ~weighed.contradicted & ~weighed.added).sum()), "points"),
+        "object_added": quantity(int(weighed.added.sum()), "points"),
+        "deviation_median": quantity(middle, unit),
+        "object_measured_share": quantity(float(measured.mean()) if len(measured) else None, "1"),
+        "object_unasked": quantity(int((~measured & np.isnan(weighed.obj.fields["match"])).sum()), "points"),
+        "added_photos": quantity(_quantiles(weighed.obj.fields["photos"][weighed.added & measured]), "photos"),
+        "scene_checked": quantity(len(left), "points"),
+        "scene_measured": quantity(int(of_scene.sum()), "points"),
+        "scene_stereo_only": quantity(int((~of_scene).sum()), "points"),
+        "scene_kept": quantity(int(left.sum()), "points"),
+        "scene_kept_measured": quantity(int((left & of_scene).sum()), "points"),
+        "settled_by": quantity(weighed.moved, "diagonals"),
+        "notes": quantity(list(weighed.notes), ""),
+    }
+
+
+def _quantiles(values: NDArray[Any]) -> dict[str, float] | None:
+    """Least, median and largest of (N,) values, and the twentieth from below."""
+    if not len(values):
+        return None
+    places = {"least": 0.0, "5 %": 0.05, "median": 0.5, "largest": 1.0}
+    return {name: float(np.quantile(values, place, method="lower")) for name, place in places.items()}
+
+
+def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:
+    """The points in the box of a crop stage."""
+    low, high = np.array(value(crop_json, "box_low")), np.array(value(crop_json, "box_high"))
+    levelled = cloud.points @ np.array(value(crop_json, "level_from_scene")).T
+    return cloud[((levelled >= low) & (levelled <= high)).all(1)]

@@ -1,0 +1,1 @@
+"""Geometry that several parts use: pairs and ICP, ground, visual hull, visibility, matching of patches."""

@@ -1,0 +1,190 @@
+"""Depth maps held against each other: which pixels other views confirm, and normals from depth."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from scenefuse.core.transforms import Array
+
+MOST_VIEWS = 64
+"""Views that a view is compared with at most: what more photos cost then grows with them, not with their square."""
+
+POINTS_A_BLOCK = 4096
+"""Points that a thread takes through the maps together."""
+
+
+@dataclass(frozen=True)
+class DepthAgreement:
+    """How the depths of other views agree with N points of one view.
+
+    Attributes:
+        agree: (N,) views whose depth at the point is the point's own, within the tolerance.
+        through: (N,) views that see past the point: it floats in front of their surface.
+        hidden: (N,) views for which the point is behind their surface.
+        off_mask: (N,) views in whose picture the point lies off the mask, with nothing before it.
+        mean: (N, 3) mean of the point and the points that agree with it.
+        compared: number of other views.
+    """
+
+    agree: NDArray[np.int32]
+    through: NDArray[np.int32]
+    hidden: NDArray[np.int32]
+    off_mask: NDArray[np.int32]
+    mean: Array
+    compared: int
+
+
+def others(view: int, frame_from_cam: Array) -> NDArray[np.int64]:
+    """Indices of the views that `view` is compared with: all others, of many the near ones and ever fewer farther off.
+
+    Near views see the same surface, far ones see it from another side and have it in their outline.
+
+    Args:
+        view: index of a view.
+        frame_from_cam: (V, 4, 4).
+    """
+    centres = frame_from_cam[:, :3, 3]
+    order = np.argsort(np.linalg.norm(centres - centres[view], axis=1), kind="stable")
+    order = order[order != view]
+    if len(order) <= MOST_VIEWS:
+        return np.sort(order)
+    step = np.arange(MOST_VIEWS)
+    spare = len(order) - MOST_VIEWS
+    return np.sort(order[step + np.floor(spare * (step / (MOST_VIEWS - 1)) ** 2).astype(np.int64)])
+
+
+def back_project(
+    depth: Array, intrinsics: Array, frame_from_cam: Array, rows: NDArray[Any], columns: NDArray[Any]
+) -> Array:
+    """Points (N, 3) of pixels (integer rows and columns) with depths (N,) along z."""
+    x = (columns + 0.5 - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (rows + 0.5 - intrinsics[1, 2]) / intrinsics[1, 1]
+    in_camera = np.stack([x, y, np.ones_like(x)], axis=1) * depth[:, None]
+    return in_camera @ frame_from_cam[:3, :3].T + frame_from_cam[:3, 3]
+
+
+def surface_points(
+    depth: NDArray[np.float32], intrinsics: Array, frame_from_cam: Array
+) -> tuple[Array, NDArray[Any], NDArray[Any]]:
+    """Points (N, 3) of all pixels of a map (H, W) that have a depth, and their rows and columns."""
+    rows, columns = np.nonzero(depth > 0)
+    known = depth[rows, columns].astype(np.float64)
+    return back_project(known, intrinsics, frame_from_cam, rows, columns), rows, columns
+
+
+def extent(points: Array) -> float:
+    """Diagonal of the box of points (N, 3), half a per cent at each side left out; 0 without points."""
+    if len(points) == 0:
+        return 0.0
+    low, high = np.percentile(points, [0.5, 99.5], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def compare(
+    points: Array,
+    view: int,
+    depths: NDArray[np.float32],
+    masks: NDArray[np.bool_],
+    intrinsics: Array,
+    frame_from_cam: Array,
+    tolerance: float,
+    covered: NDArray[np.float32] | None = None,
+) -> DepthAgreement:
+    """Project points of one view into the others (of many, `others`) and compare depths.
+
+    Args:
+        points: (N, 3) in the cameras' common frame.
+        view: index of the view they come from.
+        depths: (V, H, W) along z, 0 for none.
+        masks: (V, H, W), True on the object and a little around it.
+        intrinsics: (V, 3, 3) in pixels.
+        frame_from_cam: (V, 4, 4).
+        tolerance: largest difference of depth that agrees, unit of the frame.
+        covered: (V, H, W) depth along z from which on a view sees nothing off its mask, where it is known.
+    """
+    compared = others(view, frame_from_cam)
+    counts, total = np.zeros((4, len(points)), np.int32), points.astype(np.float64)
+    known = np.zeros((0, 0, 0), np.float32) if covered is None else covered
+    cameras = intrinsics.astype(np.float64), frame_from_cam.astype(np.float64)
+    _compare(points.astype(np.float64), compared, depths, masks, known, *cameras, tolerance, counts, total)
+    agree, through, hidden, off_mask = counts
+    return DepthAgreement(agree, through, hidden, off_mask, total / (agree + 1)[:, None], len(compared))
+
+
+@njit(parallel=True, cache=True, error_model="numpy")
+def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_cam, tolerance, counts, total):  # type: ignore[no-untyped-def]
+    """Add to counts (4, N) of `DepthAgreement` and to the sum (N, 3) of the points that agree.
+
+    A thread takes neighbouring points through one map after the other: what they look up stays in its cache.
+    """
+    height, width = depths.shape[1:]
+    for block in prange((len(points) + POINTS_A_BLOCK - 1) // POINTS_A_BLOCK):
+        for other in compared:
+            pose, k = frame_from_cam[other], intrinsics[other]
+            for n in range(block * POINTS_A_BLOCK, min((block + 1) * POINTS_A_BLOCK, len(points))):
+                dx, dy, dz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
+                z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
+                if not z > 0:
+                    continue
+                x = dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]
+                y = dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]
+                u, v = x / z * k[0, 0] + k[0, 2], y / z * k[1, 1] + k[1, 2]
+                if not (u >= 0 and u < width and v >= 0 and v < height):
+                    continue
+                row, column = int(v), int(u)
+                if not masks[other, row, column] and (len(covered) == 0 or z < covered[other, row, column]):
+                    counts[3, n] += 1
+                measured = depths[other, row, column]
+                if not measured > 0:
+                    continue
+                if z - measured < -tolerance:
+                    counts[1, n] += 1
+                elif z - measured > tolerance:
+                    counts[2, n] += 1
+                else:
+                    counts[0, n] += 1
+                    # The other view's depth, taken along the ray through the point itself, not the pixel's centre.
+                    for axis in range(3):
+                        along = x * pose[axis, 0] + y * pose[axis, 1] + z * pose[axis, 2]
+                        total[n, axis] += along * measured / z + pose[axis, 3]
+
+
+def normals_from_depth(
+    depth: NDArray[np.float32], intrinsics: Array, radius_px: int, jump: float
+) -> NDArray[np.float32]:
+    """Unit normals (H, W, 3) in the camera frame, towards the camera, zero where there is no depth.
+
+    Differences are taken over `radius_px` on the side where the depth changes less, so that edges stay sharp.
+
+    Args:
+        depth: (H, W) along z, 0 for none.
+        intrinsics: (3, 3) in pixels.
+        radius_px: distance of the differences.
+        jump: relative change of depth beyond which two pixels are not one surface.
+    """
+    rows, columns = np.indices(depth.shape)
+    points = back_project(
+        depth.reshape(-1).astype(np.float64), intrinsics, np.eye(4), rows.reshape(-1), columns.reshape(-1)
+    )
+    points = points.reshape(*depth.shape, 3)
+    tangents = []
+    for axis in (1, 0):
+        sides = []
+        for sign in (1, -1):
+            shifted = np.roll(points, -sign * radius_px, axis=axis)
+            step = (shifted - points) * sign
+            bad = (depth <= 0) | (shifted[..., 2] <= 0) | (np.abs(step[..., 2]) > jump * np.maximum(depth, 1e-9))
+            edge = [slice(None), slice(None)]
+            edge[axis] = slice(-radius_px, None) if sign > 0 else slice(0, radius_px)
+            bad[tuple(edge)] = True
+            sides.append(np.where(bad[..., None], np.nan, step))
+        both = np.nansum(np.stack(sides), axis=0)
+        both[np.isnan(sides[0][..., 0]) & np.isnan(sides[1][..., 0])] = np.nan
+        tangents.append(both)
+    normal = -np.cross(tangents[0], tangents[1])
+    with np.errstate(invalid="ignore"):
+        normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-30)
+    return np.nan_to_num(normal).astype(np.float32)

@@ -1,0 +1,205 @@
+"""ICP for similarities on two-way pairs: Tukey-weighted points first, then planes and colours."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.geometry.pairs import Pairs, color_gain, pair
+from scenefuse.geometry.surface import Surface
+
+# Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
+POINT_WEIGHT = 0.1
+# A step that moves the points by less than this share of the pairing distance is the last.
+CONVERGED = 0.005
+# Weight of colour rows against geometry in the polish; both are in units of their own spread.
+COLOR_WEIGHT = 0.3
+# Fewer pairs than this in either direction fix no similarity.
+MIN_PAIRS = 10
+
+
+@dataclass(frozen=True)
+class ScaleRange:
+    """The scale prior: a centre and a width, as natural logarithm; width 0 holds the scale fixed."""
+
+    centre: float
+    width: float
+
+    def clamp(self, scale: float) -> float:
+        """The nearest scale inside the prior."""
+        return float(np.clip(scale, self.centre * np.exp(-self.width), self.centre * np.exp(self.width)))
+
+    def widened(self, more: float) -> "ScaleRange":
+        """A wider prior; one of no width stays fixed."""
+        return ScaleRange(self.centre, self.width + more if self.width > 0 else 0.0)
+
+    def at_edge(self, scale: float) -> bool:
+        """Whether a scale presses against a bound of the prior: then the truth may lie outside."""
+        return self.width > 0 and abs(np.log(scale / self.centre)) > self.width - 0.01
+
+
+def refine_points(
+    obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, tau: tuple[float, float], rounds: int
+) -> Sim3:
+    """Two-way ICP with Tukey weights and Horn's symmetric scale (Horn 1987), threshold shrinking from tau[0] to tau[1].
+
+    Pairs from both directions count alike: a one-way fit with free scale shrinks the object.
+    """
+    pose = start
+    for step in range(rounds):
+        threshold = tau[0] * (tau[1] / tau[0]) ** (step / max(rounds - 1, 1))
+        pairs = pair(obj, scene, pose, threshold)
+        backward = len(pairs.distance) - pairs.forward
+        if min(pairs.forward, backward) < MIN_PAIRS:
+            return pose
+        weights = _two_way_weights(pairs, threshold)
+        x, y = obj.points[pairs.object_index], scene.points[pairs.scene_index]
+        mean_x, mean_y = weights @ x / weights.sum(), weights @ y / weights.sum()
+        spread_x, spread_y = weights @ ((x - mean_x) ** 2).sum(1), weights @ ((y - mean_y) ** 2).sum(1)
+        pose = fit_sim3(x, y, weights, scale=scales.clamp(float(np.sqrt(spread_y / spread_x))))
+    return pose
+
+
+def refine_planes(
+    obj: Surface,
+    scene: Surface,
+    start: Sim3,
+    scales: ScaleRange,
+    tau: float,
+    rounds: int,
+    color_weight: float,
+) -> Sim3:
+    """Gauss-Newton over the seven parameters: planes and points both ways, and colours along the scene's surface.
+
+    A colour row compares the object's colour (after a gain and bias) with the scene's colour carried to the same
+    place along its tangent plane (Park, Zhou, Koltun 2017). Both kinds of rows are divided by their own robust spread.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        start: scene_from_object to begin with.
+        scales: bounds of the scale.
+        tau: pairs within this distance, scene units.
+        rounds: iterations at most; a step that moves the points by less than 0.5 % of `tau` is the last.
+        color_weight: weight of the colour rows; 0 for geometry alone.
+    """
+    pose = start
+    for _ in range(rounds):
+        rows = _rows(obj, scene, pose, tau, color_weight)
+        if rows is None:
+            return pose
+        system, right = rows.normal_equations()
+        if scales.width == 0:
+            system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
+        step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
+        pose = _apply_step(pose, step, rows.centre, scales)
+        if _motion(step, rows) < CONVERGED * tau:
+            break
+    return pose
+
+
+def _motion(step: Array, rows: "_Rows") -> float:
+    """How far a step moves the paired points, scene units."""
+    return float(np.linalg.norm(step[3:6]) + rows.reach * (np.linalg.norm(step[:3]) + abs(step[6])))
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """The linearised fit at one pose: `jacobian` step + `residual` = 0, over rotation, translation and log scale.
+
+    Attributes:
+        jacobian: (M, 7).
+        residual: (M,).
+        weight: (M,).
+        centre: (3,) that the step turns and grows about.
+        reach: RMS distance of the paired points from it.
+    """
+
+    jacobian: Array
+    residual: Array
+    weight: Array
+    centre: Array
+    reach: float
+
+    def normal_equations(self) -> tuple[Array, Array]:
+        return self.jacobian.T @ (self.weight[:, None] * self.jacobian), self.jacobian.T @ (self.weight * self.residual)
+
+
+def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float) -> _Rows | None:
+    """Rows of the pairs both ways, None with too few: point-to-plane, a little point-to-point against the sliding that
+    planes leave free, and colours where both sides have them."""
+    pairs = _without_overhang(obj, scene, pose, tau, pair(obj, scene, pose, tau))
+    if min(pairs.forward, len(pairs.distance) - pairs.forward) < MIN_PAIRS:
+        return None
+    p, q = pose.apply(obj.points[pairs.object_index]), scene.points[pairs.scene_index]
+    centre = p.mean(0)
+    # The object's normals: its cloud is the denser and the cleaner one.
+    normals = pose.rotate(obj.normals[pairs.object_index])
+    facing = np.abs((normals * scene.normals[pairs.scene_index]).sum(1))
+    weights = _two_way_weights(pairs, tau) * np.sqrt(facing)
+    parts = [_weighted(p - centre, normals, ((p - q) * normals).sum(1), weights)]
+    for axis in np.eye(3):
+        along = np.broadcast_to(axis, p.shape)
+        parts.append(_weighted(p - centre, along, (p - q) @ axis, POINT_WEIGHT * weights))
+    if color_weight > 0 and obj.colors is not None and scene.colors is not None:
+        gain, bias = color_gain(obj, scene, pairs)
+        ahead = slice(0, pairs.forward)
+        slopes = scene.color_slopes()[pairs.scene_index[ahead]]
+        mine = gain * obj.colors[pairs.object_index[ahead]] + bias
+        theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, (p - q)[ahead])
+        for channel in range(3):
+            off = (theirs - mine)[:, channel]
+            parts.append(_weighted((p - centre)[ahead], slopes[:, channel], off, color_weight / 3 * weights[ahead]))
+    jacobian, residual, weight = (np.concatenate(kind) for kind in zip(*parts))
+    return _Rows(jacobian, residual, weight, centre, float(np.sqrt(((p - centre) ** 2).sum(1).mean())))
+
+
+def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pairs: Pairs) -> Pairs:
+    """The pairs without object points beyond the rim of what the scene shows.
+
+    They all meet the rim and would pull inwards: the less the scene shows, the more the object would shrink (Turk and
+    Levoy 1994 leave out pairs at rims for that). They are known by their partner's own nearest object point, which is
+    more than half of `tau` away.
+    """
+    ahead = slice(0, pairs.forward)
+    own = obj.nearest(pose.inverse().apply(scene.points[pairs.scene_index[ahead]]), np.inf)[1]
+    aside = np.linalg.norm(obj.points[own] - obj.points[pairs.object_index[ahead]], axis=1) * pose.scale
+    keep = np.concatenate([aside < tau / 2, np.ones(len(pairs.distance) - pairs.forward, dtype=bool)])
+    kept = int(keep[ahead].sum())
+    return Pairs(pairs.object_index[keep], pairs.scene_index[keep], pairs.distance[keep], kept)
+
+
+def _two_way_weights(pairs: Pairs, tau: float) -> Array:
+    """Tukey's biweight of the distance; each direction sums to a half."""
+    weights = (1 - np.minimum(pairs.distance / tau, 1) ** 2) ** 2
+    ahead, back = weights[: pairs.forward].sum(), weights[pairs.forward :].sum()
+    share = np.where(np.arange(len(weights)) < pairs.forward, 1 / max(ahead, 1e-12), 1 / max(back, 1e-12))
+    return 0.5 * weights * share
+
+
+def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array, Array]:
+    """Rows direction . (rotation x lever + translation + growth lever) + residual, and their Huber weights.
+
+    Residuals are divided by their robust spread, so that kinds of rows can be added.
+    """
+    spread = 1.4826 * np.median(np.abs(residual - np.median(residual))) + 1e-12
+    weight = weight * np.minimum(1, 2 * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
+    jacobian = np.concatenate(
+        [np.cross(lever, direction), direction, (lever * direction).sum(1, keepdims=True)], axis=1
+    )
+    return jacobian, residual, weight
+
+
+def _apply_step(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:
+    """Rotate and grow about `centre`, shift, and keep the scale in its prior."""
+    angle = np.linalg.norm(step[:3])
+    rotation = np.eye(3)
+    if angle > 0:
+        x, y, z = step[:3] / angle
+        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        rotation = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
+    scale = scales.clamp(pose.scale * float(np.exp(np.clip(step[6], -0.05, 0.05))))
+    growth = scale / pose.scale
+    about = Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre))
+    moved = about @ pose
+    return Sim3(scale, moved.rotation, moved.translation)

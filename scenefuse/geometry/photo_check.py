@@ -1,0 +1,229 @@
+"""Points checked in photos: where windows around a point match, it is measured, and how exactly is known.
+
+Sources: Furukawa and Ponce 2010 (patches in the tangent plane, photo-consistency from the best photos); Goesele et al.
+2006 (of several views the best count); Yoon and Kweon 2006 (weights that keep a window on one surface); Foerstner
+1982 (variance of a match from the gradients and the noise).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.photo_kernel import OFFSETS, match_points
+from scenefuse.photos.workspace import View, Workspace
+
+MIN_MATCH = 0.6
+"""Least weighted NCC of a photo that confirms a point."""
+SLACK = 0.1
+"""A photo whose score is better by more at another offset does not confirm a point."""
+LEAST_PHOTOS = 3
+"""Photos that must confirm a point for it to be measured."""
+MOST_DEVIATION = 1.2
+"""Of a step (about a pixel), the largest standard deviation of a measured point: windows that match as well farther on
+measure nothing, sky and blank walls above all."""
+MOST_PHOTOS = 64
+"""Photos of one side that points are checked in at most: from the most different directions."""
+ENOUGH, USEFUL = (3, 6, 12), 0.5
+"""Of these, photos that have a place in their picture, all places first three; a photo is as good as the best one that
+shows this share of what that one shows of places that have not yet."""
+HALVINGS = 1
+"""How often a point that photos match nowhere near is tried again in photos of half the size."""
+SEEN_SHARE = 0.02
+"""A photo that has less of an object in its picture is not asked."""
+PEAK_FACTOR = 0.6
+"""Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
+next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth."""
+PIXEL_ERROR = 0.07
+"""Of a step (about a pixel): what is common to a point's matches, interpolation above all, and does not average out."""
+NOISE_FACTOR = 1.8
+"""The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
+beside each other their pixels."""
+
+
+@dataclass(frozen=True)
+class Photos:
+    """V photos in one frame, packed for the kernel.
+
+    Attributes:
+        views: their cameras, without pixels.
+        pixels: uint8 grey values, one photo behind the other.
+        starts: (V,) int64 place of each in `pixels`.
+    """
+
+    views: list[View]
+    pixels: NDArray[np.uint8]
+    starts: NDArray[np.int64]
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        """(V, 2) width and height."""
+        return np.array([(v.width, v.height) for v in self.views], dtype=np.int64).reshape(-1, 2)
+
+    @property
+    def projections(self) -> Array:
+        """(V, 3, 4)."""
+        return np.array([v.projection for v in self.views]).reshape(-1, 3, 4)
+
+    @property
+    def centres(self) -> Array:
+        """(V, 3)."""
+        return np.array([v.centre for v in self.views]).reshape(-1, 3)
+
+    @property
+    def rights(self) -> Array:
+        """(V, 3) x axes of the cameras."""
+        return np.array([v.cam_from_world[0, :3] for v in self.views]).reshape(-1, 3)
+
+    @property
+    def focals(self) -> Array:
+        """(V,) in pixels."""
+        return np.array([np.sqrt(v.intrinsics[0, 0] * v.intrinsics[1, 1]) for v in self.views])
+
+
+def pack(views: list[View]) -> Photos:
+    """Views with grey pixels (H, W) uint8, made ready for the kernel."""
+    lengths = [view.width * view.height for view in views]
+    pixels = np.concatenate([view.pixels.reshape(-1) for view in views]) if views else np.zeros(0, np.uint8)
+    starts = np.concatenate([[0], np.cumsum(lengths)[:-1]]).astype(np.int64) if views else np.zeros(0, np.int64)
+    return Photos([replace(view, pixels=None) for view in views], pixels, starts)
+
+
+def unpacked(photos: Photos) -> list[View]:
+    """The views with their pixels (H, W)."""
+    parts = np.split(photos.pixels, photos.starts[1:])
+    return [replace(v, pixels=part.reshape(v.height, v.width)) for v, part in zip(photos.views, parts)]
+
+
+def read_photos(workspace: Workspace, points: Array) -> Photos:
+    """The photos of a workspace that have points (N, 3; its frame) in their picture, packed for the kernel."""
+    sample = points[:: max(1, len(points) // 2000)]
+    shown = np.zeros((len(workspace.views), len(sample)), dtype=bool)
+    for row, view in zip(shown, workspace.views):
+        row[view.visible(sample)[0]] = True
+    asked = np.flatnonzero(shown.sum(1) > SEEN_SHARE * len(sample))
+    if len(asked) > MOST_PHOTOS:
+        print(f"{MOST_PHOTOS} of the {len(asked)} photos that show the object are asked", flush=True)
+        centres = np.array([workspace.views[k].centre for k in asked])
+        asked = asked[covering(shown[asked], centres, sample, MOST_PHOTOS)]
+    return pack([workspace.gray(workspace.views[k]) for k in asked])
+
+
+def covering(shown: NDArray[np.bool_], centres: Array, points: Array, most: int) -> NDArray[np.int64]:
+    """Rows of photos, sorted: every point is in enough of them where it can be, from the most different directions.
+
+    Args:
+        shown: (V, N), which photos have which points in their picture; each has one.
+        centres: (V, 3) of the cameras.
+        points: (N, 3).
+        most: how many photos to choose.
+    """
+    directions = centres - (shown @ points) / shown.sum(1, keepdims=True)
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    chosen: list[int] = []
+    nearest, times = np.full(len(shown), -np.inf), np.zeros(len(points), dtype=np.int64)
+    while len(chosen) < min(most, len(shown)):
+        left = np.delete(np.arange(len(shown)), chosen)
+        lacking = next(
+            (times < many for many in ENOUGH if shown[left][:, times < many].any()), np.zeros(len(points), bool)
+        )
+        gain = (shown & lacking).sum(1)
+        gain[chosen] = -1
+        # Of photos that show about as much of what few have shown, the one from where none was taken.
+        worth = np.where(gain >= USEFUL * gain.max(), nearest, np.inf)
+        worth[chosen] = np.inf
+        chosen.append(int(worth.argmin()))
+        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
+        times += shown[chosen[-1]]
+    return np.sort(chosen)
+
+
+def moved_view(view: View, b_from_a: Sim3) -> View:
+    """A camera of frame a in frame b, whose unit its depths have then."""
+    pose = np.eye(4)
+    pose[:3, :3] = view.cam_from_world[:3, :3] @ b_from_a.rotation.T
+    pose[:3, 3] = b_from_a.scale * view.cam_from_world[:3, 3] - pose[:3, :3] @ b_from_a.translation
+    return replace(view, cam_from_world=pose)
+
+
+def moved_photos(photos: Photos, b_from_a: Sim3) -> Photos:
+    """Photos of frame a in frame b."""
+    return replace(photos, views=[moved_view(view, b_from_a) for view in photos.views])
+
+
+@dataclass(frozen=True)
+class Matches:
+    """How well N points match in a set of photos.
+
+    Attributes:
+        match: (N,) mean score of the best photos at the point, -1..1; -1 where fewer than three photos see it.
+        best: (N,) the same at the offset along the ray where it is largest.
+        photos: (N,) photos that confirm the point.
+        tested: (N,) photos that it was matched in, its reference not counted.
+        deviation: (N,) standard deviation of its place, unit of the points; infinite where no photo confirms it.
+        texture: (N,) standard deviation of the reference's window, grey levels.
+        step: (N,) how far a point moves along the ray for about a pixel in the other photos, unit of the points.
+    """
+
+    match: Array
+    best: Array
+    photos: NDArray[np.int64]
+    tested: NDArray[np.int64]
+    deviation: Array
+    texture: Array
+    step: Array
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """(N,) points that enough photos confirm, where a match says where they are: to MOST_DEVIATION."""
+        return (self.photos >= LEAST_PHOTOS) & (self.deviation <= MOST_DEVIATION * self.step)
+
+
+def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
+    """Match points (N, 3) with unit normals (N, 3), towards the photos, in photos of the same frame.
+
+    Where photos match nowhere along the ray, they are asked again at half their size: faint texture that noise or blur
+    hides in single pixels may show there, and less exactly.
+    """
+    found = _match(points, normals, photos)
+    for _ in range(HALVINGS):
+        photos, rest = halved(photos), np.flatnonzero(~found.measured & (found.best < MIN_MATCH))
+        coarse = _match(points[rest], None if normals is None else normals[rest], photos)
+        for kept, tried in zip(vars(found).values(), vars(coarse).values()):
+            kept[rest[coarse.measured]] = tried[coarse.measured]
+    return found
+
+
+def halved(photos: Photos) -> Photos:
+    """The photos at half their size."""
+    return pack([view.resized(view.width // 2, view.height // 2) for view in unpacked(photos)])
+
+
+def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
+    """`match_in` at one size of the photos."""
+    count = len(points)
+    curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
+    tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    texture, step = np.zeros(count), np.zeros(count)
+    if count and len(photos.views) >= LEAST_PHOTOS:
+        match_points(
+            np.ascontiguousarray(points), np.ascontiguousarray(normals, dtype=np.float64), photos.pixels, photos.starts,
+            photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
+            curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
+        )  # fmt: skip
+    away = PEAK_FACTOR * _peak(curve) * step
+    deviation = np.sqrt(away**2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)
+    deviation = np.where(confirming > 0, deviation, np.inf)
+    return Matches(curve[:, OFFSETS], curve.max(1), confirming, tested, deviation, texture, step)
+
+
+def _peak(curve: Array) -> Array:
+    """Where scores (N, STEPS) are largest, in steps from the point: a parabola through the best and its sides."""
+    best = np.clip(curve.argmax(1), 1, curve.shape[1] - 2)
+    rows = np.arange(len(curve))
+    before, middle, after = (curve[rows, best + k] for k in (-1, 0, 1))
+    bend = before - 2 * middle + after
+    part = np.where(bend < 0, 0.5 * (before - after) / np.where(bend < 0, bend, -1.0), 0.0)
+    return np.asarray(best + np.clip(part, -1, 1) - OFFSETS, dtype=np.float64)

@@ -1,0 +1,213 @@
+"""The visual hull of an object: a voxel grid carved by the masks of all photos, with a share of them allowed to err.
+
+Source: Laurentini 1994 (visual hull), with voting instead of a strict intersection.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from scenefuse.core.transforms import Array
+from scenefuse.photos.workspace import View
+
+Mask = NDArray[np.bool_]
+Counts = NDArray[np.int32]
+
+BATCH = 4
+"""Photos after which `carve` leaves out the voxels that are decided: most are, early."""
+LEAST_FRAMING, RARELY_FRAMED, LEAST_PHOTOS = 0.25, 10, 2
+"""Of `least_framing`: the share; the percentile of the own points; never fewer photos."""
+LEAST_OWN, LEAST_WHOLE = 20, 1 / 3
+"""Own points that say how many photos have a part; else those with all of it, or so large a share of all photos."""
+NO_POINTS: Array = np.zeros((0, 3))
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box in the object's frame.
+
+    Attributes:
+        object_from_box: (3, 4) pose; the box's third axis is up.
+        low, high: (3,) extents along the box's axes, in object units.
+    """
+
+    object_from_box: Array
+    low: Array
+    high: Array
+
+    def corners(self) -> Array:
+        """(8, 3) corners in the object's frame."""
+        picks = np.array([[i & 1, i >> 1 & 1, i >> 2] for i in range(8)], dtype=bool)
+        return self.to_object(np.where(picks, self.high, self.low))
+
+    def to_object(self, x_in_box: Array) -> Array:
+        """(N, 3) points from the box's axes to the object's frame."""
+        return x_in_box @ self.object_from_box[:, :3].T + self.object_from_box[:, 3]
+
+    def to_box(self, x_in_object: Array) -> Array:
+        """(N, 3) points from the object's frame to the box's axes."""
+        return (x_in_object - self.object_from_box[:, 3]) @ self.object_from_box[:, :3]
+
+    @property
+    def diagonal(self) -> float:
+        """Length of the diagonal, in object units."""
+        return float(np.linalg.norm(self.high - self.low))
+
+
+@dataclass(frozen=True)
+class Hull:
+    """The occupied voxels of a box.
+
+    Attributes:
+        shell: (N, 3) centres of the occupied voxels that have a free neighbour, in the object's frame.
+        voxel: side of a voxel, in object units.
+        volume: occupied share of the box, 0..1.
+    """
+
+    shell: Array
+    voxel: float
+    volume: float
+
+
+class Outline(NamedTuple):
+    """A photo of the hull: a view with `pixels` (H, W) bool, True on the object, and the depth (H, W) along z of what
+    it shows, infinite where that is unknown; None where it is unknown everywhere."""
+
+    view: View
+    depth: NDArray[np.float32] | None = None
+
+
+class Silhouettes(NamedTuple):
+    """How V photos show N points.
+
+    Attributes:
+        shown: (N,) photos that have the point in the frame, with nothing of the surroundings before it.
+        missed: (N,) of these, photos that have it off the mask.
+        hidden: (N,) photos in which something of the surroundings stands before it: they say nothing.
+        open: (N,) photos that have it on the mask, and not behind the surface that they are known to show there.
+    """
+
+    shown: Counts
+    missed: Counts
+    hidden: Counts
+    open: Counts
+
+
+def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond: float = 0.0) -> Silhouettes:
+    """How photos show points; with the counts a caller decides how many photos may err. Source: Laurentini 1994.
+
+    Args:
+        points: (N, 3) in the views' world, float32 or float64; projections are computed in their precision.
+        outlines: the photos.
+        beyond: how far behind the object's surface a point is still open, unit of the world.
+    """
+    counts = Silhouettes(*(np.zeros(len(points), dtype=np.int32) for _ in range(4)))
+    for view, first in outlines:
+        projection = view.projection.astype(points.dtype)
+        x, y, depth = (points @ projection[:, :3].T + projection[:, 3]).T
+        safe = np.maximum(depth, 1e-6)
+        u, v = (np.clip(c / safe, -1, 1e6).astype(np.int32) for c in (x, y))
+        rows = np.flatnonzero((depth > 0) & (x >= 0) & (u < view.width) & (y >= 0) & (v < view.height))
+        inside = view.pixels[v[rows], u[rows]]
+        away = np.full(len(rows), -np.inf) if first is None else depth[rows] - first[v[rows], u[rows]]
+        counts.hidden[rows] += ~inside & (away > 0)
+        counts.missed[rows] += ~inside & (away <= 0)
+        counts.open[rows] += inside & np.isfinite(away) & (away <= beyond)
+        counts.shown[rows] += inside | (away <= 0)
+    return counts
+
+
+def least_framing(views: Sequence[View], own: Array, share: float = LEAST_FRAMING) -> int:
+    """How many photos must have a place in their frame for it to be the object's, whatever they show there.
+
+    A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
+    head, some have a part only.
+
+    Args:
+        views: the photos, with masks as `pixels`.
+        own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
+        share: of these photos.
+    """
+    if len(own) >= LEAST_OWN:
+        framed = np.zeros(len(own), dtype=np.int64)
+        for view in views:
+            framed[view.visible(own)[0]] += 1
+        usual = float(np.percentile(framed, RARELY_FRAMED))
+    else:
+        usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
+    return max(LEAST_PHOTOS, int(np.ceil(share * usual)))
+
+
+def is_whole(mask: Mask) -> bool:
+    """Whether a mask (H, W) ends before the photo does."""
+    return bool(mask.any() and not (mask[[0, -1]].any() or mask[:, [0, -1]].any()))
+
+
+def carve(
+    box: Box,
+    height_of: Callable[[Array], Array],
+    silhouettes: list[View],
+    voxels: int,
+    tolerance: float,
+    own: Array = NO_POINTS,
+) -> Hull:
+    """The voxels of a box, above the ground, that all masks but a share of `tolerance` contain.
+
+    Args:
+        box: the space to carve from.
+        height_of: heights (N,) over the ground of (N, 3) points along the box's axes; nothing below 0
+            belongs to the object.
+        silhouettes: cameras with masks as `pixels`; a photo counts for the voxels in its frame.
+        voxels: number along the longest side.
+        tolerance: share of the photos that show a voxel which may have it outside their mask.
+        own: (N, 3) points on the object, for `least_framing`.
+    """
+    size = (box.high - box.low).max() / voxels
+    shape = np.maximum(np.ceil((box.high - box.low) / size).astype(int), 1)
+    index = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    x_in_box = box.low + (index + 0.5) * size
+    centres = box.to_object(x_in_box).astype(np.float32)
+    alive = np.flatnonzero(height_of(x_in_box) > 0)
+    shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
+    for start in range(0, len(silhouettes), BATCH):
+        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + BATCH]))
+        shown[alive] += counts.shown
+        missed[alive] += counts.missed
+        # A voxel outside more masks than all photos together could excuse is decided.
+        alive = alive[missed[alive] <= tolerance * len(silhouettes)]
+    occupied = np.zeros(len(centres), dtype=bool)
+    enough = shown[alive] >= least_framing(silhouettes, own)
+    occupied[alive] = enough & (missed[alive] <= tolerance * shown[alive])
+    grid = occupied.reshape(shape)
+    shell = grid & ~ndimage.binary_erosion(grid)
+    return Hull(centres[shell.ravel()].astype(np.float64), float(size), float(grid.mean()))
+
+
+def silhouette(hull: Hull, view: View) -> Mask:
+    """The hull as the photo sees it, (H, W)."""
+    drawn = np.zeros((view.height, view.width), dtype=np.uint8)
+    if len(hull.shell) == 0:
+        return drawn.astype(bool)
+    pixels, depth = view.project(hull.shell)
+    front = depth > 1e-6
+    if not front.any():
+        return drawn.astype(bool)
+    u, v = np.floor(pixels[front]).astype(int).T
+    inside = (u >= 0) & (u < view.width) & (v >= 0) & (v < view.height)
+    drawn[v[inside], u[inside]] = 255
+    side = hull.voxel * view.intrinsics[0, 0] / float(np.median(depth[front]))
+    # Closing by a voxel joins the dots; a third of it more stands for the voxel's own extent.
+    reach = 2 * int(np.ceil(0.75 * side)) + 1
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    return cv2.morphologyEx(drawn, cv2.MORPH_CLOSE, kernel) > 0
+
+
+def mask_iou(a: Mask, b: Mask) -> float:
+    """Intersection over union of two masks; 1 when both are empty, since they agree."""
+    union = np.count_nonzero(a | b)
+    return np.count_nonzero(a & b) / union if union else 1.0

@@ -1,0 +1,355 @@
+"""Where a model lies: the similarity that brings it into metres by control points or GPS, or turns it upright."""
+
+import contextlib
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.core.stage import StageError, setting
+from scenefuse.core.transforms import Sim3, fit_sim3, fit_sim3_robust, rotation_between
+from scenefuse.georef.control import Sighting, check_spread, describe_misses
+from scenefuse.photos.geodesy import FAR
+
+Array = NDArray[np.float64]
+UP = np.array([0.0, 0.0, 1.0])
+
+# Fewer registered photos with GPS are too few to tell a wild position from the others.
+MIN_GPS_PHOTOS = 5
+# In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
+# nothing about scale; one that is narrower lies along one line and says nothing about roll.
+OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
+# Heights that lean against what the cameras surely say is up, by more than the first (degrees), are not believed where
+# they fix the tilt to more than the second only (two standard errors); five photos beside each other have one error,
+# and heights are half as exact as stated for the plane.
+LEAN_DEG, TILT_DEG, HEIGHTS, ALIKE = 3.0, 2.0, 2.0, 5.0
+# How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
+BENT = 0.1
+# Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
+ELSEWHERE_M = 1000.0
+# In standard deviations: error of a control point at which it loses half its weight beside exact positions.
+DOUBTED = 3.0
+# Standard deviation of a normal error over the median of its size.
+NORMAL = 1.4826
+# Each round halves what filling in half of the heights leaves to be found.
+FILL_ROUNDS = 30
+
+
+@dataclass(frozen=True)
+class GeoreferenceSettings:
+    """When GPS is used, and how strictly."""
+
+    use_gps: bool = setting(True)
+    """Whether GPS positions in EXIF bring the model into metres."""
+    gps_accuracy_m: float = setting(3, unit="m", above=0)
+    """Standard error of a GPS position; positions farther than four times this from their cameras are outliers."""
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How a model was placed.
+
+    Attributes:
+        status: "georeferenced" (metres, in a CRS), "scaled" (metres by known lengths), "upright" (scene units).
+        reason: why, in words.
+        local_from_model: similarity into the new frame.
+        inliers: (N,) bool over the GPS positions used, or empty.
+        heights: "measured" by GPS or control points, "relative" to the middle camera, or "" where there is no metric
+            frame.
+        levelled: whether the cameras say which way is up, not GPS.
+        used: (P,) bool over the surveyed points: control points that agree.
+        gps_shift: (3,) metres that GPS positions are off the frame of the control points; zero without these.
+    """
+
+    status: str
+    reason: str
+    local_from_model: Sim3
+    inliers: NDArray[np.bool_]
+    heights: str = ""
+    levelled: bool = True
+    used: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    gps_shift: Array = field(default_factory=lambda: np.zeros(3))
+
+
+@dataclass(frozen=True)
+class GpsCameras:
+    """The registered photos that have a GPS position.
+
+    Attributes:
+        names: N of them.
+        centres: (N, 3) camera centres in the model's frame.
+        positions: (N, 3) latitude (deg), longitude (deg), altitude (m; NaN where unknown).
+        sd_m: (N, 2) standard deviations of the positions, horizontal (of each axis) and vertical.
+    """
+
+    names: list[str]
+    centres: Array
+    positions: Array
+    sd_m: Array
+
+
+def place_by_control(
+    sightings: list[Sighting], target: Array, up: Array, where: str, seed: int
+) -> tuple[Placement, list[str]]:
+    """Fit local_from_model to surveyed points in the model and their coordinates (P, 3) in metres.
+
+    Unknown heights are NaN and take no part; check points neither. Control points that do not agree with the others are
+    left out.
+
+    Args:
+        sightings: P surveyed points.
+        target: their coordinates.
+        up: (3,) the cameras' up direction in the model.
+        where: the file, for messages.
+        seed: of RANSAC.
+
+    Returns:
+        The placement, and a line for each control point left out.
+
+    Raises:
+        StageError: points along one line, too few that agree, or a model that they turn upside down.
+    """
+    rows = np.array([k for k, s in enumerate(sightings) if not (s.problem or s.point.check)])
+    names = [sightings[k].point.name for k in rows]
+    there, start = target[rows], np.array([sightings[k].x_in_model for k in rows])
+    whole = np.isfinite(there).all(1)
+    check_spread(there[whole], [n for n, w in zip(names, whole) if w], where)
+    sd_m = max(max(sightings[k].point.sd_m) for k in rows)
+    limit = max(OUTLIER * sd_m, BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
+    try:
+        fitted, inliers = fit_measured(start, there, limit, seed)
+    except ValueError:
+        inliers = np.zeros(len(rows), dtype=bool)
+    if inliers.sum() < max(3, len(rows) // 2 + 1):
+        raise StageError(
+            f"{where}: only {inliers.sum()} of {len(rows)} control points agree with the model within {limit:.2g} m;"
+            " check their coordinates, whether x is easting and y northing, and where each was clicked"
+        )
+    if fitted.rotate(up)[2] < 0:
+        raise StageError(
+            f"{where}: the control points turn the model upside down, as swapped axes do; x has to be easting or"
+            " longitude, y northing or latitude"
+        )
+    used = np.zeros(len(sightings), dtype=bool)
+    used[rows[inliers]] = True
+    notes = [
+        f"{names[k]} is left out: {describe_misses(sightings[rows[k]], fitted, target[rows[k]])}"
+        for k in np.flatnonzero(~inliers)
+    ]
+    reason = f"{inliers.sum()} of {len(rows)} control points"
+    none = np.zeros(0, dtype=bool)
+    return Placement("georeferenced", reason, fitted, none, "measured", False, used), notes
+
+
+def beside_gps(
+    placement: Placement,
+    sightings: list[Sighting],
+    there: Array,
+    gps: GpsCameras,
+    target: Array,
+    where: str,
+    settings: GeoreferenceSettings,
+) -> Placement:
+    """A placement by control points, refined by GPS positions up to a shift that all of them share.
+
+    Another datum, heights above a geoid or a base station of its own move all positions alike: the control points say
+    where the model lies, the positions help to turn and scale it: a least-squares fit of both about their own means, in
+    which points that the others contradict count for less and less (Cauchy): one wrong point among exact positions
+    would else move all of these.
+
+    Args:
+        placement: by control points.
+        sightings: P surveyed points.
+        there: (P, 3) their coordinates in the local frame; NaN where a height is unknown.
+        gps: N photos with positions.
+        target: (N, 3) the positions in the local frame, likewise.
+        where: the control points' file, for messages.
+        settings: for the limit of outliers.
+
+    Raises:
+        StageError: GPS saw the cameras more than a kilometre away.
+    """
+    fitted, points = placement.local_from_model, placement.used
+    difference = target - fitted.apply(gps.centres)
+    shift = middle_of(difference)
+    if np.linalg.norm(shift[:2]) > ELSEWHERE_M:
+        raise StageError(
+            f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
+            " correct their CRS or swapped axes, or switch use_gps off if GPS is wrong"
+        )
+    limit = _limit(float(np.median(gps.sd_m[:, 0])), _extent(target)[0], settings)
+    inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
+    if not inliers.any():
+        return replace(placement, inliers=inliers, gps_shift=shift)
+    start = [np.array([s.x_in_model for s, u in zip(sightings, points) if u]), gps.centres[inliers]]
+    wanted = [there[points], target[inliers]]
+    stated = np.array([s.point.sd_m[0] for s, u in zip(sightings, points) if u])
+    for _ in range(FILL_ROUNDS):
+        here = [fitted.apply(part) for part in start]
+        here[1] += shift
+        off = np.abs(wanted[0] - here[0])
+        # Clicks add to what was stated of the coordinates.
+        each = np.maximum(stated, NORMAL * float(np.nanmedian(off)))
+        sd_m = [each * np.hypot(1.0, np.sqrt(np.nansum(off**2, axis=1)) / (DOUBTED * each)), gps.sd_m[inliers, 0]]
+        filled = [np.where(np.isfinite(b), b, a) for a, b in zip(here, wanted)]
+        means = [
+            [np.average(part, axis=0, weights=sd**-2.0) for part, sd in zip(side, sd_m)] for side in (start, filled)
+        ]
+        centred = [np.concatenate([p - m for p, m in zip(side, mean)]) for side, mean in zip((start, filled), means)]
+        turn = fit_sim3(centred[0], centred[1], np.concatenate(sd_m) ** -2.0)
+        fitted = replace(turn, translation=means[1][0] - turn.scale * turn.rotation @ means[0][0])
+        shift = means[1][1] - fitted.apply(means[0][1])
+    return replace(placement, local_from_model=fitted, inliers=inliers, gps_shift=shift)
+
+
+def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
+    """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
+    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, BENT * extent))
+
+
+def middle_of(difference: Array) -> Array:
+    """(3,) medians of (N, 3) differences; 0 where none is known."""
+    known = np.isfinite(difference)
+    return np.array([np.median(column[k]) if k.any() else 0.0 for column, k in zip(difference.T, known.T)])
+
+
+def place_by_gps(
+    centres: Array,
+    target: Array,
+    up: Array,
+    settings: GeoreferenceSettings,
+    seed: int,
+    sd_m: float | None = None,
+    sure_up: bool = False,
+) -> Placement:
+    """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
+
+    Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
+    the tilt: then the cameras' up direction (3,) closes it; also where it is sure and inexact heights contradict it, as
+    a phone's do on a walk around a house. Positions within five times the GPS accuracy of each other say nothing about
+    scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
+    """
+    accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
+    limit = _limit(accuracy_m, extent[0], settings)
+    if extent[0] < SPREAD * accuracy_m:
+        reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
+        return upright(up, reason)
+    fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
+    if inliers.sum() < max(MIN_GPS_PHOTOS, 0.5 * len(target)):
+        reason = f"only {inliers.sum()} of {len(target)} GPS positions agree with the cameras within {limit:g} m"
+        return upright(up, reason)
+    reason = f"{inliers.sum()} of {len(target)} photos by GPS"
+    if levelled:
+        line = "along one line, " if _extent(target[inliers])[1] < WIDTH * accuracy_m else ""
+        reason += f", {line}levelled by the cameras"
+    unknown = np.isnan(target[:, 2])
+    if unknown.all():
+        reason += "; no photo has a GPS height, so heights are relative to the middle camera"
+    elif unknown.any():
+        reason += f"; {unknown.sum()} of them have no GPS height and do not constrain heights"
+    return Placement("georeferenced", reason, fitted, inliers, "relative" if unknown.all() else "measured", levelled)
+
+
+def _fit(
+    centres: Array, target: Array, up: Array, accuracy_m: float, limit: float, seed: int, sure_up: bool
+) -> tuple[Sim3, NDArray[np.bool_], bool]:
+    """Similarity, inliers, and whether the cameras had to level it, because the positions that agree do not."""
+    has_height = np.isfinite(target[:, 2])
+
+    def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= WIDTH * accuracy_m)
+
+    def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
+        lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))
+        tilt = np.degrees(HEIGHTS * accuracy_m * np.sqrt(ALIKE / rows.sum()) / _extent(target[rows])[1])
+        return bool(sure_up and lean > LEAN_DEG and tilt > TILT_DEG)
+
+    if fixes_tilt(has_height):
+        with contextlib.suppress(ValueError):  # no three positions agree
+            fitted, inliers = fit_measured(centres, target, limit, seed)
+            used = inliers & has_height
+            if inliers.sum() >= 0.5 * len(target) and fixes_tilt(used) and not leans(fitted, used):
+                return fitted, inliers, False
+    return *fit_level(centres, target, up, limit, seed), True
+
+
+def upright(up: Array, reason: str) -> Placement:
+    """Only turn the model so that `up` (3,) becomes z; scale and origin stay."""
+    rotation = rotation_between(up, UP)
+    return Placement("upright", reason, Sim3(1.0, rotation, np.zeros(3)), np.zeros(0, dtype=bool))
+
+
+def scaled(placement: Placement, metres_per_unit: float, lengths: int) -> Placement:
+    """An upright placement in metres, by known lengths."""
+    one = replace(placement.local_from_model, scale=metres_per_unit)
+    return replace(
+        placement, status="scaled", reason=f"{placement.reason}; {lengths} known lengths", local_from_model=one
+    )
+
+
+def fit_measured(centres: Array, target: Array, limit: float, seed: int) -> tuple[Sim3, NDArray[np.bool_]]:
+    """Similarity by RANSAC over positions whose height is known, then least squares over all measured coordinates.
+
+    Unknown heights (NaN in `target`) are set to what the fit says, again and again, which is least squares without them
+    (expectation maximisation).
+
+    Returns:
+        local_from_model and the (N,) inliers within `limit` metres.
+    """
+    known = np.isfinite(target)
+    whole = known.all(1)
+    fitted, inliers = fit_sim3_robust(centres[whole], target[whole], limit, seed=seed)
+    if whole.all():
+        return fitted, inliers
+    for _ in range(FILL_ROUNDS):
+        here = fitted.apply(centres)
+        filled = np.where(known, target, here)
+        inliers = np.linalg.norm(filled - here, axis=1) <= limit
+        fitted = fit_sim3(centres[inliers], filled[inliers])
+    return fitted, inliers
+
+
+def fit_level(centres: Array, target: Array, up: Array, limit: float, seed: int = 0) -> tuple[Sim3, NDArray[np.bool_]]:
+    """Similarity with its vertical given: heading, scale and shift from horizontal positions, height from the mean.
+
+    RANSAC over pairs, then least squares, reweighted with Cauchy weights of width `limit` / 2 (metres). Unknown heights
+    (NaN) take no part; where none is known, the median camera gets height 0.
+    """
+    levelling = rotation_between(up, UP)
+    levelled = centres @ levelling.T
+    # A heading alone is a rotation in the plane: one complex factor, scale and angle together.
+    a, b = levelled[:, 0] + 1j * levelled[:, 1], target[:, 0] + 1j * target[:, 1]
+    known = np.isfinite(target[:, 2])
+    weights = _agreeing_pair(a, b, limit, seed).astype(np.float64)
+    for _ in range(30):
+        w = weights / weights.sum()
+        centred = a - w @ a
+        factor = (w @ (centred.conj() * (b - w @ b))) / (w @ np.abs(centred) ** 2)
+        scale, angle = abs(factor), np.angle(factor)
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]])
+        rotation = turn @ levelling
+        offset = target - scale * centres @ rotation.T
+        height = w[known] @ offset[known, 2] / w[known].sum() if known.any() else -np.median(scale * levelled[:, 2])
+        fitted = Sim3(scale, rotation, np.array([*(w @ offset[:, :2]), height]))
+        distance = np.sqrt(np.nansum((fitted.apply(centres) - target) ** 2, axis=1))
+        weights = 1.0 / (1.0 + (2.0 * distance / limit) ** 2)
+    return fitted, distance <= limit
+
+
+def _agreeing_pair(a: NDArray[np.complex128], b: NDArray[np.complex128], limit: float, seed: int) -> NDArray[np.bool_]:
+    """Which of N positions in the plane the similarity b ~ factor a + shift through some two of them explains: most."""
+    rng, best = np.random.default_rng(seed), np.zeros(len(a), dtype=bool)
+    for _ in range(300):
+        i, j = rng.choice(len(a), 2, replace=False)
+        if a[i] != a[j]:
+            inliers = np.abs((b[j] - b[i]) / (a[j] - a[i]) * (a - a[i]) + b[i] - b) <= limit
+            best = inliers if inliers.sum() > best.sum() else best
+    return best if best.any() else ~best
+
+
+def _extent(target: Array) -> Array:
+    """RMS extent in metres of positions (N, 3) along the two axes of their horizontal spread, far ones left out."""
+    centred = target[:, :2] - np.median(target[:, :2], axis=0)
+    distance = np.linalg.norm(centred, axis=1)
+    centred = centred[distance <= FAR * np.median(distance)]
+    return np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred))

@@ -1,1 +1,0 @@
-"""Files: point clouds, depth and normal maps, pictures, masks, tables, settings."""

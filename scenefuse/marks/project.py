@@ -1,0 +1,194 @@
+"""What a run of the workflow works on: settings, scenes, objects and registration variants, all checked.
+
+Imported whenever the workflow is read: nothing here takes long to import.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scenefuse.core.settings import ROOT, merge, problem, read_differences, schema_of, with_defaults
+from scenefuse.core.stage import StageError
+from scenefuse.core.tables import Row, read_table
+
+# Columns that say something about a row's photos.
+OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
+# Columns of an object that are about its scene.
+OF_SCENE = ("fiducials", "truth")
+# Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
+OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
+OF_THE_RUN = ("scene.chunks", "object.recipe", "object.stage1.pose_source", "registration.variants")
+
+
+@dataclass(frozen=True)
+class Project:
+    """All that the rules need to know of a project.
+
+    Attributes:
+        settings: as shipped, with the user's laid over them.
+        scenes: rows of the table of scenes by name.
+        objects: rows of the table of objects by name.
+        variants: for each registration variant that runs, the settings of `registration` that differ.
+        own: settings of the rows that have a settings file of their own, by kind and name.
+    """
+
+    settings: dict[str, Any]
+    scenes: dict[str, Row]
+    objects: dict[str, Row]
+    variants: dict[str, dict[str, Any]]
+    own: dict[tuple[str, str], dict[str, Any]]
+
+    def of(self, kind: str, name: str) -> dict[str, Any]:
+        """The settings of a `scene` or an `object`."""
+        return self.own.get((kind, name), self.settings)
+
+    def registration(self, name: str, variant: str) -> dict[str, Any]:
+        """The settings of `registration` for a variant of an object."""
+        return merge(self.of("object", name)["registration"], self.variants[variant])
+
+
+def read_project(config: Mapping[str, Any]) -> Project:
+    """The project that a configuration describes; relative paths are the working directory's, then the repository's.
+
+    Raises:
+        StageError: the first thing that is wrong, with its file and place.
+    """
+    schema = schema_of("config")
+    wrong = problem(config, schema)
+    if wrong:
+        raise StageError(f"config, {wrong}")
+    settings = with_defaults(config, schema)
+    scenes, objects = (_checked_table(settings[f"{kind}s"], kind) for kind in ("scene", "object"))
+    if not scenes and not objects:
+        raise StageError(
+            f"{settings['scenes']} and {settings['objects']} have no rows; add one for each scene and object"
+        )
+    for kind, rows in (("scene", scenes), ("object", objects)):
+        for name, row in rows.items():
+            wrong = _cloud_problem(kind, row) or _crs_problem(row)
+            if wrong:
+                raise StageError(f"{settings[f'{kind}s']}: {kind} '{name}' {wrong}")
+    for name, row in objects.items():
+        wrong = _scene_problem(row, scenes, settings["scenes"])
+        if wrong:
+            raise StageError(f"{settings['objects']}: object '{name}' {wrong}")
+    wrong = _recipe_problem(settings["object"])
+    if wrong:
+        raise StageError(f"config, {wrong}")
+    own = {
+        (kind, name): merge(settings, _differences(kind, name, row["config"], settings[f"{kind}s"]))
+        for kind, rows in (("scene", scenes), ("object", objects))
+        for name, row in rows.items()
+        if row.get("config")
+    }
+    return Project(settings, scenes, objects, _variants(settings), own)
+
+
+def _checked_table(name: str, kind: str) -> dict[str, Row]:
+    path = Path(name) if Path(name).is_file() else ROOT / name
+    if not path.is_file():
+        raise StageError(f"{name} does not exist; write it as config/README.md describes")
+    rows = read_table(path, kind)
+    for number, row in enumerate(rows.values(), 1):
+        wrong = problem(row, schema_of(f"{kind}s"))
+        if wrong:
+            raise StageError(f"{name}, row {number}, {wrong}")
+    return rows
+
+
+def _cloud_problem(kind: str, row: Row) -> str:
+    """What is wrong with a row that has a cloud in the place of photos or beside them, or neither; "" where nothing."""
+    if not row.get("cloud"):
+        return "" if row.get("photos") else "has neither photos nor cloud; fill one of these columns"
+    if row.get("photos"):
+        # Where a scene's photos lie in its cloud, GPS or control points say.
+        if row.get("cameras") or kind == "scene":
+            return ""
+        return (
+            "has both photos and a cloud, but no cameras, in whose coordinates the cloud would lie; fill the column"
+            " cameras, or empty photos or cloud"
+        )
+    for column in OF_PHOTOS:
+        if row.get(column):
+            return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
+    return ""
+
+
+def _crs_problem(row: Row) -> str:
+    """What is wrong with a row that names a CRS; "" where nothing is."""
+    if not row.get("crs"):
+        return ""
+    if row.get("control") and not row.get("cloud"):
+        return "names a crs, and its control points name theirs, in which the results are; empty the cell crs"
+    if row.get("cloud") and row.get("cameras"):
+        return "names a crs, but its cloud lies where its cameras are; empty the cell crs"
+    return ""
+
+
+def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
+    """What is wrong with an object beside its scene, or with one that lies in none; "" where nothing is."""
+    scene = row.get("scene")
+    if not scene:
+        if row.get("cloud"):
+            other = "empty the cell cloud" if row.get("photos") else "give photos"
+            return f"is a cloud and lies in no scene, so there is nothing to do; name its scene, or {other}"
+        told = next((column for column in OF_SCENE if row.get(column)), None)
+        return f"lies in no scene that its {told} could be of; empty that cell, or name its scene" if told else ""
+    if scene not in scenes:
+        return f"lies in scene '{scene}', which {table} does not list"
+    if row.get("truth") and not scenes[scene].get("photos"):
+        return f"has a truth, but its scene '{scene}' is a cloud, and the evaluation compares cameras; empty the cell"
+    return ""
+
+
+def _recipe_problem(settings: Mapping[str, Any]) -> str:
+    """What is wrong with the recipe of the objects and its source of poses; "" where nothing is."""
+    recipe, source = settings["recipe"], settings["stage1"]["pose_source"]
+    if recipe == "paper" and source == "network":
+        return "object.stage1.pose_source: recipe 'paper' knows chain and sfm; poses by matches are not the paper's"
+    if recipe != "paper" and source == "chain":
+        return "object.stage1.pose_source: 'chain' is of recipe 'paper'; set object.recipe to paper, or sfm or network"
+    return ""
+
+
+def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
+    """What the settings file of a row changes."""
+    where = f"{table}, {kind} '{name}', config {path}"
+    try:
+        found = read_differences(Path(path) if Path(path).is_file() or not (ROOT / path).is_file() else ROOT / path)
+    except StageError as error:
+        raise StageError(f"{table}, {kind} '{name}': {error}") from None
+    other = next((key for key in found if key not in OWN[kind]), None)
+    if other is not None:
+        raise StageError(
+            f"{where}: '{other}' does not concern one {kind}; it may hold {', '.join(OWN[kind])}. Put the rest into the"
+            " settings file of the run"
+        )
+    for key in OF_THE_RUN:
+        part: Any = found
+        for step in key.split("."):
+            part = part.get(step) if isinstance(part, dict) else None
+        if part is not None:
+            raise StageError(f"{where}: {key} is the same for the whole run; put it into the settings file of the run")
+    return found
+
+
+def _variants(settings: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
+    """Settings of the variants that run, first `full`, which is fused; with recipe `paper` all by its crop."""
+    defined = yaml.safe_load((ROOT / "workflow/variants.yaml").read_text())
+    registration = settings["registration"]
+    if settings["object"]["recipe"] == "paper":
+        defined = {name: merge(defined["paper"], own) for name, own in defined.items()}
+    chosen = registration["variants"]
+    unknown = next((name for name in chosen if name not in defined), None)
+    if unknown is not None:
+        raise StageError(
+            f"config, registration.variants: unknown variant '{unknown}';"
+            f" workflow/variants.yaml defines: {', '.join(defined)}"
+        )
+    if "full" not in chosen:
+        raise StageError("config, registration.variants: 'full' is missing; it is the one that is fused")
+    return {name: defined[name] for name in sorted(chosen, key=lambda name: name != "full")}

@@ -1,1 +1,0 @@
-"""Masks from clicks in one photo or a few, carried on to all others."""

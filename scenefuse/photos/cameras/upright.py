@@ -1,0 +1,84 @@
+"""Cameras that another program found for photos as they are stored, turned along with the photos that EXIF says are
+rotated: here these stand upright."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from scenefuse.core.stage import StageError
+from scenefuse.photos.photos import SHAPE_TOLERANCE
+from scenefuse.photos.posed_photos import PosedPhoto
+
+QUARTERS = {6: 1, 3: 2, 8: 3}
+"""EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored."""
+FROM_STORED = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+"""Camera axes after a clockwise quarter turn from those before, OpenCV axes."""
+EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
+"""Parameters of a lens that a turn leaves as they are."""
+
+Size = tuple[int, int]
+
+
+def possible_turns(
+    posed: Mapping[str, PosedPhoto], orientations: Mapping[str, int], sizes: Mapping[str, Size]
+) -> list[dict[str, PosedPhoto]]:
+    """The cameras of photos by name as they may be meant, one way or two: for upright photos, or for stored ones.
+
+    The size of a photo on its side tells which, and then counts for those that stand on their heads as well. Where none
+    does, both ways are possible.
+
+    Args:
+        posed: cameras as given.
+        orientations: EXIF orientation of the photos that were turned here.
+        sizes: (width, height) of the upright photos.
+
+    Raises:
+        StageError: a photo on its side has a lens that cannot be turned.
+    """
+    turned = {
+        name: QUARTERS[o] for name, o in orientations.items() if o in QUARTERS and name in posed and name in sizes
+    }
+    asked = {name: _shapes(posed[name], sizes[name]) for name, quarters in turned.items() if quarters % 2}
+    stored = [name for name, (upright, lying) in asked.items() if lying and not upright]
+    as_they_are = [name for name, (upright, lying) in asked.items() if upright and not lying]
+    if not turned or (as_they_are and not stored):
+        return [dict(posed)]
+    other = dict(posed) | {
+        name: stood_upright(posed[name], quarters) for name, quarters in turned.items() if name not in as_they_are
+    }
+    return [other] if stored else [dict(posed), other]
+
+
+def stood_upright(photo: PosedPhoto, quarters: int) -> PosedPhoto:
+    """A camera after so many clockwise quarter turns of its photo.
+
+    Raises:
+        StageError: its lens has parameters that depend on the axes and that are not known here.
+    """
+    for _ in range(quarters):
+        camera, old = pycolmap.Camera(photo.camera.todict()), photo.camera
+        names = [name.strip() for name in old.params_info.split(",")]
+        own = dict(zip(names, np.asarray(old.params).tolist()))
+        new = {name: own[name] for name in names if name in EVEN}
+        new |= {"cx": old.height - own["cy"], "cy": own["cx"]}
+        if "fx" in own:
+            new |= {"fx": own["fy"], "fy": own["fx"]}
+        if "p1" in own:
+            new |= {"p1": own["p2"], "p2": -own["p1"]}
+        if set(new) != set(own):
+            raise StageError(
+                f"{photo.file.name} is rotated by EXIF, and its camera, a {old.model.name}, cannot be turned along;"
+                " undistort the photos in the program that found the cameras, or rotate them before"
+            )
+        camera.width, camera.height = old.height, old.width
+        camera.params = [new[name] for name in names]
+        photo = replace(photo, camera=camera, object_from_cam=photo.object_from_cam @ FROM_STORED.T)
+    return photo
+
+
+def _shapes(photo: PosedPhoto, size: Size) -> tuple[bool, bool]:
+    """Whether a camera has the shape of a photo that stands, and of one that lies."""
+    ratio, wanted = photo.camera.width / photo.camera.height, size[0] / size[1]
+    return abs(ratio / wanted - 1) <= SHAPE_TOLERANCE, abs(ratio * wanted - 1) <= SHAPE_TOLERANCE

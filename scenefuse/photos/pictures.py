@@ -1,0 +1,57 @@
+"""Reading and writing pictures: the pixels as they are stored, and an error that names the file."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.core.stage import StageError
+
+# Cameras belong to the pixels as they are stored; photos are turned upright once, when they enter (sfm.photos).
+_STORED = cv2.IMREAD_IGNORE_ORIENTATION
+
+
+def read_rgb(path: Path) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 RGB; StageError when the file is missing or no picture."""
+    return np.asarray(cv2.cvtColor(_read(path, cv2.IMREAD_COLOR | _STORED), cv2.COLOR_BGR2RGB), dtype=np.uint8)
+
+
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """(H, W) uint8; StageError when the file is missing or no picture."""
+    return np.asarray(_read(path, cv2.IMREAD_GRAYSCALE | _STORED), dtype=np.uint8)
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """(H, W), True above 127; StageError when the file is missing or no picture."""
+    return read_gray(path) > 127
+
+
+def read_raw(path: Path) -> NDArray[Any]:
+    """The picture with its depth, channels (BGR, BGRA) and alpha as stored; StageError when it cannot be read."""
+    return _read(path, cv2.IMREAD_UNCHANGED)
+
+
+def write_picture(path: Path, pixels: NDArray[np.uint8], jpeg_quality: int = 97) -> None:
+    """Write (H, W) grey or (H, W, 3) RGB pixels in the format of the path's suffix.
+
+    Raises:
+        StageError: OpenCV could not write the file: a full disk, or a suffix it does not know.
+    """
+    stored = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
+    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if Path(path).suffix.lower() in (".jpg", ".jpeg") else []
+    try:
+        written = cv2.imwrite(str(path), stored, options)
+    except cv2.error:
+        written = False
+    if not written:
+        raise StageError(f"{path} could not be written; check that the disk has room, and the file's ending")
+
+
+def _read(path: Path, flags: int) -> NDArray[Any]:
+    pixels = cv2.imread(str(path), flags)
+    if pixels is None:
+        what = "is no readable picture" if Path(path).is_file() else "does not exist"
+        raise StageError(f"{path} {what}; rerun the stage that writes it")
+    return pixels

@@ -1,0 +1,113 @@
+"""Where a point that was clicked in some photos is to be expected in another one, once their cameras are known."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from scenefuse.core.stage import StageError
+from scenefuse.core.transforms import Array
+from scenefuse.marks.fiducials import Clicks, triangulate_consistent
+from scenefuse.photos.workspace import posed_images, ray_through, read_model
+from scenefuse.pick.clicks import Click, Sizes
+
+DEPTHS = 200
+"""Samples of a ray, from near to far."""
+NEAR, FAR = 0.3, 4.0
+"""The ray's ends, as shares of the nearest and farthest sparse point that the photo sees."""
+MARGIN = 0.05
+"""How far outside the photo a line is still drawn, as a share of its size: a lens's model holds little farther."""
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Where a point is to be expected in a photo.
+
+    Attributes:
+        pixels: (N, 2) one pixel, or a line of them; none where the photo does not see it.
+        from_photos: how many other photos say so: from two or more it is a point, from one a line.
+    """
+
+    pixels: Array
+    from_photos: int
+
+
+class Cameras:
+    """The cameras of a COLMAP model, in pixels of the original photos."""
+
+    def __init__(self, folder: Path, sizes: Sizes) -> None:
+        """Read a model.
+
+        Raises:
+            StageError: it cannot be read.
+        """
+        self._model, self._sizes = read_model(folder), sizes
+        self._images = {image.name: image for image in posed_images(self._model) if image.name in sizes}
+
+    def __contains__(self, photo: str) -> bool:
+        return photo in self._images
+
+    def expected(self, clicks: Iterable[Click], photo: str) -> Expected | None:
+        """Where the clicks on one point in other photos say that it is in this one; None where they say nothing."""
+        others = [c for c in clicks if c.photo != photo and c.photo in self._images]
+        if photo not in self._images or not others:
+            return None
+        if len(others) == 1:
+            return Expected(self._line(others[0], photo), 1)
+        position = self._position(others)
+        if position is None:
+            return None
+        return Expected(self._seen(position[None], photo), len(others))
+
+    def residuals(self, clicks: Iterable[Click]) -> dict[str, float]:
+        """How far each click on one point is from where all say that it is, px by photo; empty for fewer than two."""
+        known = [c for c in clicks if c.photo in self._images]
+        position = self._position(known)
+        if position is None:
+            return {}
+        found = {}
+        for click in known:
+            at = self._projected(position, click.photo)
+            if at is not None:
+                found[click.photo] = float(np.hypot(*(at - [click.x, click.y])))
+        return found
+
+    def _position(self, clicks: list[Click]) -> Array | None:
+        """(3,) of a point in the model's frame, from two or more photos."""
+        if len(clicks) < 2:
+            return None
+        marked = Clicks(
+            Path(), ["point"] * len(clicks), [c.photo for c in clicks], np.array([[c.x, c.y] for c in clicks])
+        )
+        try:
+            _, found, _, _ = triangulate_consistent(marked, self._model, np.inf, self._sizes)
+        except StageError:
+            return None
+        return found[0] if len(found) else None
+
+    def _line(self, click: Click, photo: str) -> Array:
+        """(N, 2) pixels of a photo on the ray through a click in another one (Hartley and Zisserman, 9.1)."""
+        image = self._images[click.photo]
+        camera = self._model.cameras[image.camera_id]
+        pixel = np.array([click.x, click.y]) * [camera.width, camera.height] / np.array(self._sizes[click.photo])
+        ray = np.array([*ray_through(camera, pixel), 1.0])
+        if not np.isfinite(ray).all():
+            return np.zeros((0, 2))
+        pose = image.cam_from_world().matrix()
+        seen = np.array([self._model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
+        depth = seen @ pose[2, :3] + pose[2, 3] if len(seen) else np.ones(1)
+        steps = np.geomspace(NEAR * max(depth.min(), 1e-6), FAR * depth.max(), DEPTHS)
+        return self._seen((ray * steps[:, None] - pose[:, 3]) @ pose[:, :3], photo)
+
+    def _seen(self, points: Array, photo: str) -> Array:
+        """(N, 2) pixels of those points (P, 3) that lie in a photo, or little outside of it."""
+        size = np.array(self._sizes[photo], dtype=float)
+        pixels = [at for point in points if (at := self._projected(point, photo)) is not None]
+        found = np.array(pixels).reshape(-1, 2)
+        return found[((found > -MARGIN * size) & (found < (1 + MARGIN) * size)).all(1)]
+
+    def _projected(self, point: Array, photo: str) -> Array | None:
+        image = self._images[photo]
+        at, camera = image.project_point(point), self._model.cameras[image.camera_id]
+        return None if at is None else np.asarray(at) * self._sizes[photo] / np.array([camera.width, camera.height])

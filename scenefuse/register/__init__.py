@@ -1,0 +1,1 @@
+"""Where the object stands in the scene: scale, candidates, refinement, decision, uncertainty."""

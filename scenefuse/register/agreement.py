@@ -1,0 +1,84 @@
+"""How well a registered object and the scene crop agree: fitness, RMSE, normals, F-score (method R10, R11, G1)."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
+from scenefuse.core.stage import quantity, setting, threads
+from scenefuse.core.transforms import Array, Sim3
+
+# Neighbours that a plane is fitted to for a normal.
+NORMAL_NEIGHBOURS = 16
+# Points at which the normals of both clouds together are compared with their neighbours'.
+MOST_TOGETHER = 20000
+
+
+@dataclass(frozen=True)
+class AgreementSettings:
+    """When points correspond."""
+
+    tau_fraction: float = setting(0.016, least=0)
+    """Distance within which points correspond, as a share of the crop's diagonal."""
+
+
+def registration_metrics(
+    obj: Cloud, scene: Cloud, scene_from_object: Sim3, tau: float, diagonal: float, unit: str
+) -> dict[str, dict[str, Any]]:
+    """The registration.* numbers of one pose.
+
+    The object's inliers are its points with a scene point within tau. The names without a suffix are the paper's:
+    fitness = share of scene points with an object point within tau (the paper divides by the target); inlier_rmse = RMS
+    distance of the object's inliers to their nearest scene points; normal_consistency = mean |n . n_nearest| over these
+    pairs (chance 0.5). Beside them: fitness_source = share of the object's points that are inliers (Open3D's fitness);
+    fitness_f_score = harmonic mean of both fitnesses; normal_consistency_self = mean |n . n'| between points and their
+    neighbours in both whole clouds together.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene's points on the object.
+        scene_from_object: the pose.
+        tau: inlier distance.
+        diagonal: of the full variant's crop.
+        unit: of the scene's lengths.
+    """
+    moved = scene_from_object.apply(obj.points)
+    ahead, partner = cKDTree(scene.points).query(moved, workers=threads())
+    back = cKDTree(moved).query(scene.points, workers=threads())[0]
+    inlier = ahead <= tau
+    source, target = float(inlier.mean()), float((back <= tau).mean())
+    rmse = float(np.sqrt((ahead[inlier] ** 2).mean())) if inlier.any() else None
+    normals_object, normals_scene = (_normals(points, points) for points in (moved, scene.points))
+    facing = np.abs((normals_object[inlier] * normals_scene[partner[inlier]]).sum(1))
+    return {
+        "fitness": quantity(target, "1"),
+        "fitness_source": quantity(source, "1"),
+        "fitness_f_score": quantity(2 * source * target / max(source + target, 1e-12), "1"),
+        "inlier_rmse": quantity(rmse, unit),
+        "inlier_rmse_over_diagonal": quantity(None if rmse is None else rmse / diagonal, "1"),
+        "normal_consistency": quantity(float(facing.mean()) if inlier.any() else None, "1"),
+        "normal_consistency_self": quantity(self_consistency(np.concatenate([moved, scene.points])), "1"),
+        "tau": quantity(tau, unit),
+        "object_spacing": quantity(spacing(moved), unit),
+        "scene_spacing": quantity(spacing(scene.points), unit),
+    }
+
+
+def self_consistency(points: Array) -> float:
+    """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
+
+    Measured at MOST_TOGETHER points at most; neighbours and normals are those of the whole cloud.
+    """
+    tree, at = cKDTree(points), sampled(points, MOST_TOGETHER, seed=0)
+    neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    used, place = np.unique(neighbours, return_inverse=True)
+    normals = _normals(points, points[used])[place.reshape(neighbours.shape)]
+    return float(np.abs(np.einsum("nk,njk->nj", normals[:, 0], normals[:, 1:])).mean())
+
+
+def _normals(points: Array, at: Array) -> Array:
+    """Normals (M, 3) of the planes through the points (N, 3) nearest to each of `at` (M, 3)."""
+    neighbours = cKDTree(points).query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
+    return plane_normals(points, neighbours)

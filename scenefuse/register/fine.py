@@ -1,0 +1,208 @@
+"""Fine registration: the stage around `refine_hypotheses`, and its report."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.stage import quantity, read_json, value, write_json
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.alignment_picture import draw_alignment
+from scenefuse.geometry.free_space import FreeSpace, read_free_space
+from scenefuse.register.coarse import Candidate
+from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
+from scenefuse.register.problem import Alignment, Evidence, Inputs, Problem, read_alignment, read_scales
+from scenefuse.register.refinement import Outcome, refine_hypotheses
+from scenefuse.register.score import Hypothesis
+from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
+
+# Photos whose depth maps give the free space; more look from sides that these have seen.
+FREE_SPACE_PHOTOS = 12
+# A measurement this far beyond a point, as a share of the diagonal, shows that nothing stands there.
+FREE_SPACE_FRACTION = 0.03
+
+
+@dataclass(frozen=True)
+class EvidenceFiles:
+    """Files of what is known beside the clouds."""
+
+    alignment_json: Path | None = None
+    """JSON of the alignment from shared features."""
+    workspace: Path | None = None
+    """Undistorted COLMAP workspace of the scene; with `depth` it gives the free space."""
+    depth: tuple[Path, ...] = ()
+    """Folders of the scene's depth maps."""
+    object_spread: Path | None = None
+    """NPZ: how far the object's sparse model may be bent."""
+    scene_spread: Path | None = None
+    """The same of the scene's."""
+
+    def bending(self, pose: Sim3, centre: Array) -> tuple[Array | None, Array | None]:
+        """(7, 7) covariances of both models around the object's centre (3,), None where they are not known."""
+        from scenefuse.sfm.spread import read_spread
+
+        places = ((self.object_spread, centre), (self.scene_spread, pose.apply(centre)))
+        of_object, of_scene = (None if path is None else read_spread(path).covariance_at(at) for path, at in places)
+        return of_object, of_scene
+
+    def free_space(self, scene: Cloud) -> FreeSpace | None:
+        """The free space around a scene crop, or None without depth maps."""
+        if self.workspace is None:
+            return None
+        tolerance = FREE_SPACE_FRACTION * scene.diagonal
+        return read_free_space(self.workspace, self.depth, scene.points, FREE_SPACE_PHOTOS, tolerance)
+
+
+def register_finely(
+    *,
+    inputs: Inputs,
+    scale_json: Path,
+    coarse_json: Path,
+    evidence: EvidenceFiles = EvidenceFiles(),
+    report: Path,
+    picture: Path | None = None,
+    seed: int,
+    settings: FineSettings,
+) -> None:
+    """Refine the coarse hypotheses into one pose, or reject it with a reason (method R8, R9, R12).
+
+    Args:
+        inputs: the two clouds and their reports.
+        scale_json: JSON of the scale, of the coarse stage.
+        coarse_json: JSON of the coarse stage.
+        evidence: what is known beside the clouds.
+        report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.
+        picture: output PNG, the object on the scene crop from three sides.
+        seed: of all random choices.
+        settings: see FineSettings.
+
+    Raises:
+        StageError: a cloud's points lie in one place or along one line.
+    """
+    start = time.perf_counter()
+    obj, scene = inputs.clouds()
+    prior = read_json(scale_json)
+    alignment = read_alignment(evidence.alignment_json) if settings.use_alignment else None
+    known = Evidence(inputs.ups(), evidence.free_space(scene), alignment)
+    problem = Problem(obj, scene, read_scales(prior), known, seed)
+    outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
+    bending = evidence.bending(outcome.ranked[0].pose, obj.points.mean(0))
+    outcome = outcome.unless_torn(bending[0], scene.diagonal)
+    seconds = time.perf_counter() - start
+    if picture is not None:
+        draw_alignment(picture, obj, scene, outcome.ranked[0].pose, seed)
+    content = _report(outcome, problem, prior, inputs.length_unit(), settings, seconds)
+    write_json(report, content | _stated(outcome, bending, inputs.length_unit()))
+
+
+def read_candidates(coarse_json: Path) -> list[Candidate]:
+    """The poses of a coarse stage's JSON, each with its source, best first."""
+    found = value(read_json(coarse_json), "hypotheses")
+    return [(Sim3.from_matrix(np.array(h["scene_from_object"])), h["source"]) for h in found]
+
+
+def _report(
+    outcome: Outcome, problem: Problem, prior: dict[str, Any], length: str, settings: FineSettings, seconds: float
+) -> dict[str, Any]:
+    """The stage JSON; the decision is printed."""
+    best, decision = outcome.ranked[0], outcome.decision
+    status, alignment = "registered" if decision.registered else "unregistered", problem.evidence.alignment
+    print(f"{status}: {decision.reason}", flush=True)
+    ledger = scale_ledger(prior, alignment, best, outcome.uncertainty, decision.decided_by)
+    return {
+        "status": quantity(status, ""),
+        "reason": quantity(decision.reason, ""),
+        **pose_quantities(best),
+        "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
+        "decided_by": quantity(decision.decided_by, ""),
+        "rests_on": quantity(rests_on(best, problem.evidence), ""),
+        "margin": quantity(decision.margin, "1"),
+        "free_axis": quantity(decision.free_axis, ""),
+        "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
+        "scale_ledger": quantity(ledger, ""),
+        "score_tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
+        "source": quantity(best.source, ""),
+        "rival": quantity(None if decision.rival is None else decision.rival.as_json(), ""),
+        "hypotheses": quantity([h.as_json() for h in outcome.ranked], ""),
+        "seconds": quantity(seconds, "s"),
+    }
+
+
+def rests_on(best: Hypothesis, evidence: Evidence) -> list[str]:
+    """What spoke for or against a pose."""
+    known = {
+        "shape": True,
+        "colours": best.score.color is not None,
+        "gravity": evidence.ups is not None,
+        "free space": evidence.free_space is not None,
+        "shared features": evidence.alignment is not None,
+    }
+    return [name for name, there in known.items() if there]
+
+
+def _stated(outcome: Outcome, bending: tuple[Array | None, Array | None], length: str) -> dict[str, Any]:
+    """The standard deviations of the pose: against the world, with what the clouds may have wrong alike, and how far
+    either model may be bent (covariances of object and scene); and on the scene as it is, which the gate counts."""
+    on_scene, stated = outcome.uncertainty, outcome.stated
+    total = None if stated is None else with_bending(stated, outcome.ranked[0].pose, *bending)
+    known = [name for name, of in zip(("object", "scene"), bending) if of is not None]
+    return {
+        **uncertainty_quantities(total, length),
+        "on_scene": quantity(uncertainty_quantities(on_scene, length), ""),
+        "bending_known_of": quantity(known, ""),
+    }
+
+
+def pose_quantities(best: Hypothesis) -> dict[str, Any]:
+    """A pose and its scores as a stage JSON holds them."""
+    score = best.score
+    return {
+        "scene_from_object": quantity(best.pose.matrix, ""),
+        "scale": quantity(best.pose.scale, "scene units per object unit"),
+        "f_score": quantity(score.f_score, "1"),
+        "precision": quantity(score.precision, "1"),
+        "recall": quantity(score.recall, "1"),
+        "color_agreement": quantity(score.color, "1"),
+        "free_space_violation": quantity(score.free_space_violation, "1"),
+        "score": quantity(score.total, "1"),
+    }
+
+
+def scale_ledger(
+    prior: dict[str, Any],
+    alignment: Alignment | None,
+    best: Hypothesis,
+    uncertainty: Uncertainty | None,
+    decided_by: DecidedBy,
+) -> list[dict[str, Any]]:
+    """Every estimate of the scale with its standard deviation (log), what it was used for, and which was taken and why.
+
+    The estimates of extent have no standard deviation of their own: what one side lacks biases them, so they only
+    centre a prior.
+    """
+    rows = [
+        ledger_row(e["name"], e["scale"], None, "centres the prior" if e["used"] else "none")
+        for e in value(prior, "ledger")
+    ]
+    by_photos = alignment is not None and best.pose is alignment.pose
+    if alignment is not None:
+        relation = "and the clouds agree" if decided_by == "both" else "the clouds' best fit is another pose"
+        otherwise = "none: its pose lies in free space" if decided_by == "near" else "confirms"
+        use = f"taken: less uncertain than the clouds; {relation}" if by_photos else otherwise
+        rows.append(ledger_row("shared points", alignment.pose.scale, alignment.uncertainty.scale_sd_log, use))
+        if alignment.scale_from_centres is not None:
+            rows.append(ledger_row("camera centres", alignment.scale_from_centres, None, "none"))
+    if not by_photos:
+        agrees = ", and the photos agree" if decided_by == "both" else ""
+        own = None if uncertainty is None else uncertainty.scale_sd_log
+        use = f"taken: the clouds' best fit inside the prior{agrees}"
+        rows.append(ledger_row("clouds", best.pose.scale, own, use))
+    return rows
+
+
+def ledger_row(name: str, scale: float, sd_log: float | None, use: str) -> dict[str, Any]:
+    """One estimate of the scale."""
+    return {"name": name, "scale": scale, "sd_log": sd_log, "use": use}

@@ -1,0 +1,227 @@
+"""Maximum likelihood: every scene point is a noisy sample of the object's surface, in place and colour (method R15)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import Surface
+
+# Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
+NEIGHBOURS = 24
+# A scene point this many standard deviations from the object, in place and colour, is as likely something else.
+FARTHEST = 4.0
+# The noise begins at this share of the scene's diagonal; it never gets below this share of the object's spacing, nor
+# the noise of colours (0..1) below LEAST_COLOR: samples a spacing apart tell no more.
+FIRST_NOISE, LEAST_NOISE, LEAST_COLOR = 0.02, 0.75, 0.03
+# The noise settles in LEAST_ROUNDS; then a step that moves the points by less than this share of it is the last.
+ROUNDS, LEAST_ROUNDS, CONVERGED = 25, 5, 0.01
+# Directions of which less is known than this share of the best known are not followed further in one step.
+WEAKEST = 1e-3
+HALVINGS = 5
+
+
+@dataclass(frozen=True)
+class Noise:
+    """How scene points differ from the object points they come from.
+
+    Attributes:
+        place: standard deviation along each axis, scene units.
+        color: standard deviation of each channel, 0..1.
+        gain: (3,) factors that bring the object's colours to the scene's.
+        bias: (3,) added to that.
+    """
+
+    place: float
+    color: float
+    gain: Array
+    bias: Array
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """From which object points the scene's points may come, at one pose and noise.
+
+    Attributes:
+        partner: (N, K) object points.
+        weight: (N, K) their probabilities; what is left to 1 is something else.
+        residual: (N, K, 3) from the moved object point to the scene point.
+        log_likelihood: of all scene points, up to a constant.
+    """
+
+    partner: NDArray[np.int64]
+    weight: Array
+    residual: Array
+    log_likelihood: float
+
+
+@dataclass(frozen=True)
+class MostLikely:
+    """A maximum of the likelihood.
+
+    Attributes:
+        pose: scene_from_object.
+        noise: at the maximum.
+        on_object: (N,) probability of each scene point to lie on the object.
+        gradients: (N, 7) of each point's log-likelihood by rotation vector, shift and log scale about `centre`.
+        information: (7, 7) the observed information: minus the second derivative of the log-likelihood.
+        centre: (3,) of the object, in the scene.
+    """
+
+    pose: Sim3
+    noise: Noise
+    on_object: Array
+    gradients: Array
+    information: Array
+    centre: Array
+
+
+def most_likely(
+    obj: Surface, scene: Surface, start: Sim3, scales: ScaleRange, spacing: float, diagonal: float
+) -> MostLikely:
+    """The pose near `start` at which the object best explains the scene's points (Newton's method).
+
+    A scene point is a Gaussian's sample about a point of the object's surface, anywhere on it, in place and colour (a
+    mixture as in Myronenko and Song 2010, Chui and Rangarajan 2000). Where noise is as thick as what it lies on, this
+    is right where nearest points are not: these always lie near, whatever the pose.
+
+    Args:
+        obj: the object in its own frame, evenly thinned.
+        scene: the scene crop; its query points count.
+        start: scene_from_object, some deviations of the noise off at most.
+        scales: bounds of the scale; of width 0 it is held.
+        spacing: of the object's points, scene units.
+        diagonal: of the scene crop.
+    """
+    pose, floor = start, LEAST_NOISE * spacing
+    noise = Noise(FIRST_NOISE * diagonal, 0.15, np.ones(3), np.zeros(3))
+    found = explain(obj, scene, pose, noise, spacing)
+    for step in range(ROUNDS):
+        noise = _measured_noise(obj, scene, found, floor)
+        found = explain(obj, scene, pose, noise, spacing, found.partner)
+        at = _derivatives(obj, scene, pose, noise, found)
+        change = _newton_step(at, diagonal / 3, scales.width == 0)
+        pose, found, moved = _climb(obj, scene, at, found, change, scales, spacing)
+        if step >= LEAST_ROUNDS - 1 and moved * diagonal / 3 < CONVERGED * noise.place:
+            break
+    return _derivatives(obj, scene, pose, noise, found)
+
+
+def explain(
+    obj: Surface,
+    scene: Surface,
+    pose: Sim3,
+    noise: Noise,
+    spacing: float,
+    partner: NDArray[np.int64] | None = None,
+) -> Explanation:
+    """From which object points, `spacing` apart (scene units), the scene's query points may come at a pose.
+
+    `partner` (N, K) are the nearest object points at this pose, where they are known already.
+    """
+    at = scene.points[scene.queries]
+    near = min(NEIGHBOURS, len(obj))
+    if partner is None:
+        partner = obj.tree.query(pose.inverse().apply(at), k=near, workers=threads())[1].reshape(len(at), near)
+    residual = at[:, None] - pose.apply(obj.points[partner])
+    off = (residual**2).sum(2) / (2 * noise.place**2)
+    if _colored(obj, scene):
+        off += (_color_residual(obj, scene, partner, noise) ** 2).sum(2) / (2 * noise.color**2)
+    likelihood = np.exp(-off)
+    # As many object points lie within reach of a scene point on a plane.
+    other = np.exp(-(FARTHEST**2) / 2) * min(near, 2 * np.pi * (noise.place / spacing) ** 2)
+    total = likelihood.sum(1) + other
+    return Explanation(partner, likelihood / total[:, None], residual, float(np.log(total).sum()))
+
+
+def moved_about(pose: Sim3, change: Array, centre: Array, scales: ScaleRange) -> Sim3:
+    """A pose after a change (7,) of rotation vector, shift and log scale about a centre (3,) in the scene."""
+    rotation = Rotation.from_rotvec(change[:3]).as_matrix()
+    growth = scales.clamp(pose.scale * float(np.exp(change[6]))) / pose.scale
+    return Sim3(growth, rotation, centre + change[3:6] - growth * (rotation @ centre)) @ pose
+
+
+def _colored(obj: Surface, scene: Surface) -> bool:
+    return obj.colors is not None and scene.colors is not None
+
+
+def _color_residual(obj: Surface, scene: Surface, partner: NDArray[np.int64], noise: Noise) -> Array:
+    """(N, K, 3)"""
+    assert obj.colors is not None and scene.colors is not None
+    return scene.colors[scene.queries][:, None] - (noise.gain * obj.colors[partner] + noise.bias)
+
+
+def _measured_noise(obj: Surface, scene: Surface, found: Explanation, floor: float) -> Noise:
+    """The noise that makes the scene's points most likely, given where they come from."""
+    weight, total = found.weight, max(float(found.weight.sum()), 1e-12)
+    place = max(floor, float(np.sqrt((weight * (found.residual**2).sum(2)).sum() / (3 * total))))
+    if not _colored(obj, scene):
+        return Noise(place, 1.0, np.ones(3), np.zeros(3))
+    assert obj.colors is not None and scene.colors is not None
+    mine, theirs = obj.colors[found.partner], scene.colors[scene.queries]
+    mean_mine = np.einsum("nk,nkc->c", weight, mine) / total
+    mean_theirs = weight.sum(1) @ theirs / total
+    together = (np.einsum("nk,nkc->nc", weight, mine - mean_mine) * (theirs - mean_theirs)).sum(0)
+    spread = np.einsum("nk,nkc->c", weight, (mine - mean_mine) ** 2)
+    gain = np.clip(together / np.maximum(spread, 1e-9), 0.25, 4.0)
+    noise = Noise(place, 1.0, gain, mean_theirs - gain * mean_mine)
+    off = (_color_residual(obj, scene, found.partner, noise) ** 2).sum(2)
+    return Noise(place, max(LEAST_COLOR, float(np.sqrt((weight * off).sum() / (3 * total)))), gain, noise.bias)
+
+
+def _derivatives(obj: Surface, scene: Surface, pose: Sim3, noise: Noise, found: Explanation) -> MostLikely:
+    """First and second derivatives at a pose: complete information less what is missing (Louis 1982)."""
+    centre = pose.apply(obj.points.mean(0))
+    lever = pose.apply(obj.points[found.partner]) - centre
+    along = (lever * found.residual).sum(2, keepdims=True)
+    each = np.concatenate([np.cross(lever, found.residual), found.residual, along], axis=2) / noise.place**2
+    gradients = np.einsum("nk,nkd->nd", found.weight, each)
+    weight, flat, arm = found.weight.ravel(), each.reshape(-1, 7), lever.reshape(-1, 3)
+    missing = (weight[:, None] * flat).T @ flat - gradients.T @ gradients
+    total, mean, square = weight.sum(), weight @ arm, (weight[:, None] * arm).T @ arm
+    complete = np.zeros((7, 7))
+    complete[:3, :3] = np.trace(square) * np.eye(3) - square
+    complete[:3, 3:6] = np.cross(mean, np.eye(3)).T
+    complete[3:6, :3] = complete[:3, 3:6].T
+    complete[3:6, 3:6] = total * np.eye(3)
+    complete[3:6, 6] = complete[6, 3:6] = mean
+    complete[6, 6] = np.trace(square)
+    information = complete / noise.place**2 - missing
+    return MostLikely(pose, noise, found.weight.sum(1), gradients, information, centre)
+
+
+def _newton_step(at: MostLikely, reach: float, hold_scale: bool) -> Array:
+    """(7,) the change that leads to the top of the parabola at a pose; rotation and scale count by `reach`."""
+    unit = np.array([reach, reach, reach, 1, 1, 1, reach])
+    gradient, information = at.gradients.sum(0) / unit, at.information / np.outer(unit, unit)
+    if hold_scale:
+        gradient[6], information[6], information[:, 6] = 0, 0, 0
+    values, vectors = np.linalg.eigh(information)
+    values = np.maximum(values, WEAKEST * values[-1])
+    change = (vectors @ ((vectors.T @ gradient) / values)) / unit
+    change[6] = np.clip(change[6], -0.05, 0.05)
+    return change
+
+
+def _climb(
+    obj: Surface,
+    scene: Surface,
+    at: MostLikely,
+    found: Explanation,
+    change: Array,
+    scales: ScaleRange,
+    spacing: float,
+) -> tuple[Sim3, Explanation, float]:
+    """The pose after a change, or a part of it, that is more likely, and how far it moves a point at the distance 1."""
+    for _ in range(HALVINGS):
+        pose = moved_about(at.pose, change, at.centre, scales)
+        then = explain(obj, scene, pose, at.noise, spacing)
+        if then.log_likelihood > found.log_likelihood:
+            reach = float(np.linalg.norm(change[:3]) + abs(change[6]))
+            return pose, then, reach + float(np.linalg.norm(change[3:6]))
+        change = change / 3
+    return at.pose, found, 0.0

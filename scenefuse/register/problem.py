@@ -1,0 +1,163 @@
+"""What a registration is given: two clouds, bounds of the scale, and what is known beside the clouds."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.core.stage import StageError, read_json, value
+from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.geometry.free_space import FreeSpace
+from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.surface import Surface, prepare
+from scenefuse.register.uncertainty import Uncertainty
+from scenefuse.sfm.gravity import UNSURE_CUES
+
+# Points on a line leave the turn about it open: below this ratio of the two largest RMS extents no pose is sought.
+MIN_BREADTH = 1e-3
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Files of an object and of the scene around it."""
+
+    object: Path
+    """Object cloud (PLY) in its own frame and unit."""
+    crop: Path
+    """Scene crop (PLY) in the scene frame."""
+    crop_json: Path
+    """JSON of the crop stage, for `up_in_scene`, what says so, and the unit of lengths."""
+    workspace_json: Path | None = None
+    """JSON with `up_in_camera_frame`, the up direction in the object's frame; without it, or without the key, gravity
+    is not used."""
+
+    def clouds(self) -> tuple[Cloud, Cloud]:
+        """The object and the scene crop.
+
+        Raises:
+            StageError: one of them cannot be registered; see `check_extent`.
+        """
+        both = read_cloud(self.object), read_cloud(self.crop)
+        for cloud, path in zip(both, (self.object, self.crop)):
+            check_extent(cloud, str(path))
+        return both
+
+    def ups(self) -> tuple[Array, Array] | None:
+        """Unit up directions (3,) in the object's and in the scene's frame; None when either is unknown or unsure."""
+        of_object = {} if self.workspace_json is None else read_json(self.workspace_json)
+        of_scene = read_json(self.crop_json)
+        if any(content.get("up_cue", {}).get("value") in UNSURE_CUES for content in (of_object, of_scene)):
+            return None
+        up_in_object, up_in_scene = of_object.get("up_in_camera_frame"), of_scene.get("up_in_scene")
+        if not up_in_object or not up_in_scene or up_in_object["value"] is None or up_in_scene["value"] is None:
+            return None
+        a, b = np.array(up_in_object["value"], float), np.array(up_in_scene["value"], float)
+        return a / np.linalg.norm(a), b / np.linalg.norm(b)
+
+    def length_unit(self) -> str:
+        """The unit of the scene's lengths."""
+        return str(read_json(self.crop_json)["diagonal"]["unit"])
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """The cross-model alignment from shared features, found without the clouds.
+
+    Attributes:
+        pose: scene_from_object.
+        uncertainty: of the pose.
+        shared_points: points seen by photos of both sides that support it.
+        scale_from_centres: scale from the camera centres alone, or None.
+    """
+
+    pose: Sim3
+    uncertainty: Uncertainty
+    shared_points: int
+    scale_from_centres: float | None
+
+    def agrees(self, pose: Sim3, centre: Array, diagonal: float, times: float = 1.0) -> bool:
+        """Whether a pose lies within `times` three standard deviations, or 3 %, 3 degrees and 3 % of the diagonal."""
+        scale = abs(np.log(pose.scale / self.pose.scale))
+        angle = rotation_angle_deg(pose.rotation @ self.pose.rotation.T)
+        shift = float(np.linalg.norm(pose.apply(centre) - self.pose.apply(centre)))
+        return bool(
+            scale <= times * max(0.03, 3 * self.uncertainty.scale_sd_log)
+            and angle <= times * max(3.0, 3 * self.uncertainty.rotation_sd_deg)
+            and shift <= times * max(0.03 * diagonal, 3 * self.uncertainty.translation_sd)
+        )
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """Everything known beside the clouds; each part is None where it is not known.
+
+    Attributes:
+        ups: unit up directions (3,) in the object's and in the scene's frame.
+        free_space: space that the scene's depth maps show to be empty.
+        alignment: from shared features.
+    """
+
+    ups: tuple[Array, Array] | None = None
+    free_space: FreeSpace | None = None
+    alignment: Alignment | None = None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Where does the object lie in the scene?
+
+    Attributes:
+        object: any frame and unit.
+        scene: the scene's points around the object.
+        scales: what the scale may be, scene units per object unit.
+        evidence: what is known beside the clouds.
+        seed: of all random choices.
+    """
+
+    object: Cloud
+    scene: Cloud
+    scales: ScaleRange
+    evidence: Evidence = Evidence()
+    seed: int = 0
+
+    def surfaces(self, scale: float, fraction: float, most: int) -> tuple[Surface, Surface]:
+        """Object and scene thinned alike: `fraction` of the scene's diagonal is one voxel on both sides.
+
+        Args:
+            scale: scene units per object unit.
+            fraction: of the scene's diagonal.
+            most: points kept of either at most.
+        """
+        voxel = fraction * self.scene.diagonal
+        return prepare(self.object, voxel / scale, self.seed, most), prepare(self.scene, voxel, self.seed, most)
+
+
+def check_extent(cloud: Cloud, name: str) -> None:
+    """StageError where a cloud's points lie in one place or along one line: nothing fixes a pose of it then."""
+    centred = cloud.points - cloud.points.mean(0)
+    extents = np.sqrt(np.maximum(np.linalg.eigvalsh(centred.T @ centred), 0))
+    if cloud.diagonal == 0 or extents[1] <= MIN_BREADTH * extents[2]:
+        where = "in one place" if cloud.diagonal == 0 else "along one line"
+        raise StageError(f"all {len(cloud)} points of {name} lie {where}: a registration needs a surface")
+
+
+def read_scales(scale: dict[str, Any]) -> ScaleRange:
+    """The scale prior of a coarse stage's JSON of the scale."""
+    return ScaleRange(value(scale, "scale"), value(scale, "width_log"))
+
+
+def read_alignment(path: Path | None) -> Alignment | None:
+    """The alignment of an alignment stage's JSON, or None where it found none."""
+    if path is None:
+        return None
+    content = read_json(path)
+    if not value(content, "found"):
+        return None
+    return Alignment(
+        Sim3.from_matrix(np.array(value(content, "scene_from_object"))),
+        Uncertainty.even(*(value(content, name) for name in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))),
+        value(content, "shared_points"),
+        value(content, "scale_from_centres"),
+    )

@@ -1,0 +1,307 @@
+"""From coarse poses to one decision: refine, turn, polish, shift, rank, compare with the alignment, decide."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import COLOR_WEIGHT, refine_planes, refine_points
+from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
+from scenefuse.register.certain import certified
+from scenefuse.register.coarse import Candidate
+from scenefuse.register.decision import (
+    MAX_FREE_SPACE_VIOLATION,
+    DecidedBy,
+    Decision,
+    FineSettings,
+    Repetition,
+    decide,
+    unless_torn,
+)
+from scenefuse.register.overlap import multiples, shifted, undecided_shift
+from scenefuse.register.problem import Problem
+from scenefuse.register.score import SAME_ANGLE_DEG, SAME_SHIFT, Hypothesis, Score, best_distinct, score
+from scenefuse.register.shifts import shifts_onto_itself
+from scenefuse.register.uncertainty import Uncertainty, alike, half_sampling, with_bending
+
+# Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
+FINE_POINTS = 12000
+QUERY_POINTS = 1200
+POLISH_QUERY_POINTS = 3000
+# Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
+START_FRACTION, END_FRACTION = 0.05, 0.02
+REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
+# Leading poses whose turned copies are tried, copies that are refined, and hypotheses, or copies, that are polished.
+TURNED, COPIES, POLISHED = 2, 6, 4
+# Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
+COPY_ANGLE_DEG = 25
+# Nearer to its place than a coarse pose, a copy is refined from a smaller pairing distance.
+COPY_START = 0.7
+# A valley that is flat in scale has several ends: the polish is repeated from both sides.
+OFF_SCALE = 1.06
+# Poses of an object that repeats itself differ when they lie more than this share of the shortest period apart.
+OF_PERIOD = 0.5
+# Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
+OWN_SPACING = 0.005
+# The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
+BEYOND_PRIOR = 0.15
+# The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
+ASTRAY = 0.9
+# A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
+# times that.
+NEAR_ALIGNMENT = 2.0
+# Halves of the surface that are registered again for the uncertainty.
+RESAMPLINGS = 8
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The refined hypotheses, best first, the decision on the first, and its uncertainty.
+
+    Attributes:
+        ranked: the hypotheses.
+        decision: on the first.
+        uncertainty: of the first, on the clouds as they are; the gate counts it.
+        alike: (7, 7) what the clouds have wrong alike, where the pose is theirs (see `alike`); None where it is the
+            alignment's.
+    """
+
+    ranked: list[Hypothesis]
+    decision: Decision
+    uncertainty: Uncertainty | None
+    alike: Array | None = None
+
+    @property
+    def stated(self) -> Uncertainty | None:
+        """The uncertainty with what the clouds have wrong alike."""
+        if self.uncertainty is None or self.alike is None:
+            return self.uncertainty
+        return self.uncertainty.plus(self.alike)
+
+    def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
+        """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
+        if self.uncertainty is None or bending is None:
+            return self
+        bent = with_bending(self.uncertainty, self.ranked[0].pose, bending, None)
+        return replace(self, decision=unless_torn(self.decision, bent, diagonal))
+
+
+def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], settings: FineSettings) -> Outcome:
+    """Refine coarse poses into one, and decide whether it may be used (method R8, R9, R12, R15).
+
+    Two-way Tukey-weighted similarity ICP of every candidate; turned copies of the leaders; point-to-plane and colour
+    polish; turned copies of what is best then, and shifted ones where the object repeats itself; ranking by the two-way
+    F-score, the agreement of colours and free space; comparison with the alignment from shared features, which replaces
+    the clouds' pose where they differ; the most likely pose; the uncertainty; the gate.
+
+    Args:
+        problem: the clouds and what is known.
+        candidates: poses scene_from_object, each with its source; one or more.
+        settings: see FineSettings.
+    """
+    work = _prepare(problem, candidates[0][0].scale, settings)
+    refined = work.best_first([work.refine(pose, source, work.wide) for pose, source in candidates])
+    refined = work.best_first([*refined, *work.turned(refined[:TURNED])])
+    polished = work.best_first([work.polish(h) for h in refined[:POLISHED]])
+    both_sides = [work.polish(work.resized(polished[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE)]
+    polished = work.best_first([*polished, *both_sides])
+    # About the polished pose, whose axis is exact, rivals turn up that the copies of a rough one slid past.
+    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED])])
+    polished = work.best_first([*polished, *work.shifted(polished[0])])
+    ranked, uncertainty, decided_by = work.compared_with_photos(polished)
+    shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
+    decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
+    pose, alignment = ranked[0].pose, problem.evidence.alignment
+    by_photos = alignment is not None and pose is alignment.pose
+    return Outcome(
+        ranked, decision, uncertainty, None if by_photos else alike(*work.scored, pose, problem.scales, work.narrow)
+    )
+
+
+def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
+    """Thin and index both clouds for poses of about this scale."""
+    diagonal, fraction, seed = problem.scene.diagonal, settings.voxel_fraction, problem.seed
+    obj, scene = problem.surfaces(scale, fraction, FINE_POINTS)
+    cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
+    return _Work(
+        replace(problem, scales=problem.scales.widened(BEYOND_PRIOR)),
+        settings,
+        obj,
+        (
+            with_queries(with_grid(obj, cell / scale, reach / scale), QUERY_POINTS, seed),
+            with_queries(with_grid(scene, cell, reach), QUERY_POINTS, seed),
+        ),
+        (with_queries(obj, POLISH_QUERY_POINTS, seed), with_queries(scene, POLISH_QUERY_POINTS, seed)),
+        problem.surfaces(scale, 2 * fraction, FINE_POINTS),
+        _shifts(problem, obj, fraction * diagonal / scale),
+    )
+
+
+def _shifts(problem: Problem, obj: Surface, spacing: float) -> list[Array]:
+    """The shifts (3,) by which the object, thinned to a spacing, repeats itself; the scale may be wrong yet, and the
+    spacing too large to tell."""
+    own = OWN_SPACING * problem.object.diagonal
+    if own < spacing:
+        obj, spacing = prepare(problem.object, own, problem.seed, FINE_POINTS), own
+    return shifts_onto_itself(with_queries(obj, QUERY_POINTS, problem.seed), spacing)
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Both clouds, prepared once, and the steps of the refinement on them.
+
+    Attributes:
+        problem: with the prior of the scale widened.
+        settings: of the fine registration.
+        obj: the object's surface, thinned.
+        searched: object and scene with few query points and grids of nearest points, for refinement and ranking.
+        scored: the same with more query points and trees, for the polish and the final score.
+        coarser: both at twice the spacing, for the uncertainty.
+        shifts: (3,) each, by which the object repeats itself, in its own frame.
+    """
+
+    problem: Problem
+    settings: FineSettings
+    obj: Surface
+    searched: tuple[Surface, Surface]
+    scored: tuple[Surface, Surface]
+    coarser: tuple[Surface, Surface]
+    shifts: list[Array]
+
+    @property
+    def centre(self) -> Array:
+        """(3,) centre of the object, in its own frame."""
+        return self.obj.points.mean(0)
+
+    @property
+    def wide(self) -> float:
+        """First pairing distance, scene units."""
+        return START_FRACTION * self.problem.scene.diagonal
+
+    @property
+    def narrow(self) -> float:
+        """Last pairing distance, scene units."""
+        return END_FRACTION * self.problem.scene.diagonal
+
+    def best_first(self, hypotheses: list[Hypothesis], angle_deg: float = SAME_ANGLE_DEG) -> list[Hypothesis]:
+        """Ranked by score, one of each valley."""
+        diagonal = self.problem.scene.diagonal
+        same = self.same_shift(min(h.pose.scale for h in hypotheses))
+        return best_distinct(hypotheses, self.centre, diagonal, len(hypotheses), angle_deg, same)
+
+    def same_shift(self, scale: float) -> float:
+        """Poses whose shift differs by less are one, as a share of the diagonal."""
+        lengths = [OF_PERIOD * scale * float(np.linalg.norm(s)) / self.problem.scene.diagonal for s in self.shifts]
+        return min([SAME_SHIFT, *lengths])
+
+    def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
+        """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
+        pose = refine_points(*self.searched, pose, self.problem.scales, (first, self.narrow), REFINE_ROUNDS)
+        return Hypothesis(pose, source, self._score(pose, self.searched))
+
+    def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
+        """The best of the leaders' turned copies, refined."""
+        ups = self.problem.evidence.ups
+        axis, steps = None if ups is None else ups[1], self.settings.turn_steps
+        copies = [pose for h in leaders for pose in turned_copies(h.pose, self.obj, axis, steps)]
+        scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
+        best = [h for h in self.best_first([*leaders, *scored], COPY_ANGLE_DEG) if h.source == "turned"]
+        return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:COPIES]]
+
+    def shifted(self, best: Hypothesis) -> list[Hypothesis]:
+        """The best of a pose's copies shifted along the object's repetition, polished."""
+        poses = [shifted(best.pose, step) for shift in self.shifts for step in multiples(self.obj, shift)]
+        scored = [Hypothesis(pose, "shifted", self._score(pose, self.searched)) for pose in poses]
+        return [self.polish(h) for h in sorted(scored, key=lambda h: -h.score.total)[:POLISHED]]
+
+    def repetition(self, pose: Sim3) -> Repetition:
+        """What the object's repetition leaves open of a pose."""
+        if not self.shifts:
+            return Repetition()
+        tau, free_space = self.settings.score_fraction * self.problem.scene.diagonal, self.problem.evidence.free_space
+        period = undecided_shift(*self.scored, pose, self.shifts, tau, self.settings.min_margin, free_space)
+        return Repetition(self.same_shift(pose.scale), period)
+
+    def polish(self, h: Hypothesis) -> Hypothesis:
+        """The hypothesis after the last refinement, by planes and colours."""
+        pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow, POLISH_ROUNDS, COLOR_WEIGHT)
+        after, before = (Hypothesis(p, h.source, self._score(p, self.scored)) for p in (pose, h.pose))
+        return after if after.score.total > ASTRAY * before.score.total else before
+
+    def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
+        """The hypothesis with the object grown about its centre."""
+        fixed = h.pose.apply(self.centre)
+        pose = Sim3(factor, np.eye(3), (1 - factor) * fixed) @ h.pose
+        return Hypothesis(pose, h.source, self._score(pose, self.scored))
+
+    def settled(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None]:
+        """The ranking with its first replaced by the most likely pose, where that is less uncertain, and how uncertain
+        it is. A most likely pose that fits worse went astray."""
+        problem, best, diagonal = self.problem, ranked[0], self.problem.scene.diagonal
+        surfaces, spacing = [self.scored, self.coarser], self.settings.voxel_fraction * diagonal
+        own = half_sampling(surfaces, best.pose, problem.scales, self.narrow, RESAMPLINGS, problem.seed)
+        other = certified(*self.scored, best.pose, problem.scales, spacing, diagonal, problem.seed)
+        if other is None or (own is not None and own.size(diagonal) <= other[1].size(diagonal)):
+            return ranked, own
+        likely = Hypothesis(other[0], best.source, self._score(other[0], self.scored))
+        if likely.score.total <= ASTRAY * best.score.total:
+            return ranked, own
+        return [likely, *ranked[1:]], other[1]
+
+    def compared_with_photos(self, ranked: list[Hypothesis]) -> tuple[list[Hypothesis], Uncertainty | None, DecidedBy]:
+        """The ranking after the alignment from shared features, the uncertainty of its first, and what decided.
+
+        Where the alignment differs from the clouds' pose, its own is refined on the clouds. Of the refined pose and the
+        alignment's own the less uncertain one is taken; the worse the clouds score at the alignment's pose, the less
+        uncertain that must be. Where they score as well there, what they differ by beyond the alignment's uncertainty
+        counts as theirs: surfaces err alike, which their scatter does not show. A refinement that leaves the
+        alignment's valley is dropped, unless it stays near and the scene's photos refute the alignment's own pose: both
+        models may be bent. Then it has to pass as a pose that no photos support.
+        """
+        alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
+        if alignment is None:
+            return *self.settled(ranked), "geometry"
+        agree = alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        if not agree:
+            ranked = [self.polish(self.refine(alignment.pose, "photos", self.narrow)), *ranked]
+        ranked, own = self.settled(ranked)
+        by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
+        worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
+        strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
+        near = alignment.agrees(ranked[0].pose, self.centre, diagonal, NEAR_ALIGNMENT)
+        if strays and near and _refuted(by_photos) and not _refuted(ranked[0]):
+            return ranked, own, "near"
+        if own is not None and worth > ASTRAY:
+            own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
+        if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
+            ranked, own = [by_photos, *ranked], alignment.uncertainty
+        return ranked, own, "both" if agree else "photos"
+
+    def _score(self, pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
+        """How well a pose explains both clouds."""
+        tau = self.settings.score_fraction * self.problem.scene.diagonal
+        return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.evidence.free_space)
+
+
+def _refuted(h: Hypothesis) -> bool:
+    """Whether a pose puts too much of the object where the scene's photos see something behind it."""
+    violation = h.score.free_space_violation
+    return violation is not None and violation > MAX_FREE_SPACE_VIOLATION
+
+
+def turned_copies(pose: Sim3, obj: Surface, up_in_scene: Array | None, steps: int) -> list[Sim3]:
+    """The pose turned about the object's centre in `steps` steps of a full circle, the pose itself left out.
+
+    The axis is the vertical; where it is not known, each of the object's principal axes.
+    """
+    centre = pose.apply(obj.points.mean(0))
+    principal = np.linalg.svd(pose.rotate(obj.points - obj.points.mean(0)), full_matrices=False)[2]
+    axes = principal if up_in_scene is None else up_in_scene[None]
+    copies = []
+    for axis in axes:
+        for angle in np.arange(1, steps) * 2 * np.pi / steps:
+            rotation = Rotation.from_rotvec(angle * axis).as_matrix()
+            copies.append(Sim3(1.0, rotation, centre - rotation @ centre) @ pose)
+    return copies

@@ -1,0 +1,167 @@
+"""How well a pose explains two surfaces: two-way F-score, colours, free space; and hypotheses ranked by it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
+from scenefuse.geometry.free_space import FreeSpace
+from scenefuse.geometry.pairs import Pairs, pair
+from scenefuse.geometry.surface import Surface
+
+# Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
+RECALL_WEIGHT = 2.0
+# Distance within which points agree, as a share of the scene crop's diagonal.
+SCORE_FRACTION = 0.02
+# Colours that vary less (standard deviation, 0..1) say nothing about the pose.
+MIN_CONTRAST = 0.02
+# Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
+SAME_ANGLE_DEG, SAME_SCALE_LOG, SAME_SHIFT = 8.0, 0.06, 0.05
+
+
+@dataclass(frozen=True)
+class Score:
+    """The quality of one pose, every number in 0..1.
+
+    Attributes:
+        f_score: two-way F of `precision` and `recall`, both soft (an inlier counts less the farther and the more
+            tilted its partner is). Recall weighs more, since the scene shows only a part of the object.
+        precision: share of the object that the scene confirms.
+        recall: share of the scene crop that the object explains.
+        color: correlation of the colours over the pairs after one gain and bias per channel; None without colours.
+        free_space_violation: share of the object in the scene's free space, where photos measured surfaces behind it;
+            None where the free space is not known.
+        total: the number hypotheses are ranked by: F, with the object's area at the usual scale, times the agreement
+            of colours, times the share outside free space.
+    """
+
+    f_score: float
+    precision: float
+    recall: float
+    color: float | None
+    free_space_violation: float | None
+    total: float
+
+
+def worth(obj: Surface, scene: Surface, scene_from_object: Sim3, tau: float) -> tuple[Pairs, Array]:
+    """The pairs of a pose and how much each counts (M,), 0..1: less the farther and the more tilted its partner is."""
+    pairs = pair(obj, scene, scene_from_object, tau)
+    turned = scene_from_object.rotate(obj.normals)
+    facing = (turned[pairs.object_index] * scene.normals[pairs.scene_index]).sum(1)
+    return pairs, (1 - (pairs.distance / tau) ** 2) * np.clip(np.abs(facing), 0, 1)
+
+
+def f_beta(precision: float, recall: float) -> float:
+    """The F-score in which recall weighs more."""
+    b = RECALL_WEIGHT**2
+    return (1 + b) * precision * recall / (b * precision + recall) if precision + recall > 0 else 0.0
+
+
+def score(
+    obj: Surface,
+    scene: Surface,
+    scene_from_object: Sim3,
+    tau: float,
+    usual_scale: float,
+    free_space: FreeSpace | None = None,
+) -> Score:
+    """Score a pose.
+
+    Args:
+        obj: the object in its own frame.
+        scene: the scene crop.
+        scene_from_object: the pose.
+        tau: distance within which points agree, scene units.
+        usual_scale: centre of the scale prior; in the total, an object's area counts as it would be at that scale.
+        free_space: space known to be empty, or None.
+    """
+    pairs, value = worth(obj, scene, scene_from_object, tau)
+    precision = float(value[: pairs.forward].sum() / len(obj.queries))
+    recall = float(value[pairs.forward :].sum() / len(scene.queries))
+    f_score = f_beta(precision, recall)
+    color = color_agreement(obj, scene, pairs)
+    # A smaller object sticks out less: as a share of its own area, precision would always reward shrinking.
+    level = min(1.0, precision * (scene_from_object.scale / usual_scale) ** 2)
+    total = f_beta(level, recall)
+    total *= 1.0 if color is None else 0.5 + 0.5 * color
+    violation = None
+    if free_space is not None:
+        violation = free_space.violation(scene_from_object.apply(obj.points[obj.queries]))
+        total *= 1 - (violation or 0.0)
+    return Score(f_score, precision, recall, color, violation, total)
+
+
+def color_agreement(obj: Surface, scene: Surface, pairs: Pairs) -> float | None:
+    """Correlation 0..1 of paired colours, pooled over channels, after a gain and a bias per channel.
+
+    None without colours, or where either side is all but one colour: then colours say nothing about the pose.
+    """
+    if obj.colors is None or scene.colors is None:
+        return None
+    if min(float(c.std(0).max()) for c in (obj.colors, scene.colors)) < MIN_CONTRAST:
+        return None
+    if len(pairs.distance) < 30:
+        return 0.0
+    a, b = obj.colors[pairs.object_index], scene.colors[pairs.scene_index]
+    a, b = a - a.mean(0), b - b.mean(0)
+    spread = (b**2).sum(0)
+    together = (a * b).sum(0)
+    explained = np.where(together > 0, together**2 / np.maximum((a**2).sum(0), 1e-9), 0.0)
+    return float(np.sqrt(explained.sum() / max(spread.sum(), 1e-9)))
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """A pose (scene_from_object), where it comes from, and how well it explains both clouds."""
+
+    pose: Sim3
+    source: str
+    score: Score
+
+    def as_json(self) -> dict[str, Any]:
+        """The pose and its numbers as a stage JSON holds them."""
+        return {
+            "scene_from_object": self.pose.matrix.tolist(),
+            "scale": self.pose.scale,
+            "source": self.source,
+            "score": self.score.total,
+            "f_score": self.score.f_score,
+            "precision": self.score.precision,
+            "recall": self.score.recall,
+            "color_agreement": self.score.color,
+            "free_space_violation": self.score.free_space_violation,
+        }
+
+
+def best_distinct(
+    hypotheses: list[Hypothesis],
+    centre: Array,
+    diagonal: float,
+    most: int,
+    angle_deg: float = SAME_ANGLE_DEG,
+    shift: float = SAME_SHIFT,
+) -> list[Hypothesis]:
+    """At most `most` hypotheses, best first, without those that equal a better one; see `distinct`."""
+    chosen: list[Hypothesis] = []
+    for one in sorted(hypotheses, key=lambda h: -h.score.total):
+        if len(chosen) == most:
+            break
+        if all(distinct(one.pose, other.pose, centre, diagonal, angle_deg, shift) for other in chosen):
+            chosen.append(one)
+    return chosen
+
+
+def distinct(
+    a: Sim3,
+    b: Sim3,
+    centre: Array,
+    diagonal: float,
+    angle_deg: float = SAME_ANGLE_DEG,
+    shift: float = SAME_SHIFT,
+) -> bool:
+    """Whether two poses differ by more than an angle, 6 % of scale or, at the object's centre, `shift` diagonals."""
+    apart = np.linalg.norm(a.apply(centre) - b.apply(centre))
+    turn = rotation_angle_deg(a.rotation @ b.rotation.T)
+    scale_log = abs(np.log(a.scale / b.scale))
+    return bool(turn > angle_deg or scale_log > SAME_SCALE_LOG or apart > shift * diagonal)

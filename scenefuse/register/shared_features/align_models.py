@@ -1,0 +1,319 @@
+"""Cross-model alignment from shared features: points and photos that the object's and the scene's sparse models share.
+
+It uses the photos only, not the dense clouds, so what goes wrong in one rarely goes wrong in both.
+"""
+
+import contextlib
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from scenefuse.core.stage import quantity, setting, write_json
+from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
+from scenefuse.register.shared_features.gps import CONTRADICTED, GpsPose, gps_quantities, pose_by_gps
+from scenefuse.register.shared_features.landmarks import Landmarks, match_landmarks, read_landmarks
+from scenefuse.register.shared_features.localise import Centres, localise
+from scenefuse.register.shared_features.reprojection import (
+    Observations,
+    bootstrap,
+    match_errors,
+    minimise_reprojection,
+    observations,
+)
+from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
+
+# Random triples of matches drawn, those of them fitted, the matches that rank these, the best that are refined.
+RANSAC_SAMPLES, PROPOSALS, RANKED_ON, FINALISTS = 100_000, 2000, 300, 10
+# How much the scales of a triple's three edges may differ, least over largest.
+LEAST_EDGE_RATIO = 0.8
+# Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
+MAX_ERROR_PX = 6.0
+ROUNDS = 20
+# The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
+MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
+# Places alike of which GPS may settle one.
+MOST_ALIKE = 10
+# Draws of photos and points for the standard deviations.
+BOOTSTRAP_DRAWS = 200
+PER_UNIT = "scene units per object unit"
+
+
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Settings of the alignment from shared features."""
+
+    min_points: int = setting(15, least=4)
+    """Gate: fewest points shared by both models."""
+    min_photos: int = setting(3, least=2)
+    """Gate: fewest photos on either side that observe shared points."""
+    max_ratio: float = 0.85
+    """Lowe's ratio test: descriptor distance to the best over that to the second-best point."""
+    nearest_points: int = 200
+    """Shared points that fix the pose, those nearest to where the object's photos look: far from it both models may be
+    bent against each other."""
+    gps_accuracy_m: float = 3.0
+    """Standard error of the GPS positions of either side that state none, when they are compared."""
+
+
+@dataclass(frozen=True)
+class Consensus:
+    """The similarity that most matches support.
+
+    Attributes:
+        pose: scene_from_object.
+        inliers: (M,) bool over the matches.
+        rival: inliers of the best pose among the rest.
+        other: that pose, or None.
+        settled_by_gps: whether GPS chose among several.
+    """
+
+    pose: Sim3
+    inliers: NDArray[np.bool_]
+    rival: int
+    other: Sim3 | None = None
+    settled_by_gps: bool = False
+
+
+@dataclass(frozen=True)
+class Found:
+    """A refined pose and what supports it.
+
+    Attributes:
+        consensus: with the refined pose.
+        inliers: observations of the shared points.
+        uncertainty: of the pose.
+        problem: why the pose is rejected, or None.
+        centres: the pose from the camera centres alone; None where the pose is rejected.
+        centre: (3,) middle of the object's points.
+    """
+
+    consensus: Consensus
+    inliers: Observations
+    uncertainty: Uncertainty
+    problem: str | None
+    centres: Centres | None
+    centre: Array
+
+
+def align_models(
+    *,
+    object_sparse: Path,
+    object_features: Path,
+    scene_sparse: Path,
+    scene_features: Path,
+    report: Path,
+    seed: int,
+    settings: AlignmentSettings,
+    object_photos: Path | None = None,
+    scene_photos: Path | None = None,
+    scene_json: Path | None = None,
+) -> None:
+    """Find scene_from_object from features that the object's photos share with the scene's (method R14).
+
+    Shared points: triangulated points of both models are matched by their SIFT descriptors, RANSAC over triples gives a
+    similarity of free scale, and Gauss-Newton minimises the reprojection of each model's points in the other's photos.
+    Camera centres: each photo of the object is localised in the scene by itself, and a similarity is fitted to the
+    centres; it shares the matches but neither the object's points nor the minimiser, and is reported beside the first.
+    GPS: where both sides have it, it gives one more estimate, which tells an object from its like elsewhere.
+
+    Args:
+        object_sparse: COLMAP model of the object's original photos; its frame is the object frame.
+        object_features: COLMAP database that holds their features.
+        scene_sparse: georeferenced COLMAP model of the scene; its frame is the scene frame.
+        scene_features: COLMAP database that holds the scene's features.
+        report: output JSON: `found`, `reason`, `scene_from_object`, how certain it is.
+        seed: of all random choices.
+        settings: see AlignmentSettings.
+        object_photos: JSON list of the object's photos with their GPS positions, if any.
+        scene_photos: the same of the scene, for their accuracy.
+        scene_json: JSON of the georeferencing stage, for the scene's origin.
+
+    Raises:
+        StageError: a database does not belong to its model.
+    """
+    begin = time.perf_counter()
+    obj = read_landmarks(object_sparse, object_features)
+    scene = read_landmarks(scene_sparse, scene_features)
+    gps = pose_by_gps(obj, scene, object_photos, scene_photos, scene_json, settings.gps_accuracy_m, seed)
+    content = align_landmarks(obj, scene, settings, seed, gps)
+    print(f"{'found' if content['found']['value'] else 'not found'}: {content['reason']['value']}", flush=True)
+    write_json(report, {**content, "seconds": quantity(time.perf_counter() - begin, "s")})
+
+
+def align_landmarks(
+    obj: Landmarks, scene: Landmarks, settings: AlignmentSettings, seed: int, gps: GpsPose | None = None
+) -> dict[str, Any]:
+    """Match, find a consensus, refine, apply the gate: the stage JSON without its time."""
+    pairs = match_landmarks(obj, scene, settings.max_ratio)
+    print(f"{len(obj.points)} points of the object, {len(scene.points)} of the scene, {len(pairs)} matches", flush=True)
+    seen = observations(obj, scene, pairs)
+    consensus = find_consensus(seen, seed)
+    centre = np.median(obj.points, axis=0)
+    if consensus is None or not consensus.inliers.any():
+        return _report(None, len(pairs)) | gps_quantities(gps, None, obj.looked_at())
+    if gps is not None:
+        consensus = _by_gps(seen, consensus, gps, obj.looked_at(), seed)
+    inliers = seen.subset(consensus.inliers)
+    near = nearest(inliers, obj.looked_at(), settings.nearest_points)
+    pose = minimise_reprojection(near, consensus.pose, MAX_ERROR_PX / 2, ROUNDS)
+    drawn = bootstrap(near, pose, MAX_ERROR_PX / 2, centre, BOOTSTRAP_DRAWS, seed)
+    # The pose that all points give shows how much the models are bent against each other.
+    uncertainty = drawn.with_difference(pose, consensus.pose, centre)
+    consensus = replace(consensus, pose=pose)
+    problem = rejection_reason(consensus, inliers, len(pairs), uncertainty, settings)
+    centres = None if problem else localise(obj, scene, pairs, pose, MAX_ERROR_PX, seed)
+    found = _report(Found(consensus, inliers, uncertainty, problem, centres, centre), len(pairs))
+    return found | gps_quantities(gps, None if problem else pose, obj.looked_at())
+
+
+def nearest(seen: Observations, place: Array, count: int) -> Observations:
+    """The `count` matches nearest to a place (3,) in the object's frame."""
+    distance = np.linalg.norm(seen.x - place, axis=1)
+    return seen.subset(distance <= np.sort(distance)[min(count, len(distance)) - 1])
+
+
+def find_consensus(seen: Observations, seed: int) -> Consensus | None:
+    """The similarity that most matches support, refined on its inliers, and its strongest rival among the others."""
+    pose = _most_supported(seen, seed)
+    if pose is None:
+        return None
+    error = match_errors(seen, pose)
+    others = seen.subset(error > 3 * MAX_ERROR_PX)
+    other = _most_supported(others, seed)
+    rival = 0 if other is None else int((match_errors(others, other) <= MAX_ERROR_PX).sum())
+    return Consensus(pose, error <= MAX_ERROR_PX, rival, other)
+
+
+def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, seed: int) -> Consensus:
+    """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
+    poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
+    other, rival = consensus.other, consensus.rival
+    while other is not None and rival > least and len(poses) < MOST_ALIKE:
+        poses.append(other)
+        rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
+        other = _most_supported(rest, seed)
+        rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
+    allowed = [pose for pose in poses if gps.miss(pose, at) <= CONTRADICTED]
+    if len(poses) == 1 or len(allowed) != 1 or len(poses) == MOST_ALIKE:
+        return consensus
+    print(f"GPS settles which of {len(poses)} poses it is", flush=True)
+    return Consensus(allowed[0], match_errors(seen, allowed[0]) <= MAX_ERROR_PX, 0, settled_by_gps=True)
+
+
+def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
+    """RANSAC over triples whose edges agree on one scale, ranked by reprojection; the finalists are refined."""
+    if len(seen.x) < 4:
+        return None
+    rng = np.random.default_rng(seed)
+    triples = rng.integers(0, len(seen.x), (RANSAC_SAMPLES, 3))
+    edges = [np.linalg.norm(p[triples] - p[np.roll(triples, 1, axis=1)], axis=2) for p in (seen.x, seen.y)]
+    ratio = edges[1] / np.maximum(edges[0], 1e-300)
+    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > LEAST_EDGE_RATIO * ratio.max(1))
+    proposed = []
+    for triple in triples[fair][:PROPOSALS]:
+        with contextlib.suppress(ValueError):
+            proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
+    if not proposed:
+        return None
+    few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKED_ON]))
+    finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:FINALISTS]
+    polished = [_polished(seen, p, MAX_ERROR_PX) for p in finalists]
+    return min(polished, key=lambda p: _cost(seen, p, MAX_ERROR_PX))
+
+
+def _polished(seen: Observations, pose: Sim3, limit_px: float) -> Sim3:
+    """Refined on the matches within a limit that narrows to `limit_px`."""
+    for factor in (4.0, 2.0, 1.0, 1.0):
+        near = match_errors(seen, pose) <= factor * limit_px
+        if near.sum() < 4:
+            return pose
+        pose = minimise_reprojection(seen.subset(near), pose, factor * limit_px / 2, ROUNDS)
+    return pose
+
+
+def _cost(seen: Observations, pose: Sim3, limit_px: float) -> float:
+    """Truncated squared errors (MSAC, Torr and Zisserman 2000)."""
+    return float(np.minimum((match_errors(seen, pose) / limit_px) ** 2, 1).sum())
+
+
+def rejection_reason(
+    consensus: Consensus, inliers: Observations, matches: int, uncertainty: Uncertainty, settings: AlignmentSettings
+) -> str | None:
+    """Why the pose is rejected, in one sentence, or None."""
+    count, photos = len(inliers.x), min(inliers.photos)
+    if count < settings.min_points:
+        return f"only {count} of {matches} matched points agree on one pose, {settings.min_points} are needed"
+    if photos < settings.min_photos:
+        return f"the shared points are seen in {photos} photos of one side only, {settings.min_photos} are needed"
+    if consensus.rival > MAX_RIVAL_SHARE * count:
+        return (
+            f"another pose has {consensus.rival} points of its own beside the best one's {count}: something is there"
+            " twice"
+        )
+    scale, turn = uncertainty.scale_sd_log, uncertainty.rotation_sd_deg
+    if scale > MAX_SCALE_SD_LOG:
+        return (
+            f"the {count} shared points leave the scale open by {100 * scale:.1f} %, more than"
+            f" {100 * MAX_SCALE_SD_LOG:.1f} %"
+        )
+    if turn > MAX_ROTATION_SD_DEG:
+        return (
+            f"the {count} shared points leave the rotation open by {turn:.1f} degrees, more than"
+            f" {MAX_ROTATION_SD_DEG:.1f}"
+        )
+    return None
+
+
+def _report(found: Found | None, matches: int) -> dict[str, Any]:
+    """The stage JSON; what was not found or not looked for is null."""
+    if found is None:
+        problem: str | None = f"{matches} points of the models look alike, and no three of them fit one similarity"
+        count, photos, rival, error, uncertainty, pose, settled = 0, (0, 0), 0, None, None, None, False
+    else:
+        problem, consensus, inliers = found.problem, found.consensus, found.inliers
+        count, photos, rival, uncertainty = len(inliers.x), inliers.photos, consensus.rival, found.uncertainty
+        settled = consensus.settled_by_gps
+        error = float(np.sqrt((match_errors(inliers, consensus.pose) ** 2).mean())) if count else None
+        pose = None if problem else consensus.pose
+    words = (
+        f"{count} of {matches} matched points agree, in {photos[0]} photos of the object and {photos[1]} of the scene"
+        + ("; GPS tells it from its like" if settled else "")
+    )
+    return {
+        "found": quantity(problem is None, ""),
+        "reason": quantity(problem or words, ""),
+        "scene_from_object": quantity(None if pose is None else pose.matrix, ""),
+        "scale": quantity(None if pose is None else pose.scale, PER_UNIT),
+        "shared_points": quantity(count, "1"),
+        "matches": quantity(matches, "1"),
+        "inlier_share": quantity(count / matches if matches else 0.0, "1"),
+        "rival_points": quantity(rival, "1"),
+        "settled_by_gps": quantity(settled, ""),
+        "object_photos": quantity(photos[0], "1"),
+        "scene_photos": quantity(photos[1], "1"),
+        "reprojection_px": quantity(error, "px"),
+        **uncertainty_quantities(uncertainty, "scene units"),
+        **_centres_quantities(found),
+    }
+
+
+def _centres_quantities(found: Found | None) -> dict[str, Any]:
+    """The pose from the camera centres alone, and how far it is from the pose from shared points."""
+    turn = shift = scale = None
+    photos = 0
+    if found is not None and found.centres is not None:
+        photos = len(found.centres.photos)
+        pose, other = found.consensus.pose, found.centres.pose
+        if other is not None:
+            turn, scale = rotation_angle_deg(other.rotation @ pose.rotation.T), other.scale
+            shift = float(np.linalg.norm(other.apply(found.centre) - pose.apply(found.centre)))
+    return {
+        "scale_from_centres": quantity(scale, PER_UNIT),
+        "centres_photos": quantity(photos, "1"),
+        "centres_rotation_deg": quantity(turn, "deg"),
+        "centres_shift": quantity(shift, "scene units"),
+    }

@@ -1,0 +1,131 @@
+"""By which shifts an object maps onto itself, as stairs, colonnades and facades do (method R8)."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.ndimage import map_coordinates, maximum_filter
+
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import ScaleRange, refine_planes
+from scenefuse.geometry.surface import Surface
+from scenefuse.register.overlap import overlap
+
+# Edge of a voxel, and distance within which points agree, in spacings of the points.
+VOXEL, AGREEING = 4 / 3, 8 / 3
+# Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
+MOST_CELLS, LEAST_VOXELS = 1_000_000, 3
+# A shift is looked at when this share of the object's voxels meet, and so much less of them on the way to it: a plane
+# that slides along itself does not repeat.
+MEETING, DIP = 0.3, 0.02
+# Shifts that are looked at, directions kept, and rounds that refine a shift.
+LOOKED_AT, DIRECTIONS, ROUNDS = 8, 3, 20
+# It repeats when it meets its shifted self about as closely as points of one surface lie apart, and on the way there so
+# much less closely, within half the distance.
+SAME_SELF, CONTRAST = 0.96, 0.03
+
+
+def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
+    """The shortest shifts (3,) that map an object onto itself, one for each direction; often none.
+
+    Peaks of the autocorrelation of its voxels propose them, point-to-plane ICP of the object onto itself refines them.
+
+    Args:
+        obj: the object, thinned.
+        spacing: of its points, in its own unit.
+    """
+    found: list[Array] = []
+    voxel, tau = VOXEL * spacing, AGREEING * spacing
+    for shift in _peaks(obj, voxel):
+        if any(_is_multiple(shift, of, 2 * voxel) for of in found):
+            continue
+        start = Sim3(1.0, np.eye(3), shift)
+        refined = refine_planes(obj, obj, start, ScaleRange(1.0, 0.0), 2 * voxel, ROUNDS, 0.0)
+        shift = refined.apply(obj.points.mean(0)) - obj.points.mean(0)
+        length = float(np.linalg.norm(shift))
+        if length < LEAST_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
+            continue
+        if _repeats(obj, shift, tau):
+            found.append(shift)
+        if len(found) == DIRECTIONS:
+            break
+    return found
+
+
+def _repeats(obj: Surface, shift: Array, tau: float) -> bool:
+    """Whether an object meets itself shifted by (3,), and less so on the way there, where it would slide else."""
+    distance, nearest = obj.tree.query(obj.points[obj.queries], k=2, workers=threads())
+    facing = np.abs((obj.normals[obj.queries] * obj.normals[nearest[:, 1]]).sum(1))
+    usual = float((np.clip(1 - (distance[:, 1] / tau) ** 2, 0, 1) * facing).mean())
+    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < SAME_SELF * usual:
+        return False
+    there, half, quarter = (
+        overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (1.0, 0.5, 0.25)
+    )
+    return half < (1 - CONTRAST) * there or quarter < (1 - CONTRAST) * there
+
+
+def _peaks(obj: Surface, voxel: float) -> list[Array]:
+    """Shifts (3,) at which many of an object's voxels meet others, most first; of each and its reverse, one."""
+    axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
+    points, normals = obj.points @ axes.T, obj.normals @ axes.T
+    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / MOST_CELLS)))
+    meeting, share = _autocorrelation(np.floor((points - points.min(0)) / voxel).astype(np.int64), normals)
+    size = np.array(meeting.shape)
+    high = np.argwhere((share == maximum_filter(share, 5, mode="wrap")) & (meeting > MEETING))
+    step = np.where(high > size // 2, high - size, high)
+    ahead = (step[:, 0] > 0) | (step[:, 0] == 0) & ((step[:, 1] > 0) | (step[:, 1] == 0) & (step[:, 2] > 0))
+    step = step[ahead & (np.linalg.norm(step, axis=1) >= LEAST_VOXELS)]
+    way = step[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
+    least = map_coordinates(share, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
+    step = step[share[tuple(step.T)] - least > DIP]
+    order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:LOOKED_AT]
+    return [voxel * step[k] @ axes for k in order]
+
+
+def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> tuple[Array, Array]:
+    """How much of a surface in cells (N, 3) with normals (N, 3) meets its shifted self, for every shift of a periodic
+    grid: as a share of all of it, and of what lies where both are."""
+    count = cells.max(0) + 1
+    shape = tuple(fft.next_fast_len(2 * int(n) + 4, real=True) for n in count)
+    flat, size = np.ravel_multi_index(tuple(cells.T), shape), int(np.prod(shape))
+    filled = np.bincount(flat, minlength=size)
+    spectrum = 0.0
+    for axis in range(3):
+        facing = np.sqrt(np.bincount(flat, normals[:, axis] ** 2, minlength=size) / np.maximum(filled, 1))
+        wave = fft.rfftn(facing.reshape(shape).astype(np.float32), workers=threads())
+        spectrum = spectrum + wave.real**2 + wave.imag**2
+    meeting = fft.irfftn(_blurred(np.asarray(spectrum), shape), shape, workers=threads())
+    meeting /= meeting[0, 0, 0]
+    return meeting, meeting / np.maximum(_of_both((filled > 0).reshape(shape), count), MEETING / 3)
+
+
+def _of_both(filled: NDArray[np.bool_], count: NDArray[np.int64]) -> Array:
+    """The share of a box's voxels that lie in the box and in its shifted self, for every shift of a periodic grid."""
+    total = np.pad(filled, ((1, 0),) * 3).astype(np.float32)
+    for axis in range(3):
+        total = total.cumsum(axis)
+    bounds = []
+    for n, size in zip(count, filled.shape):
+        step = np.arange(size)
+        step = np.where(step > size // 2, step - size, step)
+        bounds.append((np.clip(step, 0, n), np.clip(n + step, 0, n)))
+    inside = np.zeros(filled.shape, np.float32)
+    for corner in np.ndindex(2, 2, 2):
+        inside += (-1) ** (3 - sum(corner)) * total[np.ix_(*(bounds[k][corner[k]] for k in range(3)))]
+    return np.sqrt(np.maximum(inside * np.roll(inside[::-1, ::-1, ::-1], 1, (0, 1, 2)), 0)) / total[-1, -1, -1]
+
+
+def _blurred(power: Array, shape: tuple[int, ...]) -> Array:
+    """The spectrum of voxels that meet their neighbours, too: a (1/4, 1/2, 1/4) kernel along each axis."""
+    for axis, count in enumerate(shape):
+        frequency = np.arange(power.shape[axis]) / count
+        kernel = (0.5 + 0.5 * np.cos(2 * np.pi * frequency)).astype(np.float32)
+        power = power * kernel.reshape([-1 if k == axis else 1 for k in range(3)])
+    return power
+
+
+def _is_multiple(shift: Array, of: Array, tolerance: float) -> bool:
+    """Whether a shift (3,) is another times a whole number."""
+    count = np.round(shift @ of / (of @ of))
+    return bool(np.linalg.norm(shift - count * of) < max(tolerance, 0.05 * float(np.linalg.norm(shift))))

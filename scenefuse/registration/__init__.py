@@ -1,1 +1,0 @@
-"""Where the object stands in the scene: crop, alignment, scale, coarse and fine registration, decision."""

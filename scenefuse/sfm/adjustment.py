@@ -1,0 +1,64 @@
+"""Bundle adjustment with COLMAP, as the paper has it, with weights that outliers do not pull."""
+
+from dataclasses import dataclass
+
+import pycolmap
+
+from scenefuse.core.stage import threads
+from scenefuse.sfm.interrupt import cancellable
+
+# He et al. 2026: iterations of a global bundle adjustment, of the linear solver within one, and its tolerance; 0 runs
+# all iterations.
+ITERATIONS, LINEAR_SOLVER_ITERATIONS, TOLERANCE = 100, 200, 0.0
+# Relative gain that ends an adjustment which only compares or repeats.
+ROUGH_TOLERANCE = 1e-7
+# Observations with a larger error are dropped; COLMAP's own.
+MAX_REPROJECTION_ERROR_PX = 4.0
+# Points whose rays meet at a smaller angle are dropped; COLMAP's own.
+MIN_TRIANGULATION_ANGLE_DEG = 1.5
+# Reprojection error at which an observation loses half its weight (Cauchy; Triggs et al. 1999).
+ROBUST_PX = 1.0
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """What an adjustment may change of the cameras, besides their poses.
+
+    Attributes:
+        lens: focal length and distortion; False where they are known.
+        principal_point: the principal point too.
+    """
+
+    lens: bool = True
+    principal_point: bool = False
+
+
+def adjust(model: pycolmap.Reconstruction, freedom: Freedom, tolerance: float = TOLERANCE) -> None:
+    """Adjust poses, points and the free part of the lenses of a model in place, by Cauchy-weighted errors."""
+    cancellable(pycolmap.bundle_adjustment, model, adjustment_options(freedom, tolerance))
+
+
+def adjustment_options(freedom: Freedom, tolerance: float) -> pycolmap.BundleAdjustmentOptions:
+    """COLMAP's options of an adjustment."""
+    options = pycolmap.BundleAdjustmentOptions()
+    options.print_summary = False
+    options.refine_focal_length = options.refine_extra_params = freedom.lens
+    options.refine_principal_point = freedom.lens and freedom.principal_point
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_scale = ROBUST_PX
+    solver = options.ceres.solver_options
+    solver.max_num_iterations = ITERATIONS
+    solver.max_linear_solver_iterations = LINEAR_SOLVER_ITERATIONS
+    solver.function_tolerance = tolerance
+    solver.gradient_tolerance = TOLERANCE
+    solver.parameter_tolerance = TOLERANCE
+    solver.num_threads = threads()
+    return options
+
+
+def drop_outliers(model: pycolmap.Reconstruction) -> None:
+    """Drop observations with large errors or behind the camera, and points whose rays hardly spread."""
+    observations = pycolmap.ObservationManager(model)
+    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG)
+    observations.filter_observations_with_negative_depth()
+    model.update_point_3d_errors()

@@ -1,1 +1,0 @@
-"""Cameras that another program found, in the place of mapping."""

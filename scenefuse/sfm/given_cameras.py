@@ -1,0 +1,192 @@
+"""A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
+
+import shutil
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from scenefuse.core.stage import StageError, scratch_directory
+from scenefuse.photos.cameras.bundler import read_bundler
+from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
+from scenefuse.photos.cameras.opensfm import find_opensfm, opensfm_place, read_opensfm
+from scenefuse.photos.cameras.place import Place
+from scenefuse.photos.cameras.upright import possible_turns
+from scenefuse.photos.photo_files import BUNDLER, frame_name
+from scenefuse.photos.photos import SHAPE_TOLERANCE
+from scenefuse.photos.posed_photos import PosedPhoto, find_posed_photos
+from scenefuse.sfm.interrupt import cancellable
+
+# Cameras that fit their photos give each photo so many points at least, in the median.
+MIN_POINTS = 20
+# Parameters of lenses that differ by less, relatively, are of one camera.
+SAME_LENS = 1e-6
+METASHAPE = "in Metashape, export the cameras as Agisoft XML (File, Export, Export Cameras)"
+REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) with the list of photos"
+# What to do about files of other programs that hold cameras in a form that is not read.
+EXPORTS = {".psx": METASHAPE, ".psz": METASHAPE, ".csv": REALITY, ".rcproj": REALITY}
+
+
+def triangulated(
+    cameras: Path,
+    folder: Path,
+    orientations: Mapping[str, int],
+    database: Path,
+    work: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> tuple[pycolmap.Reconstruction, list[str]]:
+    """The model of given cameras: poses and lenses as they are, points from the photos' own matches; and what was
+    decided about photos that EXIF rotates, a sentence each.
+
+    Args:
+        cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
+            Metashape's XML; Bundler's .out with its list.
+        folder: of the photos, upright.
+        orientations: EXIF orientation of the photos that were turned for that, by name.
+        database: COLMAP database with verified matches.
+        work: folder for files in between; it is removed again.
+        options: COLMAP's, of triangulation.
+
+    Raises:
+        StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
+            camera in the database but not here; cameras that do not fit the photos.
+    """
+    given = read_given(cameras, folder)
+    with pycolmap.Database.open(database) as opened:
+        own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
+        sizes = {image.name: own[image.camera_id] for image in opened.read_all_images()}
+    posed = _by_name(given, sizes, cameras)
+    if not posed:
+        some = ", ".join(sorted(photo.file.name for photo in given)[:3])
+        raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
+    ways = possible_turns(posed, orientations, sizes)
+    models = [_model(way, cameras, folder, database, work, options) for way in ways]
+    met = [model.num_points3D() for model in models]
+    best = int(np.argmax(met))
+    found, turned = models[best], sum(ways[best][name] is not posed[name] for name in posed)
+    points = [found.images[i].num_points3D for i in found.reg_image_ids()]
+    if not points or np.median(points) < MIN_POINTS:
+        raise StageError(
+            f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
+            " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
+        )
+    notes = [f"the cameras of {turned} photos were turned, as EXIF rotates these photos"] if turned else []
+    if len(ways) > 1:
+        notes = [
+            f"EXIF rotates photos, and {cameras.name} does not say whether its cameras are for them as they are stored:"
+            f" they are taken as {('upright', 'stored')[best]}, whose matches meet in {met[best]} points, and not as"
+            f" {('stored', 'upright')[best]}, with {met[1 - best]}"
+        ]
+    return found, notes
+
+
+def _model(
+    posed: Mapping[str, PosedPhoto],
+    cameras: Path,
+    folder: Path,
+    database: Path,
+    work: Path,
+    options: pycolmap.IncrementalPipelineOptions,
+) -> pycolmap.Reconstruction:
+    """`triangulated` for cameras by the names of their photos; it may have no points."""
+    with scratch_directory(work) as scratch:
+        calibrated = scratch / "database.db"
+        shutil.copyfile(database, calibrated)
+        with pycolmap.Database.open(calibrated) as opened:
+            images = {image.image_id: posed.get(image.name) for image in opened.read_all_images()}
+            shared: dict[int, PosedPhoto] = {}
+            for image in opened.read_all_images():
+                photo = images[image.image_id]
+                if photo is not None:
+                    own = opened.read_camera(image.camera_id)
+                    _check_same(shared.setdefault(image.camera_id, photo), photo, cameras)
+                    opened.update_camera(_fitted(photo, own, cameras))
+            cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
+        model = pycolmap.Reconstruction()
+        model.load(cache)
+        for number, photo in images.items():
+            if photo is not None and number in model.images:
+                pose = pycolmap.Rigid3d(np.linalg.inv(photo.object_from_cam)[:3])
+                frame = model.images[number].frame
+                assert frame is not None
+                frame.set_cam_from_world(model.images[number].camera_id, pose)
+                model.register_frame(frame.frame_id)
+        (scratch / "points").mkdir()
+        return cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
+
+
+def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
+    """The posed photos of any format that is read."""
+    if not cameras.exists():
+        raise StageError(f"the cameras {cameras} do not exist; correct the path")
+    ending = cameras.suffix.lower()
+    if ending in EXPORTS:
+        raise StageError(f"{cameras} is not read; {EXPORTS[ending]}")
+    if ending == ".xml":
+        return read_metashape(cameras, folder)
+    if cameras.suffix == BUNDLER:
+        return read_bundler(cameras, folder)
+    file = find_opensfm(cameras)
+    if file is not None:
+        return read_opensfm(file, folder)
+    has_json = cameras.is_file() or any((cameras / f"transforms{end}.json").is_file() for end in ("", "_train"))
+    return find_posed_photos(cameras, None if has_json else folder)[0]
+
+
+def place_of(cameras: Path) -> Place | None:
+    """Where the cameras that `read_given` gives lie on the earth; None where their project does not say."""
+    if cameras.suffix.lower() == ".xml":
+        return metashape_place(cameras)
+    file = find_opensfm(cameras)
+    return None if file is None else opensfm_place(file)
+
+
+def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> dict[str, PosedPhoto]:
+    """The cameras of photos (paths below their folder): by the whole path, or by the file's name where camera and photo
+    are the only ones that are called so.
+
+    Raises:
+        StageError: several cameras may be a photo's.
+    """
+    whole, alike = {photo.name: photo for photo in given}, dict[str, list[PosedPhoto]]()
+    for photo in given:
+        alike.setdefault(photo.file.name, []).append(photo)
+    found = dict[str, PosedPhoto]()
+    names = list(names)
+    called = Counter(Path(name).name for name in names)
+    for name in names:
+        end = Path(name).name
+        same = [whole[frame_name(name)]] if frame_name(name) in whole else alike.get(end, [])
+        if len(same) > 1 or (same and called[end] > 1 and frame_name(name) not in whole):
+            raise StageError(
+                f"{cameras}: {max(len(same), called[end])} photos are called {end}, and it does not say which of them"
+                " its camera is of; give every photo a name of its own"
+            )
+        if same:
+            found[name] = same[0]
+    return found
+
+
+def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:
+    """StageError where photos of one camera in the database have two lenses here."""
+    a, b = first.camera, photo.camera
+    if a.model != b.model or not np.allclose(a.params, b.params, rtol=SAME_LENS):
+        raise StageError(
+            f"{cameras}: {first.file.name} and {photo.file.name} have different lenses, but count as photos of one"
+            " camera; set features.camera_mode to per_photo"
+        )
+
+
+def _fitted(photo: PosedPhoto, own: pycolmap.Camera, cameras: Path) -> pycolmap.Camera:
+    """A given camera at the size of the photos, with the id of the database's."""
+    camera = pycolmap.Camera(photo.camera.todict())
+    if abs(camera.width / camera.height * own.height / own.width - 1) > SHAPE_TOLERANCE:
+        raise StageError(
+            f"{cameras}: the camera of {photo.file.name} has {camera.width} x {camera.height} pixels, but the photo"
+            f" {own.width} x {own.height}; give the photos that the cameras were computed for"
+        )
+    camera.rescale(own.width, own.height)
+    camera.camera_id, camera.has_prior_focal_length = own.camera_id, True
+    return camera

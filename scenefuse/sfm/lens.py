@@ -1,0 +1,210 @@
+"""The lens of a model's cameras: as much of it is refined as the photos determine (method M9).
+
+Principal point and higher distortion are refined where observations that took no part in the adjustment are predicted
+better with them; where they are not, they are held, and the photos say nothing about them.
+"""
+
+import copy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from scenefuse.core.stage import quantity
+from scenefuse.core.transforms import Array
+from scenefuse.sfm.adjustment import ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
+
+# A richer lens has to predict held-out observations better by so many standard errors.
+MIN_GAIN = 3.0
+# And their median error has to fall by this share. What changes less is no better lens that matters, but tangential
+# distortion in the place of a principal point, which turns the cameras.
+LEAST_GAIN = 0.005
+# One observation of every point seen so often is held out.
+MIN_TRACK = 4
+# Errors beyond it count as this, so that one wrong match does not decide.
+MOST_PX = 20.0
+# A principal point farther from the middle, as a share of the longer side, is no lens but a fit to something else.
+MOST_OFF_CENTRE = 0.1
+SEED = 0
+# Models by the number of their distortion parameters, the poorer ones as prefixes of the richer.
+POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+
+# Of these, a second radial term makes a richer one.
+ONE_TERM = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL")
+
+Held = list[tuple[int, int, Array]]
+
+
+@dataclass(frozen=True)
+class Lens:
+    """A choice of camera model and of what of it is refined.
+
+    Attributes:
+        name: of the choice.
+        richest: cameras of poorer models become this; None leaves each as it is.
+        freedom: what is refined.
+        words: the choice in a few words.
+    """
+
+    name: str
+    richest: str | None
+    freedom: Freedom
+    words: str
+
+    def fit(self, model: pycolmap.Reconstruction, tolerance: float) -> pycolmap.Reconstruction:
+        """A copy of a model, adjusted with this lens."""
+        fitted = copy.deepcopy(model)
+        for camera in fitted.cameras.values():
+            if self.richest is not None:
+                enrich(camera, self.richest)
+        adjust(fitted, self.freedom, tolerance)
+        return fitted
+
+
+KNOWN = Lens("known", None, Freedom(lens=False), "calibration given, held")
+HELD = Lens("held", None, Freedom(), "principal point held in the middle")
+CENTRED = Lens("centred", None, Freedom(principal_point=True), "principal point refined")
+RADIAL = Lens("radial", "RADIAL", CENTRED.freedom, "principal point and two radial terms refined")
+BROWN = Lens("brown", "OPENCV", CENTRED.freedom, "principal point and Brown distortion refined")
+RATIONAL = Lens("rational", "FULL_OPENCV", CENTRED.freedom, "principal point and rational distortion refined")
+DISTORTED, STRAIGHT = (HELD, CENTRED, RADIAL, BROWN, RATIONAL), (HELD, CENTRED)
+LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED)}
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The lens that a model's photos determine.
+
+    Attributes:
+        lens: the choice.
+        next: the one beyond it, which they do not determine; None where there is none.
+        trials: of every lens tried, what came out.
+    """
+
+    lens: Lens
+    next: Lens | None
+    trials: list[dict[str, Any]]
+
+
+def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTORTED) -> Choice:
+    """Go from the poorest lens to richer ones while held-out observations are predicted better (method M9).
+
+    Cross-validation (Stone 1974): one observation of every point that four photos or more see is left out of the
+    adjustment; the logarithmic (Cauchy) errors of a richer lens there have to be smaller than those of each poorer one,
+    taken or not (but for one whose principal point ran away), pair by pair, by three standard errors of their mean, and
+    their median by half a per cent.
+
+    Args:
+        model: bundle-adjusted; it is not changed.
+        lenses: from poor to rich.
+    """
+    kept, held = hold_out(model)
+    best, beyond = lenses[0], None
+    poorer = [_errors(best.fit(kept, ROUGH_TOLERANCE), held)]
+    trials = [_trial(best, poorer[0], None, "the poorest")]
+    for lens in lenses[1:]:
+        if lens is RADIAL and any(camera.model_name not in ONE_TERM for camera in model.cameras.values()):
+            continue
+        fitted = lens.fit(kept, ROUGH_TOLERANCE)
+        errors = _errors(fitted, held)
+        gain = min(_gain(others, errors) for others in poorer)
+        median = min(np.median(others) for others in poorer) if held else 0.0
+        better = len(errors) > 0 and np.median(errors) <= (1 - LEAST_GAIN) * median
+        problem = _problem(fitted, gain if better else 0.0)
+        trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
+        if _in_bounds(fitted):
+            poorer.append(errors)
+        if problem is None:
+            best, beyond = lens, None
+        elif beyond in (None, RADIAL):
+            beyond = lens
+        # A free principal point may help with distortion only, and one term of it with the others: all are tried.
+        if problem is not None and lens.richest not in (None, RADIAL.richest):
+            break
+    return Choice(best, beyond, trials)
+
+
+def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, Held]:
+    """A copy of a model without one observation of each long track, and these: point, photo, (2,) pixels."""
+    rng, kept, held = np.random.default_rng(SEED), copy.deepcopy(model), Held()
+    for point in sorted(model.point3D_ids()):
+        track = model.points3D[point].track.elements
+        if len(track) >= MIN_TRACK:
+            chosen = track[int(rng.integers(len(track)))]
+            pixel = model.images[chosen.image_id].points2D[chosen.point2D_idx].xy
+            held.append((point, chosen.image_id, np.array(pixel)))
+            kept.delete_observation(chosen.image_id, chosen.point2D_idx)
+    return kept, held
+
+
+def enrich(camera: pycolmap.Camera, name: str) -> None:
+    """Turn a camera into a richer polynomial model, in place and the same lens (RADIAL takes the mean of two focal
+    lengths); others and richer ones stay."""
+    ranks = {model: rank for rank, model in enumerate(POLYNOMIALS)}
+    if ranks.get(camera.model_name, len(ranks)) >= ranks[name]:
+        return
+    focal = [camera.params[i] for i in camera.focal_length_idxs()]
+    same = [camera.mean_focal_length()] if name == "RADIAL" else focal * (3 - len(focal))
+    centre = [camera.principal_point_x, camera.principal_point_y]
+    distortion = [camera.params[i] for i in camera.extra_params_idxs()]
+    camera.model = getattr(pycolmap.CameraModelId, name)
+    missing = len(camera.extra_params_idxs()) - len(distortion)
+    camera.params = [*map(float, [*same, *centre, *distortion]), *[0.0] * missing]
+
+
+def describe_lens(choice: Choice, model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """The choice as quantities: what is refined and why, and how far the principal point is from the middle."""
+    cameras = [c for _, c in sorted(model.cameras.items())]
+    off = [[c.principal_point_x - c.width / 2, c.principal_point_y - c.height / 2] for c in cameras]
+    return {
+        "lens": quantity(choice.lens.name, ""),
+        "next_lens": quantity(None if choice.next is None else choice.next.name, ""),
+        "lens_trials": quantity(choice.trials, ""),
+        "principal_point_off_centre": quantity(off, "px"),
+    }
+
+
+def _errors(model: pycolmap.Reconstruction, held: Held) -> Array:
+    """(N,) reprojection errors in pixels at held-out observations, at most `MOST_PX`; that, where there is none."""
+    errors = np.full(len(held), MOST_PX)
+    for row, (point, photo, pixel) in enumerate(held):
+        if point in model.points3D:
+            seen = model.images[photo].project_point(model.points3D[point].xyz)
+            if seen is not None:
+                errors[row] = min(MOST_PX, float(np.linalg.norm(seen - pixel)))
+    return errors
+
+
+def _gain(poorer: Array, richer: Array) -> float:
+    """By how many standard errors the richer lens has smaller logarithmic errors."""
+    if len(poorer) < 2:
+        return 0.0
+    smaller = np.log1p((poorer / ROBUST_PX) ** 2) - np.log1p((richer / ROBUST_PX) ** 2)
+    return float(smaller.mean() / max(smaller.std(ddof=1) / np.sqrt(len(smaller)), 1e-12))
+
+
+def _problem(model: pycolmap.Reconstruction, gain: float) -> str | None:
+    """Why a richer lens is not taken, or None."""
+    if gain < MIN_GAIN:
+        return "held-out observations are predicted no better"
+    return None if _in_bounds(model) else "the principal point ran away from the middle"
+
+
+def _in_bounds(model: pycolmap.Reconstruction) -> bool:
+    """Whether all principal points are near enough to the middle to be a lens's."""
+    for camera in model.cameras.values():
+        off = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
+        if np.abs(off).max() > MOST_OFF_CENTRE * max(camera.width, camera.height):
+            return False
+    return True
+
+
+def _trial(lens: Lens, errors: Array, gain: float | None, verdict: str) -> dict[str, Any]:
+    return {
+        "lens": lens.name,
+        "held_out_observations": len(errors),
+        "median_error_px": float(np.median(errors)) if len(errors) else None,
+        "gain_standard_errors": gain,
+        "verdict": verdict,
+    }

@@ -1,0 +1,177 @@
+"""How far a model may be bent: the same photos adjusted again and again, with other photos left out or another lens.
+
+A sparse model's errors are not those of its points one by one: poses, points and lens err together, so that whole
+regions are shifted, turned and scaled (drift, the bowl of self-calibration). An ensemble of models shows it without a
+truth (method M10): a delete-group jackknife over photos (Shao and Tu 1995), and one model with the next richer lens,
+which the photos do not rule out.
+"""
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.photos.workspace import read_model
+from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.lens import LENSES, Lens
+
+# Groups of photos, each left out once; fewest photos that a model keeps.
+GROUPS, MIN_PHOTOS = 8, 3
+# Points kept of a model, those that most photos see; points around a place whose common motion is its motion.
+POINTS, NEAREST = 4000, 200
+# Points that moved more than so many times the median beside the common motion do not count for it.
+ASTRAY = 3.0
+
+
+@dataclass(frozen=True)
+class Spread:
+    """An ensemble of models beside one model.
+
+    Attributes:
+        points: (P, 3) of the model, in its frame.
+        moved: (M, P, 3) the same points in each model of the ensemble, after the similarity that moves its cameras
+            nearest to the model's; not a number where a model lacks a point.
+        whole: (M,) bool, True where a model's deviation counts whole, False for a jackknife's.
+    """
+
+    points: Array
+    moved: Array
+    whole: NDArray[np.bool_]
+
+    def covariance_at(self, place: Array) -> Array | None:
+        """(7, 7) covariance of the model around a place (3,): rotation vector (radians), shift, log scale about it.
+
+        Each model's similarity of the 200 points nearest to the place is a deviation; those of a jackknife of K groups
+        add (K - 1) / K times the squares about their mean, the others their squares. None where no photos could be left
+        out: three at most, or all on one line.
+        """
+        near = np.argsort(np.linalg.norm(self.points - place, axis=1))[:NEAREST]
+        deviations, whole = [], []
+        for moved, counts_whole in zip(self.moved[:, near], self.whole):
+            seen = np.isfinite(moved).all(1)
+            if seen.sum() >= MIN_PHOTOS:
+                motion = _common_motion(self.points[near][seen], moved[seen])
+                turn = Rotation.from_matrix(motion.rotation).as_rotvec()
+                deviations.append([*turn, *(motion.apply(place) - place), np.log(motion.scale)])
+                whole.append(counts_whole)
+        deviation, counts = np.array(deviations).reshape(-1, 7), np.array(whole, dtype=bool)
+        left_out, richer = deviation[~counts], deviation[counts]
+        if len(left_out) == 0:
+            return None
+        about = left_out - left_out.mean(0)
+        return np.asarray(richer.T @ richer + (len(left_out) - 1) / len(left_out) * about.T @ about)
+
+
+def estimate_spread(*, sparse: Path, sparse_json: Path, spread: Path, report: Path) -> None:
+    """Adjust a model again without each of its photos' groups and with a richer lens; see `Spread`.
+
+    Args:
+        sparse: COLMAP model.
+        sparse_json: JSON of the mapping stage, for the lens.
+        spread: output, NPZ of a `Spread`, in the model's frame.
+        report: output, JSON: number of models and points, standard deviations of the calibration.
+    """
+    known = read_json(sparse_json)
+    model = read_model(sparse)
+    beyond = value(known, "next_lens")
+    found, calibrations = spread_of(model, LENSES[value(known, "lens")], None if beyond is None else LENSES[beyond])
+    write_spread(spread, found)
+    content = {
+        "models": quantity(len(found.whole), "1"),
+        "points": quantity(len(found.points), "1"),
+        "calibration_sd": quantity(calibrations, "px"),
+    }
+    write_json(report, content)
+    print(f"{len(found.whole)} models, {len(found.points)} points", flush=True)
+
+
+def spread_of(
+    model: pycolmap.Reconstruction, lens: Lens, beyond: Lens | None
+) -> tuple[Spread, list[dict[str, float | None]]]:
+    """The ensemble of a model, and the jackknife's standard deviations of each camera's parameters.
+
+    Args:
+        model: bundle-adjusted with `lens`; it is not changed.
+        lens: what is refined.
+        beyond: the next richer lens, or None.
+    """
+    ids = sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:POINTS]
+    points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
+    names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
+    groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0
+    moved, whole, parameters = [], [], []
+    for group in range(groups):
+        fewer = copy.deepcopy(model)
+        for _, image in names[group::groups]:
+            fewer.deregister_frame(fewer.images[image].frame_id)
+        adjust(fewer, lens.freedom, ROUGH_TOLERANCE)
+        if (found := _moved(fewer, model, ids)) is not None:
+            moved.append(found)
+            whole.append(False)
+        parameters.append([camera.params for _, camera in sorted(fewer.cameras.items())])
+    if beyond is not None and (found := _moved(beyond.fit(model, ROUGH_TOLERANCE), model, ids)) is not None:
+        moved.append(found)
+        whole.append(True)
+    kept = np.array(moved).reshape(-1, len(ids), 3)
+    return Spread(points, kept, np.array(whole, dtype=bool)), _calibration_sd(model, parameters)
+
+
+def write_spread(path: Path, spread: Spread) -> None:
+    """Write a spread as NPZ."""
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
+        np.savez_compressed(file, points=spread.points, moved=spread.moved.astype(np.float32), whole=spread.whole)
+
+
+def read_spread(path: Path) -> Spread:
+    """Read a spread.
+
+    Raises:
+        StageError: the file is none.
+    """
+    try:
+        with np.load(path) as content:
+            return Spread(content["points"], content["moved"].astype(np.float64), content["whole"])
+    except (OSError, ValueError, KeyError) as error:
+        raise StageError(f"{path} is no spread of a model; delete it and run the workflow again") from error
+
+
+def _moved(other: pycolmap.Reconstruction, model: pycolmap.Reconstruction, ids: list[int]) -> Array | None:
+    """(P, 3) a model's points in another, brought into its frame by the cameras; not a number where they are gone.
+
+    None where fewer than three cameras are shared, or their centres lie on one line.
+    """
+    shared = [i for i in other.reg_image_ids() if model.images[i].has_pose]
+    centres = [np.array([m.images[i].projection_center() for i in shared]) for m in (other, model)]
+    try:
+        frame = fit_sim3(np.reshape(centres[0], (-1, 3)), np.reshape(centres[1], (-1, 3)))
+    except ValueError:
+        return None
+    missing = np.full(3, np.nan)
+    there = np.array([other.points3D[p].xyz if p in other.points3D else missing for p in ids])
+    return frame.apply(there)
+
+
+def _common_motion(before: Array, after: Array) -> Sim3:
+    """The similarity that most points share."""
+    motion = fit_sim3(before, after)
+    error = np.linalg.norm(motion.apply(before) - after, axis=1)
+    good = error <= ASTRAY * np.median(error)
+    return fit_sim3(before[good], after[good]) if good.sum() >= MIN_PHOTOS else motion
+
+
+def _calibration_sd(model: pycolmap.Reconstruction, parameters: list[list[Array]]) -> list[dict[str, float | None]]:
+    """The jackknife's standard deviation of every parameter of each camera, by its name."""
+    found = []
+    for row, (_, camera) in enumerate(sorted(model.cameras.items())):
+        names = [name.strip() for name in camera.params_info.split(",")]
+        drawn = np.array([trial[row] for trial in parameters])
+        if len(drawn):
+            sd = np.sqrt((len(drawn) - 1) / len(drawn) * ((drawn - drawn.mean(0)) ** 2).sum(0))
+            found.append(dict(zip(names, sd.tolist())))
+    return found

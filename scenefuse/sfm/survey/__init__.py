@@ -1,1 +1,0 @@
-"""What was surveyed: control and check points, positions of photos with their accuracy, known lengths."""

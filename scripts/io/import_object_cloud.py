@@ -1,7 +1,0 @@
-"""Take a cloud or mesh for an object."""
-
-from scenefuse.io.import_cloud import import_object_cloud
-from scenefuse.stage import run
-
-if __name__ == "__main__":
-    run(import_object_cloud)
