@@ -44,7 +44,7 @@ bench-nerf: .venv/ready
 bench-scale: .venv/ready
 	PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --table results/bench/scale.csv
 
-# Writes workflow/schemas/config.schema.yaml and the tables of config/README.md, from the settings dataclasses; nothing in docs/.
+# Writes what follows from the code: workflow/schemas/config.schema.yaml, the tables of config/README.md, the numbers in documents.
 docs: .venv/ready
 	PYTHONPATH=. python workflow/generate.py
 

@@ -1,4 +1,4 @@
-"""Write what follows from the settings dataclasses: the schema, and the tables of config/README.md.
+"""Write what follows from the code: the schema, the tables of config/README.md, and the numbers in documents.
 
 python workflow/generate.py [--check]: --check writes nothing and names what is stale.
 """
@@ -10,8 +10,9 @@ from typing import Any
 import yaml
 
 from scenefuse.config import schema
+from workflow import documents
+from workflow.documents import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 SCHEMA = ROOT / "workflow/schemas/config.schema.yaml"
 PAGE = ROOT / "config/README.md"
 START, END = "<!-- settings: written by `make docs`, do not edit -->", "<!-- end of settings -->"
@@ -51,10 +52,11 @@ def tables() -> str:
 
 def fresh() -> dict[Path, str]:
     """The files as they should be."""
-    before, rest = PAGE.read_text().split(START)
+    pages = documents.fresh()
+    before, rest = pages[PAGE].split(START)
     note = "# Written by `make docs` from the settings dataclasses (scenefuse/config.py); do not edit.\n"
     text = note + yaml.safe_dump(schema(), sort_keys=False, allow_unicode=True, width=110)
-    return {SCHEMA: text, PAGE: before + tables() + rest.split(END)[1]}
+    return pages | {SCHEMA: text, PAGE: before + tables() + rest.split(END)[1]}
 
 
 def main() -> int:

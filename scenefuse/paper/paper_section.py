@@ -16,7 +16,7 @@ _ABOUT = (
     f" {SCENEFUSE}: a run of the shipped recipe on the same photos, by the same definitions, on its own crop."
     f" {COMMON}: its pose on this run's crop, which may hold ground, as the fiducials' box has it (Table 2)."
     f" {NULL}: the same for a random cloud in the place of the object (Tables 2, 4) or of the added points (Table 3);"
-    " only a clear distance from it says something. Labels like R10 are those of docs/method.md."
+    " only a clear distance from it says something. Labels like R10 are those of docs/method."
 )
 _FIGURES = (
     "Its figures have their counterparts on this page and in results/. Figure 2, the scene and its incomplete objects:"

@@ -28,7 +28,7 @@ class Measure:
     Attributes:
         name: as in metrics.json.
         paper: what the paper calls it.
-        definition: of the numbers of all our columns, with its labels in docs/method.md.
+        definition: of the numbers of all our columns, with its labels in docs/method.
         group: of metrics.json that holds it.
     """
 

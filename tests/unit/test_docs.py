@@ -1,4 +1,4 @@
-"""The documents name only what exists: links, headings, paths and commands."""
+"""The documents name only what exists (links, headings, paths, commands), with the numbers that the code has."""
 
 import re
 from pathlib import Path
@@ -7,6 +7,7 @@ import pytest
 import yaml
 
 from scenefuse.core.settings import problem
+from workflow import documents
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "config").rglob("*.md")])
@@ -90,6 +91,41 @@ def test_commands_name_existing_scripts_and_settings(page):
 @names(CURRENT)
 def test_settings_exist(page):
     assert missing_keys(page.read_text()) == []
+
+
+@names(PAGES)
+def test_numbers_are_those_of_the_constants(page):
+    text = page.read_text()
+    assert documents.with_numbers(text) == text, "run `make docs`"
+
+
+def test_a_number_follows_its_constant_and_a_constant_that_is_gone_is_an_error(monkeypatch, tmp_path):
+    monkeypatch.setattr(documents, "LIBRARY", tmp_path)
+    monkeypatch.setattr(documents, "ROOT", tmp_path)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / "masks/space.py").write_text(
+        "SHARE = 0.3\nPHOTOS: int = 4\nBOTH = 2 * PHOTOS, 1e-6\nA, B = 1, np.radians(180)\n"
+        "class S:\n    rays: int = setting(20_000, 'x')\n"
+    )
+    text = "9<!-- masks.space.SHARE --> 9<!-- masks.space.SHARE % --> % two<!-- masks.space.PHOTOS -->"
+    assert documents.with_numbers(text).replace("<!-- masks.space.", "[").replace(" -->", "]") == (
+        "0.3[SHARE] 30[SHARE %] % four[PHOTOS]"
+    )
+    text = " ".join(f"1<!-- masks.space.{name} -->" for name in ("BOTH[0]", "BOTH[1]", "S.rays", "B"))
+    assert re.findall(r"(\S+)<!", documents.with_numbers(text)) == ["8", "1e-6", "20,000", "3.14159"]
+    for gone in ("masks.space.GONE", "masks.gone.SHARE", "masks.space.S.gone"):
+        with pytest.raises(KeyError, match=gone.rpartition(".")[2] if "gone." not in gone else "no such module"):
+            documents.with_numbers(f"1<!-- {gone} -->")
+
+
+def test_labels_that_the_code_cites_are_headings_of_the_method():
+    known = documents.labels()
+    cited = {
+        (label, path.name)
+        for path in (ROOT / "scenefuse").rglob("*.py")
+        for label in re.findall(r"\bmethod ([A-Z]\d+)\b", path.read_text())
+    }
+    assert [found for found in sorted(cited) if found[0] not in known] == []
 
 
 def test_what_is_gone_is_noticed(tmp_path):
