@@ -6,7 +6,7 @@ from shutil import copy2
 from setuptools import setup
 from setuptools.command.build_py import build_py
 
-NAMES = ("README.md", "config.yaml", "paper.yaml", "paper_from_sfm.yaml", "presets", "examples")
+NAMES = ("README.md", "config.yaml", "paper.yaml", "presets", "examples")
 CONFIG = tuple(f"config/{name}" for name in NAMES)
 """Not the demo's tables: an installed workflow works on those of a user."""
 SHIPPED = ("Snakefile", "workflow", "scripts", "profiles", "envs", *CONFIG)

@@ -35,7 +35,6 @@ from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.compare_with_paper import ComparisonSettings
 from scenefuse.photos.frames import FrameSettings
-from scenefuse.poses.find_poses import PoseSettings
 from scenefuse.register.agreement import AgreementSettings
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
@@ -103,11 +102,10 @@ class HoldOutSettings:
 
 @dataclass(frozen=True)
 class PoseSourceSettings:
-    """Where poses come from."""
+    """Where the poses of recipe `paper` come from."""
 
-    pose_source: Literal["sfm", "network", "chain"] = setting("sfm")
-    """Whose poses the training stages use; with `network` those that the photos and a depth network give, with `chain`
-    the pose network's motions one after the other (recipe `paper` only, which knows `chain` and `sfm`)."""
+    pose_source: Literal["chain", "sfm"] = setting("chain")
+    """Recipe `paper` only: whose poses stages 2 to 4 use, the pose network's motions one after the other or SfM's."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +140,6 @@ SECTIONS: dict[str, list[Any]] = {
     "object.sparse": [MappingSettings()],
     "object.undistort": [UndistortSettings(max_size_px=1600)],
     "object.masks": [MaskSettings()],
-    "object.poses": [PoseSettings()],
     "object.stage1": [PoseSourceSettings(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
     "object.stage3": [FeedbackSettings()],

@@ -20,7 +20,7 @@ OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks",
 OF_SCENE = ("fiducials", "truth")
 # Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
 OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
-OF_THE_RUN = ("scene.chunks", "object.recipe", "object.stage1.pose_source", "registration.variants")
+OF_THE_RUN = ("scene.chunks", "object.recipe", "registration.variants")
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,6 @@ def read_project(config: Mapping[str, Any]) -> Project:
         wrong = _scene_problem(row, scenes, settings["scenes"])
         if wrong:
             raise StageError(f"{settings['objects']}: object '{name}' {wrong}")
-    wrong = _recipe_problem(settings["object"])
-    if wrong:
-        raise StageError(f"config, {wrong}")
     own = {
         (kind, name): merge(settings, _differences(kind, name, row["config"], settings[f"{kind}s"]))
         for kind, rows in (("scene", scenes), ("object", objects))
@@ -141,16 +138,6 @@ def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
         return f"lies in scene '{scene}', which {table} does not list"
     if row.get("truth") and not scenes[scene].get("photos"):
         return f"has a truth, but its scene '{scene}' is a cloud, and the evaluation compares cameras; empty the cell"
-    return ""
-
-
-def _recipe_problem(settings: Mapping[str, Any]) -> str:
-    """What is wrong with the recipe of the objects and its source of poses; "" where nothing is."""
-    recipe, source = settings["recipe"], settings["stage1"]["pose_source"]
-    if recipe == "paper" and source == "network":
-        return "object.stage1.pose_source: recipe 'paper' knows chain and sfm; poses by matches are not the paper's"
-    if recipe != "paper" and source == "chain":
-        return "object.stage1.pose_source: 'chain' is of recipe 'paper'; set object.recipe to paper, or sfm or network"
     return ""
 
 

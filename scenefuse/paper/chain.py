@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity
-from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.pose_network import PoseNetwork, small_photos
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import read_workspace, write_model
-from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.sfm.gravity import estimate_up
 
 
@@ -50,6 +49,22 @@ def place_chain(own: Array, known: Array) -> tuple[Array, Sim3]:
     placed = own.copy()
     placed[:, :3, :3], placed[:, :3, 3] = fit.rotation @ own[:, :3, :3], fit.apply(own[:, :3, 3])
     return placed, fit
+
+
+def trajectory_error(name: str, poses: Array, reference: Array) -> dict[str, Any]:
+    """Errors of (V, 4, 4) poses against others after a similarity fitted to the centres; nothing when they coincide."""
+    centres, target = poses[:, :3, 3], reference[:, :3, 3]
+    try:
+        placed = fit_sim3(centres, target)
+    except ValueError:
+        return {}
+    error = np.linalg.norm(placed.apply(centres) - target, axis=1)
+    turned = placed.rotation @ poses[:, :3, :3] @ reference[:, :3, :3].swapaxes(1, 2)
+    extent = float(np.linalg.norm(np.ptp(target, axis=0)))
+    return {
+        f"trajectory_error_{name}_over_extent": quantity(float(np.sqrt(np.mean(error**2))) / extent, "1"),
+        f"rotation_error_{name}_deg": quantity(float(np.median([rotation_angle_deg(r) for r in turned])), "deg"),
+    }
 
 
 def write_posed(workspace: Path, posed: Path, views: Views, poses: Array) -> None:

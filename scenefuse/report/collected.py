@@ -151,8 +151,6 @@ def collect(
     there, gap = unbroken(folder, {"photos": _OBJECT_FILES, "cloud": ("object.json",), "both": _POSED_FILES}[given])
     stages = read_fields(folder, [*there, *(["alignment.json"] if linked and not gap else [])])
     stages |= read_fields(folder, ["masks.json"] if given == "both" and not gap else [])
-    if find(stages, "stage1.workspace") == "poses":
-        stages |= read_fields(folder, ["poses.json"])
     who = folder.name
     if not gap and scene_gap:
         gap, who = f"{scene_gap} of the scene {scene}", scene

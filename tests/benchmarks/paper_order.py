@@ -1,6 +1,6 @@
 """What the paper's relative depth does in its preset, beside the absolute depth of the same maps: stage 2 without it.
 
-A finished run of config/paper.yaml with config/paper_from_sfm.yaml; then
+A finished run of config/paper.yaml with object.stage1.pose_source sfm; then
 python tests/benchmarks/paper_order.py --results results --objects fountain --seeds 3
 """
 

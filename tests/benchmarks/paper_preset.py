@@ -2,7 +2,8 @@
 
 make demo
 snakemake --configfile config/paper.yaml --directory paper --cores 2
-snakemake --configfile config/paper.yaml config/paper_from_sfm.yaml --directory paper_from_sfm --cores 2
+snakemake --configfile config/paper.yaml --config "object={stage1: {pose_source: sfm}}" --directory paper_from_sfm \
+    --cores 2
 python tests/benchmarks/paper_preset.py --shipped results --chained paper/results --from-sfm paper_from_sfm/results
 
 Its rows of the paper's Tables 2 to 4 are those of results/summary/paper.tsv (scenefuse/paper/paper_tables.py); here
@@ -28,10 +29,10 @@ from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import registration_error, true_depth
+from scenefuse.paper.chain import trajectory_error
 from scenefuse.paper.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.paper.published import OBJECTS, published
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.poses.find_poses import trajectory_error
 from scenefuse.report.collected import Collected, collect
 
 SCENE = "demo"
@@ -222,7 +223,7 @@ def paper_preset(
     Args:
         shipped: results of the shipped recipe.
         chained: results of config/paper.yaml.
-        from_sfm: results of config/paper.yaml with config/paper_from_sfm.yaml.
+        from_sfm: results of config/paper.yaml with object.stage1.pose_source sfm.
         objects: of all three.
         table: TSV to write, too.
     """

@@ -27,7 +27,7 @@ from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
 from scenefuse.nerf.prior.pose_network import pose_quantities
 from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
-from scenefuse.paper.chain import chained
+from scenefuse.paper.chain import chained, trajectory_error
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
@@ -37,7 +37,6 @@ from scenefuse.paper.monocular import (
     supervision_of,
 )
 from scenefuse.photos.views import Views
-from scenefuse.poses.find_poses import trajectory_error
 
 # As the demo's photos, at the width of the paper's stage 1.
 WIDTH, HEIGHT, FOCAL = 192, 144, 168.0

@@ -7,7 +7,6 @@ import numpy as np
 import pycolmap
 import pytest
 import torch
-import yaml
 from support.painted_sphere import CENTER, RADIUS, sphere_views
 from support.sideways_video import SHIFT_PX, sideways_video
 from support.textured_plane import plane_views
@@ -25,7 +24,7 @@ from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import recipe
 from scenefuse.paper import train_nerf_as_paper as nerf_stage
-from scenefuse.paper.chain import chained, place_chain
+from scenefuse.paper.chain import chained, place_chain, trajectory_error
 from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper, few_frames, place
 from scenefuse.paper.monocular import (
     MonocularSettings,
@@ -67,8 +66,6 @@ def test_the_constants_are_the_papers():
     assert crop | box == crop and preset["fusion"]["mode"] == "append"
     assert preset["registration"]["variants"] == ["full", "no_scale", "no_crop"]
     assert preset["object"]["masks"]["method"] == "sam2"
-    later = yaml.safe_load((ROOT / "config/paper_from_sfm.yaml").read_text())["object"]["stage1"]
-    assert later == {"epochs": preset["object"]["stage1"]["epochs"], "pose_source": "sfm"}
 
 
 def test_the_constants_of_sfm_are_the_papers():
@@ -209,6 +206,11 @@ def test_a_chain_of_true_motions_is_the_trajectory_and_a_similarity_places_it():
     known[:, :3, :3], known[:, :3, 3] = fit.rotation @ poses[:, :3, :3], fit.apply(poses[:, :3, 3])
     placed, object_from_first = place_chain(own, known)
     assert np.allclose(placed, known, atol=1e-6) and object_from_first.scale == pytest.approx(2.5)
+    own[:, :3, :3] = own[:, :3, :3] @ rotation_between(np.array([1.0, 0, 0]), np.array([np.cos(0.1), np.sin(0.1), 0]))
+    error = trajectory_error("chain", own, known)
+    assert value(error, "trajectory_error_chain_over_extent") == pytest.approx(0, abs=1e-9)
+    assert value(error, "rotation_error_chain_deg") == pytest.approx(np.degrees(0.1))
+    assert trajectory_error("chain", np.tile(np.eye(4), (len(own), 1, 1)), known) == {}
 
 
 @pytest.mark.parametrize("source", ["chain", "sfm"])

@@ -431,15 +431,6 @@ def test_a_page_without_a_summary_is_refused(tmp_path):
     assert not (tmp_path / "report.html").exists()
 
 
-def test_the_text_names_photos_without_a_pose_where_poses_are_not_those_of_sfm(results):
-    house = results / "objects/house"
-    write_json(house / "poses.json", {"not_registered": quantity(["a.jpg"], "")})
-    assert "a.jpg" not in (summarise(results) / "summary.txt").read_text()
-    write_json(house / "stage1.json", {"workspace": quantity("poses", "")})
-    text = (summarise(results) / "summary.txt").read_text()
-    assert "stage1.workspace poses" in text and "poses.not_registered: a.jpg" in text
-
-
 def test_a_variant_without_a_gate_is_neither_ok_nor_registered(results):
     fine = results / "objects/house/registration/paper/fine.json"
     write_json(fine, load(fine) | {"status": quantity("ungated", "")})

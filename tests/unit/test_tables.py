@@ -176,11 +176,6 @@ def test_a_scene_has_settings_of_its_own_too(own_project):
         ("seed: 3", "objects", "'seed' does not concern one object"),
         ("scene: {chunks: 9}", "scenes", "scene.chunks is the same for the whole run"),
         ("registration: {variants: [full]}", "objects", "registration.variants is the same for the whole run"),
-        (
-            "object: {stage1: {pose_source: network}}",
-            "objects",
-            "pose_source is the same for the whole run",
-        ),
         ("[1, 2]", "objects", "own.yaml holds no settings"),
         ("object: {", "objects", "own.yaml is no YAML"),
     ],
@@ -214,11 +209,6 @@ def test_the_variant_that_is_fused_comes_first_in_whatever_order_they_are_writte
         ({"registration": {"variants": ["full", "no_crops"]}}, "unknown variant 'no_crops'.*defines: full, paper"),
         ({"registration": {"variants": ["paper"]}}, "'full' is missing; it is the one that is fused"),
         ({"objects": "nowhere.tsv"}, "nowhere.tsv does not exist; write it as config/README.md describes"),
-        ({"object": {"stage1": {"pose_source": "chain"}}}, "'chain' is of recipe 'paper'; set object.recipe to paper"),
-        (
-            {"object": {"recipe": "paper", "stage1": {"pose_source": "network"}}},
-            "recipe 'paper' knows chain and sfm; poses by matches are not the paper's",
-        ),
     ],
 )
 def test_a_bad_setting_is_one_sentence_with_its_key(project, changes, sentence):

@@ -1,18 +1,15 @@
 # Depth and pose networks of an object: stage 1 trains them, stage 3 refines them by what the NeRF renders.
 #
-# INPUTS    results/objects/{object}/undistorted/ (or poses/), masks/; config: object.stage1, object.stage3
+# INPUTS    results/objects/{object}/undistorted/, masks/; config: object.stage1, object.stage3
 # OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
 
 
-# The workspace that the training stages read; all have the same photos, and poses in the same frame. In recipe paper, the last one.
+# The workspace that the cloud and what follows it read; in recipe paper with the poses of stage 3, in the same frame.
 UNDISTORTED = "results/objects/{object}/undistorted"
 POSED = (
     "results/objects/{object}/refined_poses"
     if config["object"]["recipe"] == "paper"
-    else {
-        "sfm": UNDISTORTED,
-        "network": "results/objects/{object}/poses",
-    }[config["object"]["stage1"]["pose_source"]]
+    else UNDISTORTED
 )
 
 

@@ -1,6 +1,6 @@
 # The NeRF of an object, stages 2 and 4, and its cloud.
 #
-# INPUTS    results/objects/{object}/undistorted/ (or poses/), masks/, stage1/, stage3/; config: object.nerf, object.cloud
+# INPUTS    results/objects/{object}/undistorted/, masks/, stage1/, stage3/; config: object.nerf, object.cloud
 # OUTPUTS   results/objects/{object}/stage2/, stage2.json, stage4/, stage4.json
 #           results/objects/{object}/object.ply, object.json                the cloud
 
