@@ -1,9 +1,10 @@
-"""What this machine has, for the limits of jobs that run on it side by side, and what photos take."""
+"""What this machine has, the CPU threads that a stage's libraries use, and the memory that photos take."""
 
 import contextlib
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 # Limits of a container, of control groups version 2 and 1.
 MEMORY_LIMITS = (Path("/sys/fs/cgroup/memory.max"), Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"))
@@ -40,3 +41,23 @@ def megapixels(folder: Path, width_px: int | None = None) -> float:
     widest, highest = (max(sides, default=0) for sides in (zip(*sizes) if sizes else ((), ())))
     scale = min(1.0, width_px / widest) if width_px and widest else 1.0
     return len(sizes) * widest * highest * scale**2 / 1e6
+
+
+def use_threads(count: int) -> None:
+    """Let PyTorch, Numba (where they are installed) and OpenCV use `count` threads each."""
+    import cv2
+
+    torch: Any = None
+    numba: Any = None
+    with contextlib.suppress(ImportError):
+        import torch  # before Numba starts its threads: it then uses the OpenMP that PyTorch brought along
+    with contextlib.suppress(ImportError):
+        import numba
+
+    cv2.setNumThreads(count)
+    if numba is not None:
+        # PyTorch's threads wait busily for a while: Numba uses the same ones, or the two would take each other's cores.
+        numba.config.THREADING_LAYER_PRIORITY = ["omp", "workqueue", "tbb"]
+        numba.set_num_threads(max(1, min(count, numba.config.NUMBA_NUM_THREADS)))
+    if torch is not None:
+        torch.set_num_threads(count)  # last, since Numba changes it when it starts

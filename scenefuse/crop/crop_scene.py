@@ -12,13 +12,12 @@ from scenefuse.cloud.crs import to_wgs84
 from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.core.units import length_unit
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
 from scenefuse.crop.one_photo import MOST_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.geometry.components import MIN_PART, parts
 from scenefuse.marks.fiducials import Labels, ScenePoints, locate, read_points
-from scenefuse.photos.geodesy import LocalFrame, scene_frame
+from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 
 UP = np.array([0.0, 0.0, 1.0])
 # Fewer points than this give no features to register by.

@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.tiles.tiled_cloud import Rows, open_cloud
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
-from scenefuse.core.units import length_unit
 from scenefuse.fuse.changes import FROM_OBJECT, FROM_SCENE, together, with_source
 from scenefuse.fuse.evidence import (
     KEPT,
@@ -42,6 +41,7 @@ from scenefuse.fuse.modes import (
     with_colors_of,
 )
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
+from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.frame_ledger import frame_ledger
 from scenefuse.register.uncertainty import Uncertainty

@@ -9,8 +9,9 @@ import pyproj
 
 from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import comma_advice, read_lines
+from scenefuse.core.tables import comma_advice, composed, read_lines
 from scenefuse.core.transforms import Array
+from scenefuse.marks.lengths import read_ends
 from scenefuse.photos.photo_files import SUFFIXES
 
 # A point whose name begins so is a check point, as OpenDroneMap's users mark it.
@@ -138,3 +139,21 @@ def _point(name: str, rows: list[Row], position: Array, path: Path) -> SurveyedP
         raise StageError(f"{path}: point {name} is clicked more than once in {twice}; keep one line of it")
     clicks = [(photo, pixel) for _, _, photo, pixel in rows]
     return SurveyedPoint(name, position, rows[0][1], name.upper().startswith(CHECK), clicks)
+
+
+def check_survey_files(names: list[str], control: Path | None = None, lengths: Path | None = None) -> None:
+    """Check that the files of a survey can be read, and that their clicks are in photos of these names.
+
+    Raises:
+        StageError: what `read_control` and `read_ends` say; a click in a photo that does not exist.
+    """
+    clicked: list[tuple[Path, str, str]] = []
+    if control is not None:
+        clicked += [(control, point.name, photo) for point in read_control(control).points for photo, _ in point.clicks]
+    if lengths is not None:
+        ends = read_ends(lengths)[2]
+        clicked += [(lengths, point, photo) for point, photo in zip(ends.points, ends.photos)]
+    known = set(map(composed, names))
+    for path, point, photo in clicked:
+        if composed(photo) not in known:
+            raise unknown_photo(path, point, photo, names)

@@ -16,11 +16,10 @@ from scenefuse.cloud.formats import LAS_DIMENSIONS, las_crs
 from scenefuse.cloud.import_cloud import IMPORTED, ImportedFile
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.core.units import length_unit
 from scenefuse.georef.cloud_fit import FIT, LEAST_PHOTOS, check_fit, fit_to_cameras, misfit
 from scenefuse.georef.on_cloud import cloud_crs, in_local
 from scenefuse.photos.cameras.place import read_place
-from scenefuse.photos.geodesy import LocalFrame, scene_frame
+from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, read_model, read_views, with_mask
 
 # A point of an object lies inside the masks in so many of the photos that frame it; masks are grown by this share of

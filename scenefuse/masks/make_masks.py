@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import (
     StageError,
     atomic_directory,

@@ -7,8 +7,8 @@ import pycolmap
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.photos.mask_files import mask_files, matte_of
-from scenefuse.photos.pictures import read_raw
+from scenefuse.photos.photo_files import mask_files
+from scenefuse.photos.pictures import matte_of, read_raw
 from scenefuse.photos.workspace import View, read_cameras
 from scenefuse.sfm.undistort import undistort_picture
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.temporary_workspace import MAPS, collect_maps, linked_workspace

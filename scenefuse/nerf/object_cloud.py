@@ -13,7 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, plane_normals, spacing, voxel_downsample, write_cloud
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from scenefuse.core.checkpoints import State, key_of
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.mvs.photo_refinement import RefinementSettings

@@ -14,8 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from scenefuse.core.checkpoints import State, checkpointed, learning_rate_factor, load_checkpoint
-from scenefuse.core.progress import Progress
+from scenefuse.core.checkpoints import Progress, State, checkpointed, learning_rate_factor, load_checkpoint
 from scenefuse.core.stage import setting
 from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pyproj
 from numpy.typing import NDArray
 
 from scenefuse.cloud.crs import unit_m
-from scenefuse.core.stage import value
+from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3, fit_sim3
 
 Array = NDArray[np.float64]
@@ -156,3 +157,8 @@ def scene_frame(georeference: Mapping[str, Any]) -> LocalFrame | GridFrame | Non
     )
     grid = value(georeference, "crs") if "crs" in georeference else ""
     return LocalFrame(float(latitude), float(longitude), float(altitude or 0.0), grid=grid)
+
+
+def length_unit(georeference: Path | None) -> str:
+    """The unit of lengths in a scene's frame by its `georeference.json`: "m", or (without that file) "scene units"."""
+    return "scene units" if georeference is None else str(value(read_json(georeference), "length_unit"))

@@ -3,6 +3,7 @@ workflow lists them often."""
 
 import os
 from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
 
 from scenefuse.core.stage import StageError
@@ -70,6 +71,28 @@ def photo_files(folder: Path) -> list[Path]:
             f" ({len(files)} other files were found)"
         )
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
+
+
+def mask_files(folder: Path) -> dict[str, Path]:
+    """The pictures of a folder by the stem of the photo they belong to: without the photo's ending and `_mask`.
+
+    Those in folders below it have the folders' names in front, joined by `_`.
+    """
+    files = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"):
+            stem = "_".join((*path.relative_to(folder).parts[:-1], path.stem))
+            for ending in (".jpg", ".JPG", ".jpeg", ".JPEG", ".png", ".PNG"):
+                stem = stem.removesuffix(ending)
+            files[stem.removesuffix("_mask")] = path
+    return files
+
+
+def find_photo(name: str, files: Iterable[Path], folder: Path) -> Path:
+    """The photo of that name, with or without its ending and wherever it lay; where there is none, what it would be."""
+    wanted = Path(name.replace("\\", "/")).name
+    exact = [file for file in files if file.name == wanted]
+    return (exact or [file for file in files if file.stem == wanted] or [folder / wanted])[0]
 
 
 def in_folders(names: list[str]) -> str:

@@ -33,6 +33,15 @@ def read_raw(path: Path) -> NDArray[Any]:
     return _read(path, cv2.IMREAD_UNCHANGED)
 
 
+def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
+    """A mask picture as (H, W) bool: alpha where it varies, else brightness, above half of the largest value."""
+    if picture.ndim == 3 and picture.shape[2] == 4 and picture[..., 3].min() < picture[..., 3].max():
+        channel = picture[..., 3]
+    else:
+        channel = picture[..., :3].max(2) if picture.ndim == 3 else picture
+    return channel > max(1, channel.max()) / 2
+
+
 def write_picture(path: Path, pixels: NDArray[np.uint8], jpeg_quality: int = 97) -> None:
     """Write (H, W) grey or (H, W, 3) RGB pixels in the format of the path's suffix.
 

@@ -13,9 +13,9 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.photos.mask_files import mask_files, matte_of
+from scenefuse.photos.photo_files import mask_files
 from scenefuse.photos.photos import JPEG_QUALITY, SHAPE_TOLERANCE
-from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.pictures import matte_of, write_picture
 from scenefuse.photos.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up

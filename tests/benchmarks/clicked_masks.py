@@ -25,7 +25,7 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.mask_files import mask_files
+from scenefuse.photos.photo_files import mask_files
 from scenefuse.photos.pictures import read_mask
 from scenefuse.photos.workspace import Workspace, read_workspace
 

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import torch
 
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import run
 from scenefuse.nerf.rays import PhotoTensors

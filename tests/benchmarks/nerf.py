@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import run
 from scenefuse.geometry.matcher import Matcher

@@ -7,7 +7,7 @@ import pytest
 import torch
 from support.painted_sphere import photos_of, sphere_views, sphere_volume
 
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.nerf.appearance import (
     falloff_map,
     fitted_log_gain,

@@ -11,7 +11,7 @@ from support.painted_sphere import CENTER, RADIUS, photos_of, sphere_views, sphe
 
 import scenefuse.nerf.training as training_module
 from scenefuse.core import checkpoints
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import MOST_VIEWS, back_project, compare, normals_from_depth, others, surface_points

@@ -22,7 +22,7 @@ MAY_IMPORT |= {"__main__": {"command_line"}}
 CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
 CORE += ("appearance", "pose_refinement")
 OUTSIDE = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
-OURS = {f"scenefuse.core.{name}" for name in ("stage", "transforms", "cores", "checkpoints", "progress")}
+OURS = {f"scenefuse.core.{name}" for name in ("stage", "transforms", "machine", "checkpoints")}
 
 
 def modules() -> list[Path]:

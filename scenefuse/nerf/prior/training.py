@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from scenefuse.core.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, require_finite
-from scenefuse.core.cores import use_threads
+from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, threads
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity

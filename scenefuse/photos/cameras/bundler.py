@@ -10,8 +10,7 @@ from PIL import Image
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.names import find_photo
-from scenefuse.photos.photo_files import bundler_list, photo_files
+from scenefuse.photos.photo_files import bundler_list, find_photo, photo_files
 from scenefuse.photos.posed_photos import PosedPhoto
 
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.

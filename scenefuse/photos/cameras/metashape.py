@@ -11,9 +11,8 @@ from scipy.optimize import least_squares
 from scenefuse.cloud.crs import usable
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.photos.cameras.names import find_photo
 from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.photo_files import photo_files
+from scenefuse.photos.photo_files import find_photo, photo_files
 from scenefuse.photos.posed_photos import PosedPhoto
 
 # Parameters of its lens; those that are zero are left out of the file.

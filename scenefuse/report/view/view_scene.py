@@ -9,7 +9,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
-from scenefuse.core.units import length_unit
+from scenefuse.photos.geodesy import length_unit
 from scenefuse.report.view.view_file import View, write_view
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
 
