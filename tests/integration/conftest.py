@@ -1,12 +1,9 @@
-import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+from support.snakemake_runs import ROOT, run_snakemake
 from support.user_project import Project
-
-ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="session")
@@ -16,16 +13,8 @@ def snakemake():
     def call(
         directory: Path, *words: str, config: Path = ROOT / "tests/data/tiny.yaml"
     ) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "snakemake", "--snakefile", ROOT / "Snakefile", "--directory", directory]
-        command += ["--configfile", config, "--cores", "2", *words]
-        return subprocess.run(
-            list(map(str, command)),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            cwd=ROOT,
-            env=os.environ | {"COLUMNS": "200"},
-        )
+        where = ["--snakefile", ROOT / "Snakefile", "--directory", directory, "--configfile", config]
+        return run_snakemake(ROOT, *where, *words)
 
     return call
 

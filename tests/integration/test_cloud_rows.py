@@ -166,9 +166,9 @@ def test_photos_without_cameras_are_laid_on_the_scene_s_cloud_by_its_crs(yard, s
     assert plan.returncode == 0, plan.stdout[-3000:]
     rules = planned(plan.stdout)
     assert {"georegister", "import_posed_scene_cloud", *SFM, *TRAINING} <= rules and not rules & STEREO
-    placing = next(line for line in plan.stdout.splitlines() if "sfm/georegister.py" in line)
+    placing = next(line for line in plan.stdout.splitlines() if "georef/georegister.py" in line)
     assert "--held False --crs EPSG:25832 --cloud yard.ply" in placing
-    taking = next(line for line in plan.stdout.splitlines() if "sfm/import_posed_cloud.py" in line)
+    taking = next(line for line in plan.stdout.splitlines() if "georef/import_posed_cloud.py" in line)
     assert "--source yard.ply --georeference-json" in taking and "--crs EPSG:25832" in taking
 
 

@@ -1,17 +1,12 @@
 """The workflow as others use it: from either Snakefile, and as a module of another workflow."""
 
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from support.snakemake_runs import ROOT, run_snakemake
 from support.user_project import CLICKS, planned
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 
-ROOT = Path(__file__).resolve().parents[2]
 OTHER = """
 configfile: "mine.yaml"
 
@@ -37,10 +32,8 @@ use rule * from completion as completion_*
 
 
 def snakemake(directory, *words):
-    command = [sys.executable, "-m", "snakemake", *map(str, words)]
-    env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=directory, env=env, capture_output=True, text=True)
-    return done.returncode, done.stdout + done.stderr
+    done = run_snakemake(directory, *words)
+    return done.returncode, done.stdout
 
 
 def plan(directory, *words):
@@ -83,7 +76,7 @@ def test_jobs_of_a_module_run(tmp_path):
     (tmp_path / "objects.tsv").write_text("object\tscene\n")
     (tmp_path / "mine.yaml").write_text("completion: { scenes: scenes.tsv, objects: objects.tsv }\n")
     (tmp_path / "Snakefile").write_text(OTHER.format(snakefile=ROOT / "workflow/Snakefile"))
-    status, output = snakemake(tmp_path, "--cores", "1", "results/scenes/yard/dense.ply")
+    status, output = snakemake(tmp_path, "results/scenes/yard/dense.ply")
     assert status == 0, output
     assert len(read_cloud(tmp_path / "results/scenes/yard/dense.ply")) == 500
 

@@ -36,7 +36,7 @@ def test_the_papers_stages_run_in_the_place_of_the_shipped_ones_and_only_when_as
             assert re.search(rf"--workspace \S+/{poses} .*--prior \S+/{prior} ", given[stage])
             assert "--previous" not in given[stage]
         assert all("--match-reach-px 0" in words for script, words in jobs if script == "nerf/make_object_cloud")
-        assert all("--minimal True" in words for script, words in jobs if script == "registration/crop_scene")
+        assert all("--minimal True" in words for script, words in jobs if script == "crop/crop_scene")
         scales = [
             re.search(r"--scale (\w+)", words)[1] for script, words in jobs if script.endswith("register_as_paper")
         ]
