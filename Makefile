@@ -1,17 +1,21 @@
-# make demo | test | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
+# make demo | check | test | lint | report | bench | docs | clean      (CORES=2 by default, PYTHON=python3)
 CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo test lint report bench bench-registration bench-nerf bench-scale docs clean
+.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
 	@cat results/summary/summary.txt
 
-test: .venv/ready
+# Unit tests that start no process, in three minutes; those of one package and what imports it: make check PART=masks.
+check: .venv/tests
+	pytest -n $(CORES) --dist loadfile -m "not process" $(if $(PART),--part $(PART)) tests/unit
+
+# All tests, in twelve minutes: those of whole workflows first.
+test: .venv/tests
 	envs/browser.sh
-	pip install --quiet --disable-pip-version-check -r tests/requirements.txt
 	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder --durations 20
 
 lint: .venv/ready
@@ -53,4 +57,8 @@ clean:
 
 .venv/ready: envs/setup.sh envs/requirements.txt pyproject.toml
 	PYTHON=$(PYTHON) envs/setup.sh
+	@touch $@
+
+.venv/tests: .venv/ready tests/requirements.txt
+	pip install --quiet --disable-pip-version-check -r tests/requirements.txt
 	@touch $@

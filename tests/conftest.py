@@ -1,8 +1,29 @@
-"""Without a GPU, Triton's interpreter runs the GPU kernels; it has to know before they are imported."""
+"""Options of the test run: `--part masks` selects the files of tests that reach a part of the library."""
 
 import os
+from pathlib import Path
 
-import torch
+import pytest
 
-if not torch.cuda.is_available():
+from scenefuse.core.fingerprint import reached
+from scenefuse.core.machine import has_gpu
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# Without a GPU, Triton's interpreter runs the GPU kernels; it reads this when they are imported.
+if not has_gpu():
     os.environ["TRITON_INTERPRET"] = "1"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--part", help="only tests that reach this package of the library, as fingerprints of jobs do")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    part = config.getoption("--part")
+    if not part or not collection_path.name.startswith("test_"):
+        return None
+    home = ROOT / "scenefuse" / part
+    if not home.is_dir():
+        raise pytest.UsageError(f"PART={part}: there is no package scenefuse/{part}")
+    return True if not any(path.is_relative_to(home) for path in reached(collection_path, ROOT)) else None

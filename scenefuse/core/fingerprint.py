@@ -58,16 +58,30 @@ def fingerprint(script: Path, root: Path) -> str:
     Raises:
         SyntaxError: a module does not parse.
     """
+    modules = _modules(script, root)
+    names = {path.relative_to(_above(path, root)).as_posix(): module for path, module in modules.items()}
+    lines = [f"{name} {names[name].code}" for name in sorted(names)]
+    lines += [f"{name} {_version(name)}" for name in sorted(set().union(*(m.packages for m in modules.values())))]
+    return _digest("\n".join(lines))
+
+
+def reached(script: Path, root: Path) -> frozenset[Path]:
+    """The script and all modules of the project that it imports, directly or indirectly.
+
+    Raises:
+        SyntaxError: a module does not parse.
+    """
+    return frozenset(_modules(script, root))
+
+
+def _modules(script: Path, root: Path) -> dict[Path, _Module]:
     modules, todo = {}, [script]
     while todo:
         path = todo.pop()
         if path not in modules:
             modules[path] = _module(path, root)
             todo += modules[path].files
-    names = {path.relative_to(_above(path, root)).as_posix(): module for path, module in modules.items()}
-    lines = [f"{name} {names[name].code}" for name in sorted(names)]
-    lines += [f"{name} {_version(name)}" for name in sorted(set().union(*(m.packages for m in modules.values())))]
-    return _digest("\n".join(lines))
+    return modules
 
 
 @functools.cache

@@ -111,6 +111,7 @@ for name, types in arguments.items():
 """
 
 
+@pytest.mark.process
 def test_gpu_kernels_compile_to_one_load_or_addition_per_vertex(tmp_path):
     pytest.importorskip("triton", reason="Triton is not installed: pip install -r tests/requirements.txt")
     environment = os.environ | {"TRITON_INTERPRET": "0", "TRITON_CACHE_DIR": str(tmp_path)}

@@ -54,6 +54,7 @@ def test_every_setting_is_described():
     assert [name for name, part in leaves(schema) if not part.get("description")] == []
 
 
+@pytest.mark.process
 def test_schema_and_page_of_settings_are_not_stale():
     check = [sys.executable, "workflow/generate.py", "--check"]
     assert subprocess.run(check, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}).returncode == 0, (
@@ -97,6 +98,7 @@ def test_rules_and_scripts_share_their_names():
     assert used == {str(p.relative_to(ROOT / "scripts")) for p in SCRIPTS if p.parent.name != "scripts"}
 
 
+@pytest.mark.process
 def test_reading_the_rules_imports_nothing_heavy():
     # Every job on a cluster reads them again. Snakemake itself imports NumPy and pandas.
     rules = [*(ROOT / "workflow").rglob("*.smk"), ROOT / "Snakefile"]

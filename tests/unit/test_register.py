@@ -96,6 +96,7 @@ def test_fiducials_gravity_and_a_known_scale_in_text_and_ply(tmp_path):
     assert np.abs(placed - pose.apply(read_cloud(tmp_path / "house.xyz").points)).max() < 1e-8
 
 
+@pytest.mark.process
 def test_another_shape_is_refused_with_status_three_and_no_object_is_left(tmp_path, house):
     write_cloud(tmp_path / "house.ply", house.object)
     other = plant("sculpture", 7, ground=False, noise=0.005, density_ratio=1.0).scene

@@ -61,6 +61,7 @@ def test_atomic_directory_keeps_the_old_result_when_it_fails(tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["d"]
 
 
+@pytest.mark.process
 def test_what_a_killed_job_left_is_removed_by_the_next_run_and_a_living_one_keeps_its_own(tmp_path):
     dead = subprocess.Popen([sys.executable, "-c", ""])
     dead.wait()
@@ -117,6 +118,7 @@ def test_manifest_names_contents_and_ignores_snakemake(tmp_path):
     assert list(manifest(tmp_path)) == ["d/a"]
 
 
+@pytest.mark.process
 def test_an_error_is_one_sentence_a_log_begins_with_the_command_and_a_signal_leaves_nothing(tmp_path):
     script = tmp_path / "stage.py"
     script.write_text(SCRIPT)
