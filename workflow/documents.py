@@ -1,9 +1,9 @@
 """What documents take from the code: numbers of constants.
 
 In any page, `0.5<!-- masks.space.MIN_SHARE -->` is the constant MIN_SHARE of scenefuse/masks/space.py,
-`30<!-- masks.space.MIN_SHARE % --> %` the same as percent, `four<!-- masks.space.PHOTOS -->` a number as a word. A field
-of a dataclass is `module.Class.field`, an entry of a tuple `module.NAME[0]`. Constants are read from the source: nothing
-is imported.
+`30<!-- masks.space.MIN_SHARE % --> %` the same as percent, `four<!-- masks.space.PHOTOS -->` a number as a word.
+A field of a dataclass is `module.Class.field`, an entry of a tuple `module.NAME[0]`. Constants are read from the
+source: nothing is imported.
 """
 
 import ast
