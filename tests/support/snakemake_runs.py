@@ -1,4 +1,4 @@
-"""Snakemake run by tests: plans in a forked copy of this process, which has imported it; runs in processes of their own."""
+"""Snakemake run by tests: plans in a forked copy of this process, which has imported it; runs in processes."""
 
 import os
 import subprocess
