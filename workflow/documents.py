@@ -1,9 +1,13 @@
-"""What documents take from the code: numbers of constants.
+"""What documents take from elsewhere: numbers of constants from the code, tables from docs/results.
 
 In any page, `0.5<!-- masks.space.MIN_SHARE -->` is the constant MIN_SHARE of scenefuse/masks/space.py,
 `30<!-- masks.space.MIN_SHARE % --> %` the same as percent, `four<!-- masks.space.PHOTOS -->` a number as a word.
 A field of a dataclass is `module.Class.field`, an entry of a tuple `module.NAME[0]`. Constants are read from the
 source: nothing is imported.
+
+Between `<!-- table: docs/results/x.tsv -->` and `<!-- end -->` stands that table, and under it the commit whose code
+it measured. docs/results/index.tsv has a row for each table: its command, that commit, the packages that it measured,
+and in column `state` the word `older` where these have changed since.
 """
 
 import ast
@@ -11,12 +15,15 @@ import functools
 import math
 import operator
 import re
+import subprocess
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 LIBRARY = ROOT / "scenefuse"
 NUMBER = re.compile(r"([^\s<>(|`]+)(<!-- ([\w.]+?)(?:\[(\d+)\])?( %)? -->)")
+TABLE = re.compile(r"(<!-- table: docs/(results/\w+\.tsv) -->\n).*?(<!-- end -->)", re.DOTALL)
+OLDER = "older"
 WORDS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]
 OPERATORS = {
     ast.Add: operator.add,
@@ -125,6 +132,41 @@ def _written(value: Any, as_it_was: str, percent: bool) -> str:
     return re.sub(r"e([+-])0*", lambda sign: "e" + sign[1].replace("+", ""), f"{value:.6g}")
 
 
+def with_tables(text: str) -> str:
+    """`text` with every table as its file has it.
+
+    Raises:
+        KeyError: a table has no row in docs/results/index.tsv.
+    """
+    return TABLE.sub(lambda match: match[1] + _table(match[2]) + match[3], text)
+
+
+def _table(name: str) -> str:
+    entry = measured()[Path(name).name]
+    header, *rows = [line.split("\t") for line in (ROOT / "docs" / name).read_text().splitlines()]
+    lines = ["|".join(["", *cells, ""]) for cells in [header, ["---"] * len(header), *rows]]
+    since = "; the code has changed since" if entry["state"] == OLDER else ""
+    return "\n".join([*lines, "", f"*Measured at {entry['commit']}{since}.*", ""])
+
+
+def measured() -> dict[str, dict[str, str]]:
+    """The rows of docs/results/index.tsv by the names of their tables."""
+    header, *rows = [line.split("\t") for line in (ROOT / "docs/results/index.tsv").read_text().splitlines()]
+    return {row[0]: dict(zip(header, row, strict=True)) for row in rows}
+
+
+def has_changed(commit: str, packages: str) -> bool | None:
+    """Whether modules of these packages are others now than at `commit`; None where Git does not know it.
+
+    Args:
+        packages: names below scenefuse/, separated by spaces.
+    """
+    files = [f"scenefuse/{name}/*.py" for name in packages.split()]
+    command = ["git", "-C", str(ROOT), "diff", "--quiet", commit, "--", *files]
+    code = subprocess.run(command, capture_output=True, check=False).returncode
+    return bool(code) if code in (0, 1) else None
+
+
 def labels() -> set[str]:
     """The labels of the method, `R8`: the first words of the headings of its pages."""
     found = (
@@ -135,4 +177,4 @@ def labels() -> set[str]:
 
 def fresh() -> dict[Path, str]:
     """All documents as they should be."""
-    return {page: with_numbers(page.read_text()) for page in pages()}
+    return {page: with_tables(with_numbers(page.read_text())) for page in pages()}

@@ -1,6 +1,7 @@
 """The documents name only what exists (links, headings, paths, commands), with the numbers that the code has."""
 
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -116,6 +117,51 @@ def test_a_number_follows_its_constant_and_a_constant_that_is_gone_is_an_error(m
     for gone in ("masks.space.GONE", "masks.gone.SHARE", "masks.space.S.gone"):
         with pytest.raises(KeyError, match=gone.rpartition(".")[2] if "gone." not in gone else "no such module"):
             documents.with_numbers(f"1<!-- {gone} -->")
+
+
+@names(PAGES)
+def test_tables_are_those_of_their_files(page):
+    text = page.read_text()
+    assert documents.with_tables(text) == text, "run `make docs`"
+
+
+def test_every_measured_table_says_of_which_code_it_is():
+    tables = {path.name for path in (ROOT / "docs/results").glob("*.tsv")} - {"index.tsv"}
+    assert set(documents.measured()) == tables
+    for row in documents.measured().values():
+        assert row["command"] and all((ROOT / "scenefuse" / name).is_dir() for name in row["measures"].split()), row
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("row", documents.measured().values(), ids=lambda row: row["table"])
+def test_a_table_is_not_older_than_the_code_that_it_measured_unless_it_says_so(row):
+    changed = documents.has_changed(row["commit"], row["measures"])
+    if changed is None:
+        pytest.skip("no Git, or a clone without this commit")
+    assert (row["state"] == documents.OLDER) == changed, (
+        f"{row['measures']}: changed since {row['commit']}; run the command of docs/results/index.tsv again, or write "
+        f"'{documents.OLDER}' into the table's row there, and run `make docs`"
+    )
+
+
+@pytest.mark.process
+def test_changed_code_is_noticed(monkeypatch, tmp_path):
+    def git(*words):
+        author = ["-c", "user.name=a", "-c", "user.email=a@example.org"]
+        done = subprocess.run(["git", "-C", tmp_path, *author, *words], check=True, capture_output=True, text=True)
+        return done.stdout.strip()
+
+    module = tmp_path / "scenefuse/fuse/fuse.py"
+    module.parent.mkdir(parents=True)
+    module.write_text("A = 1\n")
+    git("init"), git("add", "."), git("commit", "-m", "first")
+    first = git("rev-parse", "HEAD")
+    monkeypatch.setattr(documents, "ROOT", tmp_path)
+    assert documents.has_changed(first, "fuse") is False
+    module.write_text("A = 2\n")
+    assert documents.has_changed(first, "masks fuse") is True
+    assert documents.has_changed(first, "masks") is False
+    assert documents.has_changed("0" * 40, "fuse") is None
 
 
 def test_labels_that_the_code_cites_are_headings_of_the_method():
