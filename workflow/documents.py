@@ -21,7 +21,8 @@ from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 LIBRARY = ROOT / "scenefuse"
-NUMBER = re.compile(r"([^\s<>(|`]+)(<!-- ([\w.]+?)(?:\[(\d+)\])?( %)? -->)")
+# In a code span it is an example.
+NUMBER = re.compile(r"(?<![`\w.,])([^\s<>(|`]+)(<!-- ?([\w.]+?)(?:\[(\d+)\])?( ?%)? ?-->)")
 TABLE = re.compile(r"(<!-- table: docs/(results/\w+\.tsv) -->\n).*?(<!-- end -->)", re.DOTALL)
 OLDER = "older"
 WORDS = ["no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten", "eleven", "twelve"]

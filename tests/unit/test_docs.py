@@ -114,6 +114,8 @@ def test_a_number_follows_its_constant_and_a_constant_that_is_gone_is_an_error(m
     )
     text = " ".join(f"1<!-- masks.space.{name} -->" for name in ("BOTH[0]", "BOTH[1]", "S.rays", "B"))
     assert re.findall(r"(\S+)<!", documents.with_numbers(text)) == ["8", "1e-6", "20,000", "3.14159"]
+    example = "`1<!-- masks.gone.SHARE -->`"
+    assert documents.with_numbers(example) == example
     for gone in ("masks.space.GONE", "masks.gone.SHARE", "masks.space.S.gone"):
         with pytest.raises(KeyError, match=gone.rpartition(".")[2] if "gone." not in gone else "no such module"):
             documents.with_numbers(f"1<!-- {gone} -->")
