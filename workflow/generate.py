@@ -18,24 +18,45 @@ PAGE = ROOT / "config/README.md"
 START, END = "<!-- settings: written by `make docs`, do not edit -->", "<!-- end of settings -->"
 
 
-def rows(part: dict[str, Any], prefix: str = "") -> list[str]:
-    """One table row for each leaf of a schema: key, shipped value, unit, meaning."""
-    lines = []
+# The rendered demo's own sections; their descriptions are in the schema.
+LEFT_OUT = ("demo", "evaluation")
+
+
+def leaves(part: dict[str, Any], prefix: str = "") -> dict[str, dict[str, Any]]:
+    """The leaves of a schema by their keys, `fusion.mode`."""
+    found = {}
     for key, leaf in part["properties"].items():
-        if "properties" in leaf:
-            lines += rows(leaf, f"{prefix}{key}.")
-        else:
-            text = yaml.safe_dump(leaf["default"], default_flow_style=True, sort_keys=False, width=float("inf"))
-            text = text.strip().removesuffix("...").strip()
-            lines.append(f"| `{prefix}{key}` | `{text}` | {leaf.get('unit', '')} | {leaf['description']} |")
+        found |= leaves(leaf, f"{prefix}{key}.") if "properties" in leaf else {prefix + key: leaf}
+    return found
+
+
+def rows() -> list[str]:
+    """One table row for each setting: key, shipped value, unit, meaning; what scene and object share once."""
+    known = leaves(schema())
+    lines = []
+    for key, leaf in known.items():
+        section, _, rest = key.partition(".")
+        twin = known.get(f"{'scene' if section == 'object' else 'object'}.{rest}", {})
+        shared = section in ("scene", "object") and twin.get("description") == leaf["description"]
+        if section in LEFT_OUT or (shared and section == "object"):
+            continue
+        values = [shipped(leaf)] if not shared or twin["default"] == leaf["default"] else [shipped(leaf), shipped(twin)]
+        cell = " / ".join(f"`{value}`" for value in values)
+        lines.append(f"|`{key}`{' *' if shared else ''}|{cell}|{leaf.get('unit', '')}|{leaf['description']}|")
     return lines
+
+
+def shipped(leaf: dict[str, Any]) -> str:
+    """A setting's shipped value, as one writes it."""
+    text = yaml.safe_dump(leaf["default"], default_flow_style=True, sort_keys=False, width=float("inf"))
+    return text.strip().removesuffix("...").strip()
 
 
 def columns(part: dict[str, Any]) -> list[str]:
     """One table row for each column of a TSV schema."""
     required = part["required"]
     return [
-        f"| `{name}` | {'yes' if name in required else 'no'} | {column['description']} |"
+        f"|`{name}`{' (required)' if name in required else ''}|{column['description']}|"
         for name, column in part["properties"].items()
     ]
 
@@ -45,9 +66,10 @@ def tables() -> str:
     parts = [START, ""]
     for name in ("scenes", "objects"):
         table = yaml.safe_load(SCHEMA.with_name(f"{name}.schema.yaml").read_text())
-        parts += [f"### `{name}.tsv`", "", "| column | required | meaning |", "|---|---|---|", *columns(table), ""]
-    parts += ["### `config.yaml`", "", "| key | shipped value | unit | meaning |", "|---|---|---|---|"]
-    return "\n".join([*parts, *rows(schema()), "", END])
+        parts += [f"### `{name}.tsv`", "", "|column|meaning|", "|---|---|", *columns(table), ""]
+    note = "Sections with * are there for `scene` and `object`; where their shipped values differ, both are given."
+    parts += ["### `config.yaml`", "", note, "", "|key|shipped|unit|meaning|", "|---|---|---|---|"]
+    return "\n".join([*parts, *rows(), "", END])
 
 
 def fresh() -> dict[Path, str]:
