@@ -166,13 +166,14 @@ def test_changed_code_is_noticed(monkeypatch, tmp_path):
     assert documents.has_changed("0" * 40, "fuse") is None
 
 
-def test_labels_that_the_code_cites_are_headings_of_the_method():
+def test_labels_that_code_and_documents_cite_are_headings_of_the_method():
     known = documents.labels()
     cited = {
         (label, path.name)
         for path in (ROOT / "scenefuse").rglob("*.py")
         for label in re.findall(r"\bmethod ([A-Z]\d+)\b", path.read_text())
     }
+    cited |= {(label, page.name) for page in CURRENT for label in re.findall(r"\b[CFGKMNR]\d{1,2}\b", page.read_text())}
     assert [found for found in sorted(cited) if found[0] not in known] == []
 
 
