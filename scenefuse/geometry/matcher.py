@@ -12,15 +12,15 @@ from torch import Tensor
 from scenefuse.geometry.matching_kernel import keep_best as keep_best_on_cpu
 from scenefuse.photos.workspace import View
 
-FLAT = 1.5e-5
-"""One grey level of 255, squared, the noise of a photo: keeps windows without texture from matching anything."""
-ALIKE, UNLIKE = 0.07, 0.28
-"""Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e, and at which it ends: beside
-a dark statue, the smallest weight is texture enough for a blank sky to match at the statue's depth."""
-FALL = 0.6
-"""Distance, in radii of the window, at which it falls to 1 / e."""
-OUTSIDE = -0.5
-"""Score of a hypothesis outside a source photo: worse than a window that does not match."""
+# One grey level of 255, squared, the noise of a photo: keeps windows without texture from matching anything.
+NOISE_VARIANCE = 1.5e-5
+# Difference of grey values, 0..1, at which a pixel's weight in a support falls to 1 / e, and at which it ends: beside a
+# dark statue, the smallest weight is texture enough for a blank sky to match at the statue's depth.
+GREY_FALL, MAX_GREY_STEP = 0.07, 0.28
+# Distance, in radii of the window, at which it falls to 1 / e.
+DISTANCE_FALL = 0.6
+# Score of a hypothesis outside a source photo: worse than a window that does not match.
+OUTSIDE_SCORE = -0.5
 
 
 class Matcher:
@@ -41,11 +41,11 @@ class Matcher:
         best_sources: int,
         window_px: int,
         device: torch.device | str,
-        flat: float = FLAT,
+        flat: float = NOISE_VARIANCE,
     ) -> None:
         """Place each pixel's ray in each source photo; `pixels` of all are (H, W) float32 grey values in 0..1.
 
-        `flat` is the variance that is added to all windows', see FLAT.
+        `flat` is the variance that is added to all windows', see NOISE_VARIANCE.
         """
         height, width = reference.height, reference.width
         self.best, self.flat = min(best_sources, len(sources)), flat
@@ -74,7 +74,7 @@ class Matcher:
 
     def score(self, inverse: Tensor) -> Tensor:
         """Mean NCC of the best sources for D hypotheses per pixel: (D, h, w) inverse depths -> (D, h, w) in -1..1."""
-        best = inverse.new_full((self.best, *inverse.shape), OUTSIDE)
+        best = inverse.new_full((self.best, *inverse.shape), OUTSIDE_SCORE)
         keep = self._keep_best_on_cpu if inverse.device.type == "cpu" else self.keep_best
         for source in self.sources:
             keep(inverse, best, *source)
@@ -106,7 +106,7 @@ class Matcher:
         return grid, (z > 1e-6) & (grid.abs().amax(-1) < 1)
 
     def _ncc(self, inverse: Tensor, gray: Tensor, directions: Tensor, move: Tensor) -> Tensor:
-        """NCC of one source, (D, h, w); OUTSIDE where the hypothesis lies outside the source photo."""
+        """NCC of one source, (D, h, w); OUTSIDE_SCORE where the hypothesis lies outside the source photo."""
         grid, inside = self._place(inverse, directions, move)
         count, height, width = inverse.shape
         grid = grid.reshape(1, count * height, width, 2)
@@ -116,7 +116,7 @@ class Matcher:
         variance = (self._mean(warped * warped) - mean * mean).clamp(min=0)
         covariance = self._mean(warped * self.reference) - mean * self.mean
         ncc = covariance / torch.sqrt((variance + self.flat) * (self.variance + self.flat))
-        return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE))
+        return torch.where(inside, ncc, torch.full_like(ncc, OUTSIDE_SCORE))
 
     def _mean(self, values: Tensor) -> Tensor:
         """Weighted mean of values (..., h, w) over the support of each pixel."""
@@ -165,7 +165,9 @@ def support_weights(gray: Tensor, window: int) -> Tensor:
         weights = []
         for k in range(window):
             step = (padded[k : k + len(values)] - values).abs()
-            weights.append(torch.exp(-step / ALIKE - abs(k - radius) / (FALL * radius)) * (step < UNLIKE))
+            weights.append(
+                torch.exp(-step / GREY_FALL - abs(k - radius) / (DISTANCE_FALL * radius)) * (step < MAX_GREY_STEP)
+            )
         stacked = torch.stack(weights, dim=1)
         stacked = (stacked / stacked.sum(1, keepdim=True)).transpose(0, 2 * axis)
         parts.append(stacked)

@@ -15,32 +15,25 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.photo_kernel import OFFSETS, match_points
 from scenefuse.photos.workspace import View, Workspace
 
-MIN_MATCH = 0.6
-"""Least weighted NCC of a photo that confirms a point."""
-SLACK = 0.1
-"""A photo whose score is better by more at another offset does not confirm a point."""
-LEAST_PHOTOS = 3
-"""Photos that must confirm a point for it to be measured."""
-MOST_DEVIATION = 1.2
-"""Of a step (about a pixel), the largest standard deviation of a measured point: windows that match as well farther on
-measure nothing, sky and blank walls above all."""
-MOST_PHOTOS = 64
-"""Photos of one side that points are checked in at most: from the most different directions."""
-ENOUGH, USEFUL = (3, 6, 12), 0.5
-"""Of these, photos that have a place in their picture, all places first three; a photo is as good as the best one that
-shows this share of what that one shows of places that have not yet."""
+# Least weighted NCC of a photo that confirms a point, and by how much more another offset may score.
+MIN_MATCH, MAX_DROP = 0.6, 0.1
+# Photos that must confirm a point for it to be measured.
+CONFIRMING_PHOTOS = 3
+# Largest standard deviation of a measured point in steps along the ray, of about a pixel: windows that match as well
+# farther on measure nothing, sky and blank walls above all.
+MAX_DEVIATION_PX = 1.2
+# Photos of one side that points are checked in at most, and the share of an object that a photo must show.
+MAX_PHOTOS, MIN_SHOWN_SHARE = 64, 0.02
+# How often a point that photos match nowhere near is tried again in photos of half the size.
 HALVINGS = 1
-"""How often a point that photos match nowhere near is tried again in photos of half the size."""
-SEEN_SHARE = 0.02
-"""A photo that has less of an object in its picture is not asked."""
+# Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
+# next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth.
 PEAK_FACTOR = 0.6
-"""Of how far the best match lies from a point: the point is off by a part of it, the match by the rest. This and the
-next two by the likelihood of the errors of the demo's house and sculpture, once aligned to the truth."""
+# Of a step: what is common to a point's matches, interpolation above all, and does not average out.
 PIXEL_ERROR = 0.07
-"""Of a step (about a pixel): what is common to a point's matches, interpolation above all, and does not average out."""
+# The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
+# beside each other their pixels.
 NOISE_FACTOR = 1.8
-"""The noise of a match is so many times what independent pixels would give: photos share the reference, and samples
-beside each other their pixels."""
 
 
 @dataclass(frozen=True)
@@ -103,39 +96,35 @@ def read_photos(workspace: Workspace, points: Array) -> Photos:
     shown = np.zeros((len(workspace.views), len(sample)), dtype=bool)
     for row, view in zip(shown, workspace.views):
         row[view.visible(sample)[0]] = True
-    asked = np.flatnonzero(shown.sum(1) > SEEN_SHARE * len(sample))
-    if len(asked) > MOST_PHOTOS:
-        print(f"{MOST_PHOTOS} of the {len(asked)} photos that show the object are asked", flush=True)
-        centres = np.array([workspace.views[k].centre for k in asked])
-        asked = asked[covering(shown[asked], centres, sample, MOST_PHOTOS)]
-    return pack([workspace.gray(workspace.views[k]) for k in asked])
+    rows = np.flatnonzero(shown.sum(1) > MIN_SHOWN_SHARE * len(sample))
+    if len(rows) > MAX_PHOTOS:
+        print(f"{MAX_PHOTOS} of the {len(rows)} photos that show the object are compared", flush=True)
+        centres = np.array([workspace.views[k].centre for k in rows])
+        rows = rows[covering(shown[rows], centres, sample, MAX_PHOTOS)]
+    return pack([workspace.gray(workspace.views[k]) for k in rows])
 
 
-def covering(shown: NDArray[np.bool_], centres: Array, points: Array, most: int) -> NDArray[np.int64]:
-    """Rows of photos, sorted: every point is in enough of them where it can be, from the most different directions.
+def covering(shown: NDArray[np.bool_], centres: Array, points: Array, count: int) -> NDArray[np.int64]:
+    """Rows of photos, sorted, that show every point where they can, from the most different directions.
+
+    The next photo is the one of the greatest worth: the points that it shows, each divided by the square of one more
+    than the chosen photos that show it, times two less the cosine to the nearest of their directions.
 
     Args:
         shown: (V, N), which photos have which points in their picture; each has one.
         centres: (V, 3) of the cameras.
         points: (N, 3).
-        most: how many photos to choose.
+        count: how many photos to choose.
     """
     directions = centres - (shown @ points) / shown.sum(1, keepdims=True)
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     chosen: list[int] = []
-    nearest, times = np.full(len(shown), -np.inf), np.zeros(len(points), dtype=np.int64)
-    while len(chosen) < min(most, len(shown)):
-        left = np.delete(np.arange(len(shown)), chosen)
-        lacking = next(
-            (times < many for many in ENOUGH if shown[left][:, times < many].any()), np.zeros(len(points), bool)
-        )
-        gain = (shown & lacking).sum(1)
-        gain[chosen] = -1
-        # Of photos that show about as much of what few have shown, the one from where none was taken.
-        worth = np.where(gain >= USEFUL * gain.max(), nearest, np.inf)
-        worth[chosen] = np.inf
-        chosen.append(int(worth.argmin()))
-        nearest = np.maximum(nearest, directions @ directions[chosen[-1]])
+    cosine, times = np.full(len(shown), -1.0), np.zeros(len(points))
+    while len(chosen) < min(count, len(shown)):
+        worth = shown @ (1 + times) ** -2 * (2 - cosine)
+        worth[chosen] = -1
+        chosen.append(int(worth.argmax()))
+        cosine = np.maximum(cosine, directions @ directions[chosen[-1]])
         times += shown[chosen[-1]]
     return np.sort(chosen)
 
@@ -177,15 +166,15 @@ class Matches:
 
     @property
     def measured(self) -> NDArray[np.bool_]:
-        """(N,) points that enough photos confirm, where a match says where they are: to MOST_DEVIATION."""
-        return (self.photos >= LEAST_PHOTOS) & (self.deviation <= MOST_DEVIATION * self.step)
+        """(N,) points that enough photos confirm, where a match says where they are: to MAX_DEVIATION_PX."""
+        return (self.photos >= CONFIRMING_PHOTOS) & (self.deviation <= MAX_DEVIATION_PX * self.step)
 
 
 def match_in(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Matches:
     """Match points (N, 3) with unit normals (N, 3), towards the photos, in photos of the same frame.
 
-    Where photos match nowhere along the ray, they are asked again at half their size: faint texture that noise or blur
-    hides in single pixels may show there, and less exactly.
+    Where photos match nowhere along the ray, they are compared again at half their size: faint texture that noise or
+    blur hides in single pixels may show there, and less exactly.
     """
     found = _match(points, normals, photos)
     for _ in range(HALVINGS):
@@ -207,11 +196,11 @@ def _match(points: Array, normals: NDArray[Any] | None, photos: Photos) -> Match
     curve, noise = np.full((count, 2 * OFFSETS + 1), -1.0), np.full(count, np.inf)
     tested, confirming = np.zeros(count, np.int64), np.zeros(count, np.int64)
     texture, step = np.zeros(count), np.zeros(count)
-    if count and len(photos.views) >= LEAST_PHOTOS:
+    if count and len(photos.views) >= CONFIRMING_PHOTOS:
         match_points(
             np.ascontiguousarray(points), np.ascontiguousarray(normals, dtype=np.float64), photos.pixels, photos.starts,
             photos.sizes, photos.projections, photos.centres, photos.rights, photos.focals,
-            curve, noise, tested, confirming, texture, step, MIN_MATCH, SLACK,
+            curve, noise, tested, confirming, texture, step, MIN_MATCH, MAX_DROP,
         )  # fmt: skip
     away = PEAK_FACTOR * _peak(curve) * step
     deviation = np.sqrt(away**2 + (PIXEL_ERROR * step) ** 2 + (NOISE_FACTOR * noise) ** 2)

@@ -16,7 +16,7 @@ from scenefuse.cloud.tiles.tiled_cloud import WHOLE
 from scenefuse.cloud.tiles.write_tiles import write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.votes import neighbours, vote
+from scenefuse.geometry.consistency import neighbours, vote
 from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.maps import read_depth, write_depth

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from scenefuse.geometry.votes import neighbours, vote
+from scenefuse.geometry.consistency import neighbours, vote
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.photos.workspace import View
 

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 from torch.nn import functional
 
-from scenefuse.geometry.matcher import FLAT, Matcher
+from scenefuse.geometry.matcher import NOISE_VARIANCE, Matcher
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.networks import depth_from_disparity, disparity_from_depth
 from scenefuse.nerf.prior.self_supervision import points_in_cam, warp
@@ -24,7 +24,7 @@ MEDIAN_PX = 5
 SWEEP_SOURCES, BEST_SOURCES = 4, 2
 # Windows this small hold little contrast: what the matcher allows for flat ones must not outweigh theirs, and the slow
 # changes of brightness are kept.
-SMALL_WINDOW_FLAT = FLAT / 16
+SMALL_WINDOW_FLAT = NOISE_VARIANCE / 16
 # Masks are widened by this window's radius before a depth may be outside them.
 HULL_PX = 5
 WHOLE = (slice(None), slice(None))
