@@ -1,22 +1,19 @@
 """The completed scene: all registered objects in one cloud, each point naming where it is from."""
 
 import time
-from dataclasses import dataclass, replace
-from itertools import chain
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, records_of, spacing
-from scenefuse.cloud.formats import LAS_DIMENSIONS
+from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.cloud.tiles.copc import write_copc
 from scenefuse.cloud.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
-from scenefuse.cloud.tiles.write_tiles import reserved
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.version import VERSION
-from scenefuse.fuse.changes import Changes, added_by, merged, read_changes, with_source
+from scenefuse.fuse.write import Changes, added_by, merged, read_changes, with_source, write_completed
 from scenefuse.photos.geodesy import scene_frame
 
 
@@ -90,7 +87,7 @@ def complete_scene(*, inputs: CompletionInputs, completed: Path, completed_copc:
 
 
 def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) -> dict[int, int]:
-    """Write the completed scene part by part: the scene's tiles in their order, then a tile for what each object adds.
+    """Write the completed scene: the scene's tiles in their order, then a tile for what each object adds.
 
     Returns the number of points of each `source`.
     """
@@ -100,36 +97,12 @@ def _write(scene: TiledCloud, changes: Changes, added: list[Cloud], path: Path) 
         raise StageError(f"of {scene.path} no point is left, and no object adds any: there is no scene to write")
     boxes = np.concatenate([scene.low, scene.high], axis=1)[left > 0]
     boxes = np.concatenate([boxes, *([[*cloud.points.min(0), *cloud.points.max(0)]] for cloud in added)])
-    table = np.zeros(len(boxes), ROW_OF_TILE)
-    table["count"] = [*left[left > 0], *map(len, added)]
+    tiles = np.zeros(len(boxes), ROW_OF_TILE)
+    tiles["count"] = [*left[left > 0], *map(len, added)]
     for name, values in zip(BOX, boxes.T):
-        table[name] = values
-    like = changes.left_of(np.zeros(0, np.int64), scene.like)
-    like = replace(like, fields=dict(sorted(like.fields.items())))
-    row = records_of(like, path).dtype
-    with reserved(path, row, int(table["count"].sum()), len(table)) as (file, _):
-        for cloud in chain((changes.left_of(*part) for part in scene.parts()), added):
-            records = records_of(_with_columns_of(like, cloud), path)
-            assert records.dtype == row
-            file.write(records.tobytes())
-        file.write(table.tobytes())
+        tiles[name] = values
+    write_completed(path, scene.like, scene.parts(), changes, added, int(tiles["count"].sum()), tiles)
     return {0: int(left.sum())} | {int(cloud.fields["source"][0]): len(cloud) for cloud in added}
-
-
-def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
-    """A cloud with only the columns that another has; normals and colours that only the object has are left out, and
-    classes and intensities that only the scene has are 0."""
-    return replace(
-        cloud,
-        normals=None if like.normals is None else cloud.normals,
-        colors=None if like.colors is None else cloud.colors,
-        fields={
-            name: np.zeros(len(cloud), values.dtype)
-            if name in LAS_DIMENSIONS and name not in cloud.fields
-            else cloud.fields[name]
-            for name, values in like.fields.items()
-        },
-    )
 
 
 def without_overlaps(clouds: list[Cloud]) -> list[Cloud]:

@@ -13,11 +13,12 @@ from scenefuse.cloud.tiles.tiled_cloud import AT_ONCE, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, rotation_between
-from scenefuse.fuse.changes import added_by, read_changes, together
-from scenefuse.fuse.evidence import around, with_normals
+from scenefuse.fuse.evidence import around
 from scenefuse.fuse.fuse_object import photos_of
+from scenefuse.fuse.measure import with_normals
 from scenefuse.fuse.missing import CLASSES, Missing, find_missing_surface
 from scenefuse.fuse.next_photos import CLEARANCE, UPWARDS, Plan, plan_stations, reach_of_stations
+from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
 from scenefuse.photos.geodesy import GridFrame, LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, with_mask

@@ -6,48 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.tiles.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
-from scenefuse.fuse.changes import FROM_OBJECT, FROM_SCENE, together, with_source
-from scenefuse.fuse.evidence import (
-    KEPT,
-    MEASURED,
-    NEAR,
-    NERF_ONLY,
-    REASONS,
-    REPLACED,
-    Side,
-    Weighed,
-    around,
-    unchecked,
-    weigh,
-    with_normals,
-    with_pose_uncertainty,
-)
-from scenefuse.fuse.modes import (
-    FEATHER_SPACINGS,
-    FILL_SPACINGS,
-    GAINS,
-    NEAR_SPACINGS,
-    FusionSettings,
-    feathered,
-    fuse_clouds,
-    thinned,
-    with_colors_of,
-)
+from scenefuse.fuse.evidence import NEAR, Checked, evidence_report, fuse_by_evidence
+from scenefuse.fuse.measure import NERF_ONLY, unchecked, with_normals, with_pose_uncertainty
+from scenefuse.fuse.modes import NEAR_SPACINGS, Fused, FusionSettings, color_notes, fuse_by_distance
+from scenefuse.fuse.write import FROM_OBJECT, FROM_SCENE, together, with_source
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.register.frame_ledger import frame_ledger
 from scenefuse.register.uncertainty import Uncertainty
-
-GREY = 128
-"""Of the points of an object without colours in a scene that has some."""
 
 
 @dataclass(frozen=True)
@@ -91,43 +64,6 @@ class FusionOutputs:
     """JSON, the frame ledger: every transform between the object's frames."""
 
 
-@dataclass(frozen=True)
-class Fused:
-    """A part of a scene with an object in it.
-
-    Attributes:
-        scene: its points with `photos`, `match`, `deviation`, `evidence`.
-        rows: (M,) of these points, those that were checked.
-        reason: (M,) uint8, KEPT or why the point is taken away.
-        added: the object's points that come in, with the same fields.
-        gain: (3,) colour gain of the object.
-        bias: (3,) colour bias, 0..255.
-        same_distance: distance within which both show the same place.
-        weighed: of `evidence`, else None.
-    """
-
-    scene: Cloud
-    rows: NDArray[np.int64]
-    reason: NDArray[np.uint8]
-    added: Cloud
-    gain: Array
-    bias: Array
-    same_distance: float
-    weighed: Weighed | None = None
-
-    @property
-    def removed(self) -> NDArray[np.int64]:
-        """(R,) rows of the points that are taken away."""
-        return self.rows[self.reason != KEPT]
-
-    @property
-    def kept(self) -> Cloud:
-        """The part of the scene without them."""
-        left = np.ones(len(self.scene), dtype=bool)
-        left[self.removed] = False
-        return self.scene[left]
-
-
 def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: FusionSettings) -> None:
     """Add a registered object to the scene (method F1 to F4); an unregistered one leaves the scene as it is.
 
@@ -149,34 +85,26 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     placed, step = is_placed(registration), spacing(part.points)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
     rows, scene = whole.near(*_region(obj, pose, crop_json, step))
+    checked: Checked | None = None
     if pose is None:
         print(f"the object is not fused: {value(registration, 'reason')}", flush=True)
         fused, notes = _unchanged(obj, scene), []
     elif settings.mode == "evidence":
-        fused = _by_evidence(obj, scene, pose, inputs, registration, settings)
+        fused, checked = _by_evidence(obj, scene, pose, inputs, registration, settings)
+        notes, pose = checked.notes + notes, checked.settled @ pose
     else:
         fused = fuse_by_distance(obj, scene, part, pose, settings)
-    if scene.colors is not None and obj.colors is None:
-        notes.append("the object has no colours: its points are grey in the scene")
-        grey = np.full((len(fused.added), 3), GREY, np.uint8)
-        fused = replace(fused, added=replace(fused.added, colors=grey))
-    if np.isin(fused.gain, GAINS).any():
-        notes.append(
-            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
-            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
-            " fusion.match_colors: false leaves them as they are"
-        )
+    fused, of_colors = color_notes(fused, obj, scene)
+    notes += of_colors
     for note in notes:
         print(note, flush=True)
     _write(fused, rows, crop_json, outputs)
     unit = length_unit(inputs.georeference_json)
-    write_json(outputs.evidence, evidence_report(fused, unit))
-    if pose is not None and fused.weighed is not None:
-        pose = fused.weighed.settled @ pose
-    content = _report(fused, registration, len(whole), step, unit) | {
+    write_json(outputs.evidence, evidence_report(fused, checked, unit))
+    content = _report(fused, checked, registration, len(whole), step, unit) | {
         "scene_from_object": quantity(None if pose is None else pose.matrix, unit),
         "mode": quantity(settings.mode, ""),
-        "notes": quantity(([] if fused.weighed is None else list(fused.weighed.notes)) + notes, ""),
+        "notes": quantity(notes, ""),
         "object_points": quantity(len(obj), "points"),
         "seconds": quantity(time.perf_counter() - start, "s"),
     }
@@ -199,16 +127,16 @@ def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: floa
 
 def _by_evidence(
     obj: Cloud, scene: Cloud, pose: Sim3, inputs: FusionInputs, registration: dict[str, Any], settings: FusionSettings
-) -> Fused:
+) -> tuple[Fused, Checked]:
     """`fuse_by_evidence` of an object in its own frame, with what its pose adds to the deviations."""
     placed = obj.transformed(pose)
     photos = photos_of(inputs.object_workspace, obj.points, pose), photos_of(inputs.scene_workspace, placed.points)
-    fused = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
+    fused, checked = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
     covariance = value(registration, "covariance") if "covariance" in registration else None
-    if covariance is None:
-        return fused
-    added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
-    return replace(fused, added=added)
+    if covariance is not None:
+        added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
+        fused = replace(fused, added=added)
+    return fused, checked
 
 
 def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
@@ -240,49 +168,6 @@ def uncertainty_on_scene(registration: dict[str, Any]) -> Uncertainty | None:
     return None if covariance is None else Uncertainty.of(np.array(covariance))
 
 
-def fuse_by_evidence(
-    obj: Cloud,
-    scene: Cloud,
-    of_obj: Photos,
-    of_scene: Photos,
-    settings: FusionSettings,
-    uncertainty: Uncertainty | None = None,
-) -> Fused:
-    """Fuse by what photos know of the points of both sides; see `weigh`.
-
-    Args:
-        obj: the object in the scene's frame, registered.
-        scene: the scene around it, or all of it.
-        of_obj: the object's photos in the scene's frame.
-        of_scene: the scene's photos that see the object.
-        settings: see FusionSettings.
-        uncertainty: of the object's pose on the scene, where it is known.
-    """
-    certain = None if uncertainty is None else uncertainty.size(obj.diagonal)
-    rows = np.flatnonzero(around(scene, obj))
-    near = scene[rows]
-    weighed = weigh(Side(obj, of_obj), Side(near, of_scene), settings.nerf_only, certain)
-    step = spacing(near.points)
-    moved, gain, bias = with_colors_of(weighed.obj, near, FILL_SPACINGS * step, settings.match_colors)
-    added = thinned(moved[weighed.added], settings.density * step)
-    if len(near):
-        kept = near[weighed.reason == KEPT]
-        added = feathered(added, kept, FEATHER_SPACINGS * step, FILL_SPACINGS * step)
-    whole = unchecked(scene)
-    for name, values in whole.fields.items():
-        values[rows] = weighed.scene.fields[name]
-    return Fused(whole, rows, weighed.reason, added, gain, bias, FILL_SPACINGS * step, weighed)
-
-
-def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings: FusionSettings) -> Fused:
-    """Fuse without asking photos; see `fuse_clouds`."""
-    fusion = fuse_clouds(obj, scene, part, pose, settings)
-    rows = np.flatnonzero(~fusion.kept)
-    reason = np.full(len(rows), REPLACED, np.uint8)
-    added = unchecked(fusion.added)
-    return Fused(unchecked(scene), rows, reason, added, fusion.gain, fusion.bias, fusion.fill_distance)
-
-
 def _unchanged(obj: Cloud, scene: Cloud) -> Fused:
     """The scene as it is, with nothing of the object."""
     nothing = unchecked(obj[np.zeros(len(obj), dtype=bool)])
@@ -308,11 +193,16 @@ def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionO
 
 
 def _report(
-    fused: Fused, registration: dict[str, Any], scene_points: int, scene_spacing: float, unit: str
+    fused: Fused,
+    checked: Checked | None,
+    registration: dict[str, Any],
+    scene_points: int,
+    scene_spacing: float,
+    unit: str,
 ) -> dict[str, Any]:
     """What was added and taken away, with units."""
-    added, weighed = fused.added, fused.weighed
-    unconfirmed = None if weighed is None else int((weighed.obj.fields["evidence"] == NERF_ONLY).sum())
+    added = fused.added
+    unconfirmed = None if checked is None else int((checked.obj.fields["evidence"] == NERF_ONLY).sum())
     return {
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
         "registration": quantity(value(registration, "status"), ""),
@@ -324,56 +214,11 @@ def _report(
         "nerf_only_points": quantity(unconfirmed, "points"),
         "scene_spacing": quantity(scene_spacing, unit),
         "added_spacing": quantity(spacing(added.points) if len(added) > 10 else None, unit),
-        "settled_by": quantity(None if weighed is None else weighed.moved, "diagonals"),
+        "settled_by": quantity(None if checked is None else checked.moved, "diagonals"),
         "fill_distance": quantity(fused.same_distance, unit),
         "color_gain": quantity(fused.gain, "1"),
         "color_bias": quantity(fused.bias, "of 255"),
     }
-
-
-def evidence_report(fused: Fused, unit: str) -> dict[str, Any]:
-    """What photos say of both sides' points; without `evidence`, only what was taken away.
-
-    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added, better in the scene, or
-    contradicted. Of the others, `object_unasked` lie where fewer than three photos could be compared. `added_photos`
-    says how many photos confirm the measured points that were added.
-    """
-    removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
-    content = {"scene_removed": quantity(removed, "points")}
-    weighed = fused.weighed
-    if weighed is None:
-        return content | {"notes": quantity(["no photo was asked"], "")}
-    kinds, left = weighed.obj.fields["evidence"], weighed.reason == KEPT
-    measured, of_scene = kinds == MEASURED, weighed.scene.fields["evidence"] == MEASURED
-    middle = float(np.median(weighed.obj.fields["deviation"][measured])) if measured.any() else None
-    return content | {
-        "object_points": quantity(len(kinds), "points"),
-        "object_measured": quantity(int(measured.sum()), "points"),
-        "object_nerf_only": quantity(int((kinds == NERF_ONLY).sum()), "points"),
-        "object_contradicted": quantity(int(weighed.contradicted.sum()), "points"),
-        "object_measured_contradicted": quantity(int((measured & weighed.contradicted).sum()), "points"),
-        "object_better_in_scene": quantity(int((measured & ~weighed.contradicted & ~weighed.added).sum()), "points"),
-        "object_added": quantity(int(weighed.added.sum()), "points"),
-        "deviation_median": quantity(middle, unit),
-        "object_measured_share": quantity(float(measured.mean()) if len(measured) else None, "1"),
-        "object_unasked": quantity(int((~measured & np.isnan(weighed.obj.fields["match"])).sum()), "points"),
-        "added_photos": quantity(_quantiles(weighed.obj.fields["photos"][weighed.added & measured]), "photos"),
-        "scene_checked": quantity(len(left), "points"),
-        "scene_measured": quantity(int(of_scene.sum()), "points"),
-        "scene_stereo_only": quantity(int((~of_scene).sum()), "points"),
-        "scene_kept": quantity(int(left.sum()), "points"),
-        "scene_kept_measured": quantity(int((left & of_scene).sum()), "points"),
-        "settled_by": quantity(weighed.moved, "diagonals"),
-        "notes": quantity(list(weighed.notes), ""),
-    }
-
-
-def _quantiles(values: NDArray[Any]) -> dict[str, float] | None:
-    """Least, median and largest of (N,) values, and the twentieth from below."""
-    if not len(values):
-        return None
-    places = {"least": 0.0, "5 %": 0.05, "median": 0.5, "largest": 1.0}
-    return {name: float(np.quantile(values, place, method="lower")) for name, place in places.items()}
 
 
 def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:

@@ -14,7 +14,8 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.photo_check import LEAST_PHOTOS, Photos, match_in
+from scenefuse.fuse.compare import MARGIN, THROUGH_PHOTOS
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
 from scenefuse.geometry.visibility import see, shown_in
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.photos.workspace import View
@@ -26,29 +27,23 @@ CLASSES = {
     UNTEXTURED: "untextured",
     CONTRADICTED: "contradicted",
 }
-CELLS = 100
-"""Cells along the object's diagonal."""
-COVERED = 1.5
-"""A cell is covered by points of the completed scene within so many sides of it."""
-MARGIN = 0.01
-"""Share of the diagonal that a place must lie before or behind a surface to be seen through or hidden."""
-LEAST_THROUGH = 2
-"""Photos that must see through a place for it to be empty."""
-OFF_MASK = 0.1
-"""Share of the photos that may have a place of the hull outside their mask: masks err."""
-IN_SIGHT = 0.2
-"""Share of the photos with a place in their picture that must see it for it to be empty off the masks."""
-LEAST_CELLS = 12
-"""Cells beside each other that count: smaller spots are between points, not missing."""
-LEAST_TEXTURE = 4.0
-"""Standard deviation of a patch, in grey levels, below which its matches say nothing."""
+# Cells along the object's diagonal; so many around its points are looked at too.
+CELLS, BORDER_CELLS = 100, 3
+# A cell is covered by points of the completed scene within so many sides of it.
+COVERED_SIDES = 1.5
+# Share of the photos that may have a place of the hull outside their mask: masks err.
+MAX_OFF_MASK = 0.1
+# Share of the photos with a place in their picture that must see it for it to be empty off the masks.
+MIN_IN_SIGHT = 0.2
+# Cells beside each other that count: smaller spots are between points, not missing.
+MIN_SPOT_CELLS = 12
+# Standard deviation of a patch, in grey levels, below which its matches say nothing.
+MIN_TEXTURE = 4.0
+# Quantile of the distances between a surface's points that depth buffers go by: sparse parts have no holes then.
 SPARSEST = 0.9
-"""Quantile of the distances between a surface's points that depth buffers go by: sparse parts have no holes then."""
-REACH = 0.2
-"""Share of the diagonal within which a missing cell has a point of the object: what is seen past a wall without points
-is not its back."""
-BORDER = 3
-"""Cells around the object's points that are looked at too."""
+# Share of the diagonal within which a missing cell has a point of the object: what is seen past a wall without points
+# is not its back.
+MAX_FROM_OBJECT = 0.2
 
 Grid = NDArray[np.bool_]
 
@@ -93,9 +88,9 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     views = photos[0].views + photos[1].views
     surface = _plain(voxel_downsample(completed, side / 2))
     step = spacing(surface.points, quantile=SPARSEST)
-    apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > COVERED * side
+    apart = cKDTree(surface.points).query(obj.points, workers=threads())[0] > COVERED_SIDES * side
     loose = _plain(obj[apart])
-    through = see(loose.points, surface, views, step, margin).through >= LEAST_THROUGH
+    through = see(loose.points, surface, views, step, margin).through >= THROUGH_PHOTOS
     through |= _off_masks(loose.points, masks)
     loose = loose[~through]
     if len(loose):
@@ -105,7 +100,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     towards = np.zeros((*grid.shape, 3), np.float32)
     if masks:
         edge, towards = _frontier(grid, surface, views, masks, step, margin)
-        edge &= grid.within(obj.points, REACH * obj.diagonal)
+        edge &= grid.within(obj.points, MAX_FROM_OBJECT * obj.diagonal)
     found = _in_spots(supposed | edge)
     centres, normals = grid.middle(found), towards[found]
     own = supposed[found]
@@ -115,7 +110,7 @@ def find_missing_surface(obj: Cloud, completed: Cloud, photos: tuple[Photos, Pho
     cells = Cloud(centres, normals)
     cells.fields["missing"] = _classes(cells, surface, photos, step, margin)
     few = f"{len(masks)} masks: what they do not frame is unknown, only points of the object's own cloud are looked at"
-    notes = (few,) if len(masks) < LEAST_PHOTOS else ()
+    notes = (few,) if len(masks) < CONFIRMING_PHOTOS else ()
     return Missing(cells, side, int(grid.hold(obj.points[~apart]).sum()), int(through.sum()), notes)
 
 
@@ -124,8 +119,8 @@ class _Cells:
 
     def __init__(self, points: Array, side: float):
         self.side = side
-        self.low = points.min(0) - BORDER * side
-        self.shape = tuple(np.ceil((np.ptp(points, axis=0)) / side).astype(int) + 2 * BORDER)
+        self.low = points.min(0) - BORDER_CELLS * side
+        self.shape = tuple(np.ceil((np.ptp(points, axis=0)) / side).astype(int) + 2 * BORDER_CELLS)
 
     @property
     def centres(self) -> Array:
@@ -163,12 +158,12 @@ def _frontier(
     """Cells of unknown space that border on empty space, and for every cell the direction towards empty space."""
     centres = grid.centres
     shown, off, *_ = count_silhouettes(centres, map(Outline, masks))
-    in_hull = (shown >= LEAST_PHOTOS) & (off <= OFF_MASK * shown)
+    in_hull = (shown >= CONFIRMING_PHOTOS) & (off <= MAX_OFF_MASK * shown)
     seen = see(centres, surface, views, step, margin)
     # Off the masks nothing of the object is, where photos see the place at all; below the ground few do, through gaps.
-    in_sight = seen.in_view - seen.hidden >= np.maximum(LEAST_THROUGH, IN_SIGHT * seen.in_view)
-    empty = (seen.through >= LEAST_THROUGH) | (~in_hull & in_sight)
-    bare = ~grid.within(surface.points, COVERED * grid.side)
+    in_sight = seen.in_view - seen.hidden >= np.maximum(THROUGH_PHOTOS, MIN_IN_SIGHT * seen.in_view)
+    empty = (seen.through >= THROUGH_PHOTOS) | (~in_hull & in_sight)
+    bare = ~grid.within(surface.points, COVERED_SIDES * grid.side)
     free = empty.reshape(grid.shape) & bare
     unknown = (in_hull & ~empty).reshape(grid.shape) & bare
     edge = unknown & ndimage.binary_dilation(free)
@@ -179,7 +174,7 @@ def _frontier(
 def _off_masks(points: Array, masks: list[View]) -> NDArray[np.bool_]:
     """(N,) points that three photos have in their frame, and too many of these outside the mask."""
     shown, off, *_ = count_silhouettes(points, map(Outline, masks))
-    return np.asarray((shown >= LEAST_PHOTOS) & (off > OFF_MASK * shown))
+    return np.asarray((shown >= CONFIRMING_PHOTOS) & (off > MAX_OFF_MASK * shown))
 
 
 def _in_spots(missing: Grid) -> Grid:
@@ -189,7 +184,7 @@ def _in_spots(missing: Grid) -> Grid:
         return missing
     sizes = np.bincount(labels.ravel())
     sizes[0] = 0
-    return np.asarray(sizes[labels] >= LEAST_CELLS)
+    return np.asarray(sizes[labels] >= MIN_SPOT_CELLS)
 
 
 def _classes(
@@ -206,8 +201,8 @@ def _classes(
         # Photos from nearly the same place say nothing of a point's place: they are not tested.
         seen = np.maximum(seen, np.minimum(shown, matches.tested + 1))
         texture = np.maximum(texture, matches.texture)
-    kinds = np.where(texture < LEAST_TEXTURE, UNTEXTURED, CONTRADICTED)
-    return np.where(seen < LEAST_PHOTOS, NEVER_SEEN, kinds).astype(np.uint8)
+    kinds = np.where(texture < MIN_TEXTURE, UNTEXTURED, CONTRADICTED)
+    return np.where(seen < CONFIRMING_PHOTOS, NEVER_SEEN, kinds).astype(np.uint8)
 
 
 def _plain(cloud: Cloud) -> Cloud:

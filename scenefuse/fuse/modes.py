@@ -1,4 +1,4 @@
-"""How an object comes into a scene: the settings, the modes for comparison, and colours that follow the scene's."""
+"""How an object comes into a scene: the settings, fusion by distances alone, colours that follow the scene's (F1)."""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -10,20 +10,19 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.fuse.compare import KEPT, REPLACED
+from scenefuse.fuse.measure import FIELDS, unchecked
+from scenefuse.fuse.write import Changes, Rows
 
-FILL_SPACINGS = 1.5
-"""Points farther than so many spacings of the scene from all of its points are new to it."""
-GAINS = (0.5, 2.0)
-"""Least and largest gain of an object's colours."""
-FILL_RESIDUALS = 1.5
-"""Points are new at no less than this many median distances between the clouds where both exist, so that noise does not
-add a second layer."""
+# Points farther than so many spacings of the scene from all of its points are new to it, or so many median distances
+# between the clouds where both exist, if that is more: noise does not add a second layer.
+FILL_SPACINGS, FILL_RESIDUALS = 1.5, 1.5
+# Least and largest gain of an object's colours, and pairs of points that it is computed from at least.
+GAINS, MIN_PAIRS = (0.5, 2.0), 50
+# Points of the scene within so many of its spacings of the object's box are compared with it.
 NEAR_SPACINGS = 10.0
-"""Points of the scene within so many of its spacings of the object's box are held against it."""
-FEATHER_SPACINGS = 4.0
-"""Width of the seam over which colours blend, in spacings of the scene."""
-LEAST_PAIRS = 50
-"""Pairs of points that a gain and bias of colours need."""
+# Width of the seam over which colours blend, in spacings of the scene.
+SEAM_SPACINGS = 4.0
 
 
 @dataclass(frozen=True)
@@ -43,58 +42,89 @@ class FusionSettings:
 
 
 @dataclass(frozen=True)
-class Fusion:
-    """The parts of a fused scene.
+class Fused:
+    """A part of a scene with an object in it.
 
     Attributes:
-        kept: (N,) bool over the scene's points.
-        added: new points in the scene frame.
+        scene: its points with the fields of evidence.
+        rows: (M,) rising, of these points, those that were checked.
+        reason: (M,) uint8, KEPT or why the point is taken away.
+        added: the object's points that come in, with the same fields.
         gain: (3,) colour gain of the object.
         bias: (3,) colour bias, 0..255.
-        fill_distance: distance from the scene within which both show the same place.
+        same_distance: distance within which both show the same place.
     """
 
-    kept: NDArray[np.bool_]
+    scene: Cloud
+    rows: Rows
+    reason: NDArray[np.uint8]
     added: Cloud
     gain: Array
     bias: Array
-    fill_distance: float
+    same_distance: float
+
+    @property
+    def removed(self) -> Rows:
+        """(R,) rows of the points that are taken away."""
+        return self.rows[self.reason != KEPT]
+
+    @property
+    def kept(self) -> Cloud:
+        """The part of the scene without them."""
+        return self.scene[np.delete(np.arange(len(self.scene)), self.removed)]
+
+    def changes(self, rows: Rows) -> Changes:
+        """What changes in a scene's cloud that has the part's points in these rows (N,)."""
+        fields = {name: self.scene.fields[name][self.rows] for name in FIELDS}
+        return Changes(rows[self.rows], self.reason != KEPT, fields)
 
 
-def fuse_clouds(obj: Cloud, scene: Cloud, part: Cloud, scene_from_object: Sim3, settings: FusionSettings) -> Fusion:
+def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings: FusionSettings) -> Fused:
     """Decide what is added and what is taken away by distances alone: `fill`, `append` and `replace` (method F1).
 
     Args:
         obj: the object in its own frame.
         scene: the scene around it, or all of it.
         part: the scene's points on the object.
-        scene_from_object: the registration.
+        pose: scene_from_object of the registration.
         settings: see FusionSettings.
     """
-    moved = obj.transformed(scene_from_object)
-    step = spacing(part.points)
-    near = np.flatnonzero(_near(scene, moved, NEAR_SPACINGS * step))
+    moved, step = obj.transformed(pose), spacing(part.points)
+    low, high = moved.points.min(0) - NEAR_SPACINGS * step, moved.points.max(0) + NEAR_SPACINGS * step
+    near = np.flatnonzero(((scene.points >= low) & (scene.points <= high)).all(1))
     near = near if len(near) else np.arange(len(scene))
     distance = cKDTree(scene.points[near]).query(moved.points, workers=threads())[0]
     fill = FILL_SPACINGS * step
     overlap = distance <= 3 * fill
-    if overlap.sum() > LEAST_PAIRS:
+    if overlap.sum() > MIN_PAIRS:
         fill = max(fill, FILL_RESIDUALS * float(np.median(distance[overlap])))
     moved, gain, bias = with_colors_of(moved, scene[near], fill, settings.match_colors)
-    kept = np.ones(len(scene), dtype=bool)
+    removed = near[:0]
     if settings.mode == "fill":
         moved = moved[distance > fill]
     elif settings.mode == "replace":
-        kept[near] = cKDTree(moved.points).query(scene.points[near], workers=threads())[0] > fill
+        removed = near[cKDTree(moved.points).query(scene.points[near], workers=threads())[0] <= fill]
     added = thinned(moved, settings.density * step)
     if settings.mode != "append":
-        added = feathered(added, scene[near[kept[near]]], FEATHER_SPACINGS * step, fill)
-    return Fusion(kept, added, gain, bias, fill)
+        added = feathered(added, scene[np.setdiff1d(near, removed)], SEAM_SPACINGS * step, fill)
+    reason = np.full(len(removed), REPLACED, np.uint8)
+    return Fused(unchecked(scene), removed, reason, unchecked(added), gain, bias, fill)
 
 
-def _near(scene: Cloud, obj: Cloud, reach: float) -> NDArray[np.bool_]:
-    low, high = obj.points.min(0) - reach, obj.points.max(0) + reach
-    return ((scene.points >= low) & (scene.points <= high)).all(1)
+def color_notes(fused: Fused, obj: Cloud, scene: Cloud) -> tuple[Fused, list[str]]:
+    """The fusion, added points grey where only the scene has colours, and what a user should know of the colours."""
+    notes = []
+    if scene.colors is not None and obj.colors is None:
+        notes.append("the object has no colours: its points are grey in the scene")
+        grey = np.full((len(fused.added), 3), 128, np.uint8)
+        fused = replace(fused, added=replace(fused.added, colors=grey))
+    if np.isin(fused.gain, GAINS).any():
+        notes.append(
+            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
+            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
+            " fusion.match_colors: false leaves them as they are"
+        )
+    return fused, notes
 
 
 def with_colors_of(obj: Cloud, scene: Cloud, reach: float, wanted: bool) -> tuple[Cloud, Array, Array]:
@@ -104,14 +134,14 @@ def with_colors_of(obj: Cloud, scene: Cloud, reach: float, wanted: bool) -> tupl
         return obj, gain, bias
     distance, partner = cKDTree(scene.points).query(obj.points, distance_upper_bound=reach, workers=threads())
     close = np.isfinite(distance)
-    if close.sum() < LEAST_PAIRS:
+    if close.sum() < MIN_PAIRS:
         return obj, gain, bias
     gain, bias = match_colors(obj.colors[close], scene.colors[partner[close]])
     return replace(obj, colors=_bytes(obj.colors * gain + bias)), gain, bias
 
 
 def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
-    """Gain and bias (3,) per channel with gain a + bias = b, from medians and median deviations of pairs (M, 3)."""
+    """Gain and bias (3,) per channel with gain a + bias = b, from pairs (M, 3): medians and mean deviations."""
     mine, theirs = a.astype(np.float64), b.astype(np.float64)
     middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
     wide_a = np.abs(mine - middle_a).mean(0)

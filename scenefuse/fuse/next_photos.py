@@ -17,24 +17,20 @@ from scenefuse.fuse.missing import CONTRADICTED, SPARSEST, UNTEXTURED, Missing
 from scenefuse.geometry.visibility import shown_in
 from scenefuse.photos.workspace import View
 
-DIRECTIONS = 120
-"""Directions that are tried, spread evenly over a sphere around the object."""
-DISTANCES = (0.7, 1.0, 1.4)
-"""In distances of the close-ups that there are."""
-LOWEST_DEG = -25.0
-"""Cameras farther below the object's middle are left out."""
+# Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its
+# close-ups; cameras farther below the object's middle are left out.
+DIRECTIONS, DISTANCES, MIN_ELEVATION_DEG = 120, (0.7, 1.0, 1.4), -25.0
+# Share of the object's diagonal that a camera stays away from the ground and everything else.
 CLEARANCE = 0.05
-"""Share of the object's diagonal that a camera stays away from the ground and everything else."""
-SIDESTEP_DEG = 10.0
-"""Between the three photos of a station, so that they locate what they show."""
-BESIDE = 0.6
-"""What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight."""
-SAME_DEG = 15.0
-"""A photo from nearer to the direction of one that there is shows contradicted surface no better."""
-MOST_STATIONS = 6
+# Between the three photos of a station, so that they locate what they show.
+STATION_ANGLE_DEG = 10.0
+# What is nearer to the object's middle than so many diagonals hides by depth buffers, the rest by lines of sight.
+BESIDE_DIAGONALS = 0.6
+# A photo from nearer to the direction of one that there is shows contradicted surface no better.
+MIN_NEW_ANGLE_DEG = 15.0
+# Stations at most, and the share of what is missing that one must add.
+MAX_STATIONS, MIN_GAIN = 6, 0.05
 UPWARDS = np.array([0.0, 0.0, 1.0])
-LEAST_GAIN = 0.05
-"""Share of what is missing that a station must add."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +77,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         return Plan([], 0.0)
     middle, distance = _close_ups_from(obj, close_ups)
     apart = np.linalg.norm(around.points - middle, axis=1)
-    beside = apart < BESIDE * obj.diagonal
+    beside = apart < BESIDE_DIAGONALS * obj.diagonal
     if not beside.any():
         return Plan([], 0.0)
     assert around.normals is not None
@@ -94,15 +90,15 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
     photos = [_photos_from(place, middle, lens, up) for place in _around(middle, distance, up)]
     free = _Free(others.points, middle, obj.diagonal, up)
     photos = [three for three in photos if free.ways(np.array([photo.centre for photo in three]))]
-    # What the middle photo shows is the most that all three do; these are asked only where it decides (Minoux 1978).
+    # What the middle photo shows is the most that all three do; these are tested only where it decides (Minoux 1978).
     shown = np.array([_shown_in_all(three[1:2], cells, obstacles, step, missing.side) for three in photos])
     shown = shown.reshape(len(photos), len(cells)).astype(bool)
     shown &= ~_tried(photos, cells, close_ups, obstacles, step, missing.side)
     exact, left, stations = np.zeros(len(photos), dtype=bool), np.ones(len(cells), dtype=bool), list[Station]()
-    while len(stations) < MOST_STATIONS and len(photos):
+    while len(stations) < MAX_STATIONS and len(photos):
         gains = (shown & left).sum(1)
         best = int(gains.argmax())
-        if gains[best] < max(1.0, LEAST_GAIN * len(cells)):
+        if gains[best] < max(1.0, MIN_GAIN * len(cells)):
             break
         if not exact[best]:
             shown[best] &= _shown_in_all(photos[best], cells, obstacles, step, missing.side)
@@ -130,7 +126,7 @@ def _around(middle: Array, distance: float, up: Array) -> Array:
     height, turn = 1 - 2 * number / DIRECTIONS, np.pi * (1 + np.sqrt(5)) * number
     flat = np.sqrt(1 - height**2)
     directions = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-    directions = directions[height > np.sin(np.radians(LOWEST_DEG))] @ rotation_between(UPWARDS, up).T
+    directions = directions[height > np.sin(np.radians(MIN_ELEVATION_DEG))] @ rotation_between(UPWARDS, up).T
     return np.concatenate([middle + factor * distance * directions for factor in sorted(DISTANCES)])
 
 
@@ -149,7 +145,7 @@ class _Free:
         if (at[:, 2] < self.level[self.below.query(at[:, :2])[1], 2] + self.clearance).any():
             return False
         ahead = self.middle - eyes
-        ends = np.maximum(0, 1 - BESIDE * self.diagonal / np.linalg.norm(ahead, axis=1))
+        ends = np.maximum(0, 1 - BESIDE_DIAGONALS * self.diagonal / np.linalg.norm(ahead, axis=1))
         steps = np.linspace(0, 1, 60)[:, None, None] * ends[:, None]
         return bool((self.near.query((eyes + steps * ahead).reshape(-1, 3))[0] > self.clearance).all())
 
@@ -160,7 +156,7 @@ def _photos_from(place: Array, middle: Array, lens: View, up: Array) -> list[Vie
     axis = up - (up @ away) / (away @ away) * away
     axis /= np.linalg.norm(axis)
     photos = []
-    for number, angle in enumerate(np.radians(SIDESTEP_DEG) * np.array([-1, 0, 1]), 1):
+    for number, angle in enumerate(np.radians(STATION_ANGLE_DEG) * np.array([-1, 0, 1]), 1):
         eye = middle + np.cos(angle) * away + np.sin(angle) * np.cross(axis, away)
         pose = np.eye(4)
         pose[:3, :3] = look_at(eye, middle, up)
@@ -182,7 +178,7 @@ def _tried(
     toward = np.array([_directions(part.points, three[1].centre) for three in photos]).reshape(-1, len(rows), 3)
     for view in close_ups:
         known = shown_in(part.points, part.normals, obstacles, view, step, margin)
-        beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(np.radians(SAME_DEG))
+        beside = (toward * _directions(part.points, view.centre)).sum(2) > np.cos(np.radians(MIN_NEW_ANGLE_DEG))
         tried[:, rows] |= beside & known
     return tried
 

@@ -11,7 +11,7 @@ from scenefuse.cloud.tiles.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, setting, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.demo.cameras import read_cameras as read_true_cameras
-from scenefuse.fuse.changes import after_fusion
+from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics.object_truth import (
     MARGIN,

@@ -10,7 +10,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.cloud.tiles.tiled_cloud import open_cloud
 from scenefuse.core.stage import atomic_directory, read_json
 from scenefuse.core.transforms import Array, box_corners
-from scenefuse.fuse.evidence import NERF_ONLY
+from scenefuse.fuse.measure import NERF_ONLY
 from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.photos.workspace import read_views

@@ -11,8 +11,8 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.cloud.tiles.tiled_cloud import open_cloud
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
-from scenefuse.fuse.changes import after_fusion
 from scenefuse.fuse.fuse_object import is_placed
+from scenefuse.fuse.write import after_fusion
 from scenefuse.report.object_sheet import inner
 from scenefuse.report.values import find, flatten, load, number, unit_of
 

@@ -3,7 +3,7 @@
 import copy
 import time
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, records_of, spacing
+from scenefuse.cloud.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, spacing
 from scenefuse.cloud.formats import las_crs
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.columns import COLOR
 from scenefuse.cloud.tiles.tiled_cloud import Rows
-from scenefuse.cloud.tiles.write_tiles import reserved
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, scratch_directory, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
-from scenefuse.fuse.changes import FROM_OBJECT, FROM_SCENE, with_source
-from scenefuse.fuse.evidence import FIELDS, unchecked, with_normals
-from scenefuse.fuse.fuse_object import GREY, possible
-from scenefuse.fuse.modes import NEAR_SPACINGS, FusionSettings, fuse_clouds
+from scenefuse.fuse.fuse_object import possible
+from scenefuse.fuse.measure import unchecked, with_normals
+from scenefuse.fuse.modes import NEAR_SPACINGS, FusionSettings, color_notes, fuse_by_distance
+from scenefuse.fuse.write import (
+    FROM_OBJECT,
+    FROM_SCENE,
+    Changes,
+    together,
+    was_completed,
+    with_source,
+    write_completed,
+)
 
 FILES = ("completed.ply", "completed.laz", "completed.json")
 CHUNK = 1_000_000
@@ -32,8 +39,6 @@ CHUNK = 1_000_000
 AXES = ("X", "Y", "Z")
 MOST = np.iinfo(np.int32).max
 """Integers of a LAS file's coordinates, and the greatest of them."""
-OWN = {*FIELDS, "source"}
-"""Fields of a completed scene; one that is completed again keeps them, and its numbers in `source` go on."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +46,9 @@ class Completed:
     """A scene with an object in it.
 
     Attributes:
-        near: the scene's points around the object, before.
-        kept: (N,) of these that stay.
-        gone: (R,) rising: rows of the scene's file that are taken away.
+        before, after: the scene around the object, and the same with what came in.
+        removed: (R,) rising: rows of the scene's file that are taken away.
+        changes: to the scene's file.
         added: the object's points that come in, in the scene's coordinates, with `source` and the fields of evidence
             (method F4), not checked.
         source: their `source`; 1, or the next number of a scene that was completed before.
@@ -53,9 +58,10 @@ class Completed:
         seconds: that it took.
     """
 
-    near: Cloud
-    kept: NDArray[np.bool_]
-    gone: Rows
+    before: Cloud
+    after: Cloud
+    removed: Rows
+    changes: Changes
     added: Cloud
     source: int
     fill_distance: float
@@ -87,27 +93,25 @@ def complete(
         obj = with_normals(obj)
     moved, reach = scene_from_object.apply(obj.points), max(NEAR_SPACINGS * spacing(scene.part.points), around)
     rows, near = scene.near(moved.min(0) - reach, moved.max(0) + reach)
-    fusion = fuse_clouds(obj, near, scene.part if scene.every == 1 else near, scene_from_object, settings)
-    source = scene.last + 1 if _again(near) else FROM_OBJECT
-    added = with_source(unchecked(fusion.added), source)
-    if near.colors is not None and obj.colors is None:
-        notes.append("the object has no colours: its points are grey in the scene")
-        added = replace(added, colors=np.full((len(added), 3), GREY, np.uint8))
+    fused = fuse_by_distance(obj, near, scene.part if scene.every == 1 else near, scene_from_object, settings)
+    fused, of_colors = color_notes(fused, obj, near)
+    notes += of_colors
     if near.colors is None and obj.colors is not None:
         notes.append("the scene has no colours: the completed scene leaves out the object's, object_in_scene has them")
-    left_out = sorted({*near.fields, *obj.fields} - (OWN if _again(near) else set()))
+    known = set(fused.added.fields) | {"source"} if was_completed(near) else set()
+    left_out = sorted({*near.fields, *obj.fields} - known)
     if left_out:
         notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
-    gone, seconds = rows[~fusion.kept], time.perf_counter() - start
-    return Completed(near, fusion.kept, gone, added, source, fusion.fill_distance, settings.mode, notes, seconds)
+    source = scene.last + 1 if was_completed(near) else FROM_OBJECT
+    changes, added = fused.changes(rows), with_source(fused.added, source)
+    after = together(changes.left_of(rows, near), added)
+    return Completed(
+        near, after, rows[fused.removed], changes, added, source, fused.same_distance, settings.mode, notes,
+        time.perf_counter() - start,
+    )  # fmt: skip
 
 
-def _again(scene: Cloud) -> bool:
-    """Whether a scene was completed before."""
-    return set(scene.fields) >= OWN
-
-
-def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) -> list[Path]:
+def write_files(out: Path, done: Completed, object: Path, scene: CloudFile) -> list[Path]:
     """Write completed.ply, completed.laz where the scene is LAS or LAZ, and completed.json; returns their paths.
 
     The scene is read and written in parts. The files appear together, when all are written.
@@ -121,7 +125,8 @@ def write_completed(out: Path, done: Completed, object: Path, scene: CloudFile) 
             notes += append_to_las(folder / "completed.laz", scene, done)
             if noise := scene.survey.rows - scene.survey.count:
                 notes.append(f"completed.ply leaves out the {noise} points that are not used; completed.laz has them")
-        _write_ply(folder / "completed.ply", done, scene)
+        count = scene.survey.count - len(done.removed) + len(done.added)
+        write_completed(folder / "completed.ply", scene.like, scene.parts(), done.changes, [done.added], count)
         _write_report(folder / "completed.json", done, object, scene, notes)
         written = [folder / name for name in FILES if (folder / name).exists()]
         return [path.replace(out / path.name) for path in written]
@@ -134,12 +139,12 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
     crs = las_crs(scene.survey.path)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
     earlier = {str(number): f"{number} in {scene.survey.path.name}" for number in range(FROM_OBJECT, done.source)}
-    kept = scene.survey.count - len(done.gone)
+    kept = scene.survey.count - len(done.removed)
     content = {
         "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
         "points": quantity(kept + len(done.added), "points"),
         "scene_points": quantity(kept, "points"),
-        "removed_points": quantity(len(done.gone), "points"),
+        "removed_points": quantity(len(done.removed), "points"),
         "added_points": quantity({object.stem: len(done.added)}, "points"),
         "mode": quantity(done.mode, ""),
         "fill_distance": quantity(done.fill_distance, unit),
@@ -149,35 +154,6 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
         "seconds": quantity(done.seconds, "s"),
     }
     write_json(path, content)
-
-
-def _write_ply(path: Path, done: Completed, scene: CloudFile) -> None:
-    """The scene's points that stay, then those that came in, with the columns that the scene has."""
-    like = with_fields(scene.like)
-    added = replace(
-        done.added,
-        normals=None if like.normals is None else done.added.normals,
-        colors=None if like.colors is None else done.added.colors,
-        fields={name: done.added.fields[name] for name in like.fields},
-    )
-    count = scene.survey.count - len(done.gone) + len(added)
-    with reserved(path, records_of(like, path).dtype, count) as (file, _):
-        for rows, cloud in scene.parts():
-            file.write(records_of(with_fields(cloud[_stay(rows, done)]), path).tobytes())
-        file.write(records_of(added, path).tobytes())
-
-
-def with_fields(cloud: Cloud) -> Cloud:
-    """Points of the scene with `source` and the fields of evidence: those that they have, or not checked ones."""
-    kept = with_source(unchecked(cloud), FROM_SCENE)
-    if not _again(cloud):
-        return kept
-    return replace(kept, fields={name: cloud.fields[name].astype(of.dtype) for name, of in kept.fields.items()})
-
-
-def _stay(rows: Rows, done: Completed) -> NDArray[np.bool_]:
-    """(N,) which of some rows of the scene's file are not taken away."""
-    return ~np.isin(rows, done.gone)
 
 
 def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
@@ -206,7 +182,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
         header.vlrs = type(header.vlrs)(_but_copc(header.vlrs))
         further = type(header.vlrs)(_but_copc(header.evlrs or []))
         own = set(header.point_format.dimension_names)
-        again = own >= OWN
+        again = own >= set(done.added.fields)
         names = {name: name if again else _free(name, own) for name in done.added.fields}
         types = {} if again else {name: values.dtype.str[1:] for name, values in done.added.fields.items()}
         described = {name: LAS_DESCRIPTIONS.get(name, "") for name in types}
@@ -214,7 +190,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
         with las_writer(path, header) as writer:
             brightest, first = 0, 0
             for chunk in reader.chunk_iterator(CHUNK):
-                stay = _stay(np.arange(first, first + len(chunk)), done)
+                stay = ~np.isin(np.arange(first, first + len(chunk)), done.removed)
                 first, chunk = first + len(chunk), chunk[stay]
                 part = laspy.ScaleAwarePointRecord.zeros(len(chunk), header=header)
                 for name in chunk.array.dtype.names:

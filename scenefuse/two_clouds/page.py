@@ -8,13 +8,12 @@ import numpy as np
 
 from scenefuse.core.stage import atomic_file, value
 from scenefuse.core.transforms import Array, Sim3, rotation_between
-from scenefuse.fuse.changes import together
 from scenefuse.report.page import document, embedded
 from scenefuse.report.values import flatten, number
 from scenefuse.report.view.view_file import View
 from scenefuse.report.view.view_page import view_section
 from scenefuse.report.view.view_points import REMOVED, merge, thin, within
-from scenefuse.two_clouds.complete import Completed, with_fields
+from scenefuse.two_clouds.complete import Completed
 
 VIEW_POINTS = 300_000
 VIEW_REACH = 0.35
@@ -60,8 +59,8 @@ def write_page(
     if done is None:
         parts.append(f"<p>The pose was refused, so there is no completed scene. {escape(value(content, 'next'))}.</p>")
     else:
-        scene_points = inputs["scene_points"] - len(done.gone)
-        parts += [_told(done, scene_points), view_section("scene", title, view_of(names[0], done, up, unit))]
+        scene_points = inputs["scene_points"] - len(done.removed)
+        parts += [_changes(done, scene_points), view_section("scene", title, view_of(names[0], done, up, unit))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
         parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
@@ -78,35 +77,35 @@ def write_page(
 def view_of(name: str, done: Completed, up: Array | None, unit: str) -> View:
     """The 3D view of the completed scene around what was added, before and after."""
     level = Sim3(1.0, rotation_between(UP if up is None else up, UP), np.zeros(3))
-    added = done.added if len(done.added) else done.near
+    added = done.added if len(done.added) else done.before
     corners = np.percentile(added.points, [0.5, 99.5], axis=0)
     middle = np.floor(corners.mean(0))
     level = level @ Sim3(1.0, np.eye(3), -middle)
     reach = (0.5 + VIEW_REACH) * float(np.linalg.norm(corners[1] - corners[0]))
     before, after = (
         cloud[within(cloud.points, middle - reach, middle + reach, margin=0.0)].transformed(level)
-        for cloud in (done.near, together(with_fields(done.near[done.kept]), done.added))
+        for cloud in (done.before, done.after)
     )
     low, high = np.percentile(added.transformed(level).points, [0.5, 99.5], axis=0)
     points = merge(before, after)
     points.fields["near"][:] = within(points.points, low, high)
     thinned = thin(points, VIEW_POINTS)
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
-    told = {done.source: f"added from {name}"}
-    sources = {0: "scene"} | {code: told.get(code, f"{code} in the scene") for code in found}
+    names = {done.source: f"added from {name}"}
+    sources = {0: "scene"} | {code: names.get(code, f"{code} in the scene") for code in found}
     return View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, len(before), len(after))
 
 
-def _told(done: Completed, scene_points: int) -> str:
+def _changes(done: Completed, scene_points: int) -> str:
     """What became of the scene, in a paragraph."""
-    removed = len(done.gone)
-    said = [
+    removed = len(done.removed)
+    text = [
         f"{len(done.added):,} points of the object were added to {scene_points:,} of the scene"
         + (f", {removed:,} of which were taken away" if removed else "; none was taken away")
         + f"; what lies within {number(done.fill_distance)} of the scene's points counts as the same place",
         *done.notes,
     ]
-    return f"<p>{escape('; '.join(said))}. <code>source</code> of completed.ply: 0 scene, {done.source} object.</p>"
+    return f"<p>{escape('; '.join(text))}. <code>source</code> of completed.ply: 0 scene, {done.source} object.</p>"
 
 
 def _table(content: dict[str, Any]) -> str:

@@ -30,7 +30,7 @@ from scenefuse.register.register import (
     second_place,
     summary,
 )
-from scenefuse.two_clouds.complete import complete, fusion_settings, write_completed
+from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
 
 REGISTERED, UNREGISTERED = 0, 3
@@ -275,7 +275,7 @@ def _fuse(
         pose = found.scene_from_object
         around = VIEW_REACH * given.object.transformed(pose).diagonal
         done = complete(given.object, given.scene, pose, fusion_settings(config), around)
-        written += write_completed(out, done, inputs["object"], given.scene)
+        written += write_files(out, done, inputs["object"], given.scene)
     page = out / "report.html"
     write_page(page, content, found.unit, out / "picture.png", done, known.ups()[1])
     return [*written, page]

@@ -25,11 +25,12 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.core.stage import StageError, read_json, run, threads, value
 from scenefuse.core.transforms import Array, Sim3, step_to_planes
 from scenefuse.demo.cameras import read_cameras
-from scenefuse.fuse.changes import FROM_OBJECT, together
-from scenefuse.fuse.evidence import MEASURED, around
-from scenefuse.fuse.fuse_object import fuse_by_distance, fuse_by_evidence, uncertainty_on_scene
-from scenefuse.fuse.modes import FusionSettings
-from scenefuse.geometry.photo_check import LEAST_PHOTOS, moved_photos, read_photos
+from scenefuse.fuse.evidence import around, fuse_by_evidence
+from scenefuse.fuse.fuse_object import uncertainty_on_scene
+from scenefuse.fuse.measure import MEASURED
+from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
+from scenefuse.fuse.write import FROM_OBJECT, together
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.thresholds import THRESHOLDS
 from scenefuse.metrics.truth import registration_error
@@ -103,7 +104,8 @@ def fuse(case: Case, settings: FusionSettings) -> Cloud:
         placed = case.object.transformed(case.pose)
         own = read_photos(read_workspace(case.results / "objects" / case.name / "undistorted"), case.object.points)
         theirs = read_photos(read_workspace(case.results / "scenes/demo/undistorted"), placed.points)
-        fused = fuse_by_evidence(placed, case.scene, moved_photos(own, case.pose), theirs, settings, case.uncertainty)
+        photos = moved_photos(own, case.pose), theirs
+        fused, _ = fuse_by_evidence(placed, case.scene, *photos, settings, case.uncertainty)
     else:
         fused = fuse_by_distance(case.object, case.scene, case.crop, case.pose, settings)
     return together(fused.kept, fused.added)
@@ -234,7 +236,7 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     settled = Sim3.from_matrix(np.array(value(read_json(folder / "fusion.json"), "scene_from_object")))
     truth_from_scene = case.known.fit.truth_from_model @ settled.inverse()
     added = fused[fused.fields["source"] == FROM_OBJECT]
-    measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= LEAST_PHOTOS)
+    measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= CONFIRMING_PHOTOS)
     placed = truth_from_scene.apply(added.points[measured])
     aligned = surface_alignment(placed, case.known)
     points, bounds = aligned.apply(placed), 2 * truth_from_scene.scale * added.fields["deviation"][measured]

@@ -3,8 +3,9 @@
 import numpy as np
 
 from scenefuse.cloud.clouds import write_cloud
-from scenefuse.fuse.changes import FROM_OBJECT, with_source
-from scenefuse.fuse.evidence import KEPT, REPLACED, unchecked
+from scenefuse.fuse.compare import KEPT, REPLACED
+from scenefuse.fuse.measure import unchecked
+from scenefuse.fuse.write import FROM_OBJECT, with_source
 
 
 def write_changes(folder, scene, added, rows=(), removed=(), evidence=0):

@@ -13,7 +13,7 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.complete_scene import CompletionInputs, complete_scene, without_overlaps
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fuse.modes import FusionSettings, fuse_clouds
+from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
 
 SETTINGS = FusionSettings(mode="fill")
 POSE = Sim3(2.0, np.eye(3), np.array([1.0, 2.0, 3.0]))
@@ -80,7 +80,7 @@ def test_objects_apart_add_what_each_adds_alone(tmp_path):
     assert value(report, "sources") == {"0": "scene", "1": "left", "2": "right"}
     assert np.array_equal(whole.points[whole.fields["source"] == 0], scene.points)
     for number, (name, cloud) in enumerate(objects.items(), 1):
-        alone = fuse_clouds(cloud.transformed(POSE.inverse()), scene, scene, POSE, SETTINGS).added
+        alone = fuse_by_distance(cloud.transformed(POSE.inverse()), scene, scene, POSE, SETTINGS).added
         mine = whole[whole.fields["source"] == number]
         assert len(mine) == value(report, "added_points")[name] > 100
         assert np.allclose(mine.points, alone.points)

@@ -1,4 +1,4 @@
-"""Evidence on a painted plane: what photos of both sides say decides what is added, kept and taken away."""
+"""Evidence on a painted plane: the photos of both sides decide what is added, kept and taken away."""
 
 from dataclasses import replace
 
@@ -9,24 +9,19 @@ from support.photographed_plane import BLANK, photographs
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse import evidence
-from scenefuse.fuse.evidence import (
+from scenefuse.fuse import compare, evidence
+from scenefuse.fuse.compare import (
     ELSEWHERE,
     ENCLOSED,
-    FIELDS,
     KEPT,
-    MEASURED,
-    NERF_ONLY,
     REPLACED,
     SEEN_THROUGH,
-    STEREO_ONLY,
-    Side,
+    better_measured,
     is_seen_through,
     matched_elsewhere,
-    weigh,
-    with_pose_uncertainty,
 )
-from scenefuse.fuse.fuse_object import evidence_report, fuse_by_evidence
+from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence
+from scenefuse.fuse.measure import FIELDS, MEASURED, NERF_ONLY, STEREO_ONLY, Measured, with_pose_uncertainty
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.settle import settle
 from scenefuse.geometry.photo_check import Matches, moved_photos, pack
@@ -58,32 +53,32 @@ def far():
 
 def test_the_sharper_side_stays_where_both_measured(near, far):
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    found = check(obj, scene, near, far, nerf_only=False)
     assert found.added.mean() > 0.97
     inside, outside = scene.points[:, 0] < 0.3, scene.points[:, 0] > 0.5
     assert (found.reason[inside] == REPLACED).mean() > 0.95 and (found.reason[outside] == KEPT).all()
     assert (found.scene.fields["evidence"][outside] == MEASURED).mean() > 0.9
     # The other way round the scene is the sharper one, and nothing comes in where it is.
     farther = pack(photographs(8, 9.0, radius=6.0))
-    found = weigh(Side(scene, farther), Side(obj, near), nerf_only=False)
+    found = check(scene, obj, farther, near, nerf_only=False)
     assert found.added[scene.points[:, 0] < 0.3].mean() < 0.05 and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
     assert (found.reason == KEPT).all()
 
 
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
     rough, smooth = sheet(-0.8, 0.8, 0.015, noise=0.012), sheet(-0.8, 0.8, 0.02)
-    found = weigh(Side(rough, near), Side(smooth, far), nerf_only=False)
+    found = check(rough, smooth, near, far, nerf_only=False)
     inside = np.abs(smooth.points[:, 0]) < 0.6
     assert (found.reason[inside] == KEPT).mean() > 0.95 and found.added[np.abs(rough.points[:, 0]) < 0.6].mean() < 0.02
     # A rough scene gives way to a smooth object.
-    found = weigh(Side(smooth, near), Side(rough, far), nerf_only=False)
+    found = check(smooth, rough, near, far, nerf_only=False)
     assert (found.reason[np.abs(rough.points[:, 0]) < 0.6] != KEPT).mean() > 0.95 and found.added.mean() > 0.95
 
 
 def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):
     # The scene's points are six times as far apart as the object's, whose rim they touch.
     obj, scene = sheet(-0.8, 0.0, 0.02), sheet(-0.8, 0.8, 0.12)
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    found = check(obj, scene, near, far, nerf_only=False)
     beside = (scene.points[:, 0] > 0.03) & (scene.points[:, 0] < 0.17) & (np.abs(scene.points[:, 1]) < 0.9)
     assert beside.any() and (found.reason[beside] == KEPT).all()
 
@@ -93,7 +88,7 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     scene = concatenate([sheet(-0.8, 0.8, 0.06), floating, under])
     part = np.repeat([0, 1, 2], [len(scene) - len(floating) - len(under), len(floating), len(under)])
     obj = concatenate([sheet(-0.8, 0.8, 0.03), floating])
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=True)
+    found = check(obj, scene, near, far, nerf_only=True)
     middle = np.abs(scene.points[:, 1]) < 0.6
     assert (found.reason[(part == 1) & middle] == SEEN_THROUGH).all()
     assert (found.reason[(part == 2) & middle] == ENCLOSED).all()
@@ -118,15 +113,15 @@ def test_what_close_ups_match_elsewhere_goes_unless_that_is_said_of_many(near, f
     obj, scene = sheet(-0.8, -0.2, 0.03), sheet(-0.8, 0.8, 0.06)
     beyond = scene.points[:, 0] > 0.5
     monkeypatch.setattr(evidence, "matched_elsewhere", lambda *_: beyond)
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    found = check(obj, scene, near, far, nerf_only=False)
     assert ((found.reason == ELSEWHERE) == beyond).all()
 
 
 def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(near, far, monkeypatch):
     obj, scene = sheet(-0.8, 0.4, 0.03), sheet(-0.4, 0.8, 0.06, noise=0.005)
     holed = obj.points[:, 0] > 0.1
-    monkeypatch.setattr(evidence, "compare", lambda *_: (np.ones(len(scene), dtype=bool), holed))
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    monkeypatch.setattr(compare, "better_measured", lambda *_: (np.ones(len(scene), dtype=bool), holed))
+    found = check(obj, scene, near, far, nerf_only=False)
     assert (found.reason[scene.points[:, 0] < 0.0] == REPLACED).all()
     inside = (scene.points[:, 0] > 0.25) & (scene.points[:, 0] < 0.35) & (np.abs(scene.points[:, 1]) < 0.8)
     assert inside.any() and (found.reason[inside] == KEPT).all()
@@ -135,9 +130,9 @@ def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(nea
 def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
     floating = sheet(-0.2, 0.2, 0.03, z=0.3)
     obj, scene = sheet(-0.8, 0.4, 0.03), concatenate([sheet(-0.8, 0.8, 0.02), floating])
-    whole = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
-    monkeypatch.setattr(evidence, "MOST_CHECKED", len(scene) // 2)
-    some = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    whole = check(obj, scene, near, far, nerf_only=False)
+    monkeypatch.setattr(evidence, "MAX_CHECKED", len(scene) // 2)
+    some = check(obj, scene, near, far, nerf_only=False)
     assert len(some.reason) == len(some.scene) == len(scene) and set(some.scene.fields) == set(FIELDS)
     assert (some.reason == whole.reason).mean() > 0.97 and (some.added == whole.added).mean() > 0.97
     assert any(f"{len(scene) // 2} were checked" in note for note in some.notes) and some.notes[:-1] == whole.notes
@@ -147,34 +142,34 @@ def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far
     blank = sheet(BLANK + 0.15, BLANK + 0.4, 0.03)
     obj = concatenate([sheet(-0.5, 0.5, 0.03), blank])
     scene = concatenate([sheet(-0.5, 0.0, 0.06), sheet(BLANK + 0.4, BLANK + 0.5, 0.06)])
-    found = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    found = check(obj, scene, near, far, nerf_only=False)
     last = slice(-len(blank), None)
     assert (found.obj.fields["evidence"][last] == NERF_ONLY).all() and not found.added[last].any()
     beyond = scene.points[:, 0] > BLANK
     assert (found.scene.fields["evidence"][beyond] == STEREO_ONLY).all() and (found.reason[beyond] == KEPT).all()
-    assert weigh(Side(obj, near), Side(scene, far), nerf_only=True).added[last].mean() > 0.8
+    assert check(obj, scene, near, far, nerf_only=True).added[last].mean() > 0.8
 
 
 def test_an_object_that_is_a_little_off_is_laid_on_the_scene(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
-    found = weigh(Side(obj.transformed(off), moved_photos(near, off)), Side(scene, far), nerf_only=False)
+    found = check(obj.transformed(off), scene, moved_photos(near, off), far, nerf_only=False)
     assert np.abs(found.obj.points[:, 2]).max() < 0.005 and found.moved == pytest.approx(0.04 / obj.diagonal, rel=0.2)
     far_off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.3]))
-    found = weigh(Side(obj.transformed(far_off), moved_photos(near, far_off)), Side(scene, far), nerf_only=False)
+    found = check(obj.transformed(far_off), scene, moved_photos(near, far_off), far, nerf_only=False)
     assert np.abs(found.obj.points[:, 2] - 0.3).max() < 0.05
 
 
 def test_an_object_whose_pose_is_more_certain_than_the_surfaces_stays(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04)
     off = Sim3(1.0, np.eye(3), np.array([0, 0, 0.008]))
-    sides = Side(obj.transformed(off), moved_photos(near, off)), Side(scene, far)
-    stays, settles = (weigh(*sides, nerf_only=False, certain=certain) for certain in (0.0, 0.1))
+    sides = obj.transformed(off), scene, moved_photos(near, off), far
+    stays, settles = (check(*sides, nerf_only=False, certain=certain) for certain in (0.0, 0.1))
     assert stays.moved == 0 and any("more certain" in note for note in stays.notes)
     assert settles.moved > 0.002
     away = Sim3(1.0, np.eye(3), np.array([0, 0, 0.04]))
-    sides = Side(obj.transformed(away), moved_photos(near, away)), Side(scene, far)
-    assert weigh(*sides, nerf_only=False, certain=0.0).moved > 0.005
+    sides = obj.transformed(away), scene, moved_photos(near, away), far
+    assert check(*sides, nerf_only=False, certain=0.0).moved > 0.005
 
 
 def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
@@ -189,7 +184,7 @@ def test_a_sheet_that_does_not_say_how_large_it_is_keeps_its_scale():
 def test_hardly_any_point_of_the_scene_is_no_error(near, far, count):
     obj = sheet(-0.8, 0.8, 0.03)
     scene = Cloud(obj.points[:count].copy() if count else np.zeros((0, 3)))
-    assert len(fuse_by_evidence(obj, scene, near, far, FusionSettings()).added) > 500
+    assert len(fuse_by_evidence(obj, scene, near, far, FusionSettings())[0].added) > 500
 
 
 def test_one_wrong_camera_changes_little(near, far):
@@ -198,8 +193,8 @@ def test_one_wrong_camera_changes_little(near, far):
     pose = views[0].cam_from_world.copy()
     pose[:3, 3] += 0.4
     views[0] = replace(views[0], cam_from_world=pose)
-    found = weigh(Side(obj, pack(views)), Side(scene, far), nerf_only=False)
-    good = weigh(Side(obj, near), Side(scene, far), nerf_only=False)
+    found = check(obj, scene, pack(views), far, nerf_only=False)
+    good = check(obj, scene, near, far, nerf_only=False)
     assert good.added.mean() > 0.97 and found.added.mean() > 0.9
     assert np.abs(found.obj.points[found.added][:, 2]).max() < 0.01
 
@@ -216,17 +211,18 @@ def test_the_pose_adds_along_the_normal_what_it_may_be_off():
 def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_and_is_said(near, far):
     up = Sim3(1.0, np.eye(3), np.array([0, 0, 0.5]))
     obj, scene = sheet(-0.5, 0.5, 0.03).transformed(up), sheet(-0.8, 0.8, 0.06)
-    fused = fuse_by_evidence(obj, scene, moved_photos(near, up), far, FusionSettings())
+    fused, checked = fuse_by_evidence(obj, scene, moved_photos(near, up), far, FusionSettings())
     assert len(fused.removed) == 0
-    assert any("stays where the registration put it" in note for note in value(evidence_report(fused, "m"), "notes"))
+    notes = value(evidence_report(fused, checked, "m"), "notes")
+    assert any("stays where the registration put it" in note for note in notes)
 
 
 @pytest.mark.parametrize("without", ["object", "scene", "both"])
 def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
     sides = NOBODY if without != "scene" else near, NOBODY if without != "object" else far
-    fused = fuse_by_evidence(obj, scene, *sides, FusionSettings())
-    notes = value(evidence_report(fused, "m"), "notes")
+    fused, checked = fuse_by_evidence(obj, scene, *sides, FusionSettings())
+    notes = value(evidence_report(fused, checked, "m"), "notes")
     if without == "both":
         assert len(fused.added) == len(fused.removed) == 0 and any("nothing is added" in note for note in notes)
     else:
@@ -237,20 +233,20 @@ def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
 def test_clouds_without_normals_or_colors_and_a_scene_far_away(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.2, 0.06)
     plain = Cloud(obj.points), Cloud(scene.points)
-    fused = fuse_by_evidence(*plain, near, far, FusionSettings())
+    fused, _ = fuse_by_evidence(*plain, near, far, FusionSettings())
     assert (fused.added.points[:, 0] > 0.3).sum() > 500
-    fused = fuse_by_evidence(obj, replace(scene, points=scene.points + 50), near, far, FusionSettings())
+    fused, _ = fuse_by_evidence(obj, replace(scene, points=scene.points + 50), near, far, FusionSettings())
     assert len(fused.rows) == 0 and len(fused.added) > 0.9 * len(obj)
 
 
 def test_every_point_says_what_is_known_of_it(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), concatenate([sheet(-0.8, 0.2, 0.06), sheet(8, 9, 0.06)])
-    fused = fuse_by_evidence(obj, scene, near, far, FusionSettings())
+    fused, checked = fuse_by_evidence(obj, scene, near, far, FusionSettings())
     assert set(FIELDS) == set(fused.added.fields) == set(fused.scene.fields)
     assert (fused.added.fields["photos"] >= 3).all() and (fused.added.fields["deviation"] < 0.02).all()
     beyond = fused.scene.points[:, 0] > 5
     assert not fused.scene.fields["evidence"][beyond].any() and np.isnan(fused.scene.fields["deviation"][beyond]).all()
-    report = evidence_report(fused, "m")
+    report = evidence_report(fused, checked, "m")
     checked = value(report, "scene_checked")
     assert value(report, "scene_measured") + value(report, "scene_stereo_only") == checked == len(fused.rows)
     assert value(report, "scene_kept") + sum(value(report, "scene_removed").values()) == checked
@@ -279,14 +275,14 @@ def test_a_pot_before_a_wall_stays_where_most_photos_confirm_it():
     scene = concatenate([sheet(-0.8, 0.8, 0.04), pot])
     # The object is the wall and a sill as high as the pot, so that the pot lies in its box.
     obj = concatenate([sheet(-0.8, 0.8, 0.03), sheet(0.7, 0.8, 0.03, z=0.32)])
-    found = weigh(Side(obj, photos), Side(scene, flight), nerf_only=False)
+    found = check(obj, scene, photos, flight, nerf_only=False)
     assert (found.scene.fields["evidence"][-len(pot) :] == MEASURED).mean() > 0.95
     assert (found.reason[-len(pot) :] == KEPT).mean() > 0.95
 
 
 def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
     obj, scene, far = sheet(-0.8, 0.8, 0.02), sheet(-0.8, 0.8, 0.12), pack(photographs(8, 9.0, radius=6.0))
-    found = weigh(Side(obj, far), Side(scene, near), nerf_only=False)
+    found = check(obj, scene, far, near, nerf_only=False)
     inside = np.abs(obj.points[:, :2]).max(1) < 0.6
     distance = np.linalg.norm(obj.points[inside, None, :2] - scene.points[:, :2], axis=2).min(1)
     added = found.added[inside]
@@ -296,7 +292,7 @@ def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
 def test_of_equals_the_denser_side_stays(near, far):
     coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
     for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
-        found = weigh(Side(obj, near), Side(scene, near), nerf_only=False)
+        found = check(obj, scene, near, near, nerf_only=False)
         middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
         assert (found.added[middle].mean() > 0.95) == added
         assert ((found.reason[around] == KEPT).mean() < 0.05) == added
@@ -305,20 +301,20 @@ def test_of_equals_the_denser_side_stays(near, far):
 def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.012)
     scene = scene[np.linalg.norm(scene.points[:, :2], axis=1) > 0.08]
-    found = weigh(Side(obj, near), Side(scene, near), nerf_only=False)
+    found = check(obj, scene, near, near, nerf_only=False)
     inside, beside = (np.linalg.norm(obj.points[:, :2], axis=1) < r for r in (0.05, 0.5))
     assert found.added[inside].mean() > 0.7 and found.added[beside & (np.abs(obj.points[:, 0]) > 0.2)].mean() < 0.05
 
 
 def test_doubles_do_not_make_a_scene_dense(near):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
-    found = weigh(Side(obj, near), Side(concatenate([scene] * 10), near), nerf_only=False)
+    found = check(obj, concatenate([scene] * 10), near, near, nerf_only=False)
     assert found.added.mean() > 0.95
 
 
 def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
     obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
-    found = weigh(Side(obj, near), Side(floating, far), nerf_only=False)
+    found = check(obj, floating, near, far, nerf_only=False)
     assert found.added.mean() > 0.9 and (found.reason != KEPT).mean() > 0.9
 
 
@@ -326,14 +322,17 @@ def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
 def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exactly(inexact, stay):
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04, z=0.01)
     measured = scene.points[:, 0] < 0
-    every = np.ones(len(obj), dtype=bool)
-    worse, better = evidence.compare(
-        obj, np.full(len(obj), inexact), every, scene, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
-    )
+    theirs = known(scene, np.where(measured, 0.005, np.inf), measured)
+    worse, better = better_measured(known(obj, inexact), theirs, obj.diagonal, 1.0)
     assert (not worse[~measured].any()) if stay else worse[~measured].all()
     # What lies farther off than the object's own deviation explains goes.
-    away = replace(scene, points=scene.points + [0, 0, 0.035])
-    worse, _ = evidence.compare(
-        obj, np.full(len(obj), 0.012), every, away, np.where(measured, 0.005, np.inf), measured, obj.diagonal, 1.0
-    )
+    away = replace(theirs, cloud=replace(scene, points=scene.points + [0, 0, 0.035]))
+    worse, _ = better_measured(known(obj, 0.012), away, obj.diagonal, 1.0)
     assert worse[~measured].mean() > 0.95
+
+
+def known(cloud, deviation, surface=True):
+    """A cloud that photos measured, of that standard deviation."""
+    nothing = np.zeros(len(cloud))
+    matches = Matches(nothing, nothing, nothing, nothing, nothing + deviation, nothing, nothing)
+    return Measured(cloud, matches, np.broadcast_to(surface, len(cloud)))

@@ -8,9 +8,9 @@ import pytest
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse.changes import read_changes
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fuse.modes import FusionSettings, feathered, fuse_clouds, match_colors
+from scenefuse.fuse.modes import FusionSettings, feathered, fuse_by_distance, match_colors
+from scenefuse.fuse.write import read_changes
 
 SETTINGS = FusionSettings(mode="fill", density=1.0)
 
@@ -38,22 +38,22 @@ def obj():
 
 
 def test_fill_adds_only_what_the_scene_lacks(scene, obj):
-    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), SETTINGS)
-    assert fusion.kept.all()
+    fusion = fuse_by_distance(obj, scene, scene, Sim3.identity(), SETTINGS)
+    assert len(fusion.removed) == 0
     assert fusion.added.points[:, 0].min() > 4.0
     assert spacing(fusion.added.points) == pytest.approx(0.1, rel=0.2)
 
 
 def test_append_adds_everything_at_its_own_density(scene, obj):
-    fusion = fuse_clouds(obj, scene, scene, Sim3.identity(), replace(SETTINGS, mode="append", density=0.0))
-    assert len(fusion.added) == len(obj) and fusion.kept.all()
+    fusion = fuse_by_distance(obj, scene, scene, Sim3.identity(), replace(SETTINGS, mode="append", density=0.0))
+    assert len(fusion.added) == len(obj) and len(fusion.removed) == 0
 
 
 def test_replace_takes_the_scene_away_under_the_object(scene, obj):
     half = obj[obj.points[:, 0] > 2]
-    fusion = fuse_clouds(half, scene, scene, Sim3.identity(), replace(SETTINGS, mode="replace"))
-    assert fusion.kept[scene.points[:, 0] < 1.8].all()
-    assert not fusion.kept[scene.points[:, 0] > 2.2].any()
+    fusion = fuse_by_distance(half, scene, scene, Sim3.identity(), replace(SETTINGS, mode="replace"))
+    left = fusion.kept.points[:, 0]
+    assert (left < 1.8).sum() == (scene.points[:, 0] < 1.8).sum() and not (left > 2.2).any()
 
 
 def test_the_seam_blends_colors_and_moves_no_point(scene):
@@ -65,7 +65,7 @@ def test_the_seam_blends_colors_and_moves_no_point(scene):
 
 
 def test_colors_of_what_is_added_follow_the_scene(scene, obj):
-    added = fuse_clouds(obj, scene, scene, Sim3.identity(), SETTINGS).added
+    added = fuse_by_distance(obj, scene, scene, Sim3.identity(), SETTINGS).added
     expected = np.array([200, 100, 50]) * (0.6 + 0.4 * np.sin(added.points[:, 1:2]))
     assert np.abs(added.colors - expected).mean() < 5
 
@@ -129,6 +129,6 @@ def test_stage_keeps_provenance_and_survives_an_unregistered_object(tmp_path, sc
     assert (added > 0) == (status != "unregistered") and value(report, "registration") == status
     assert (around.fields["source"] == 1).sum() == added
     assert around.fields["source"].dtype == np.uint16 and not around.fields["evidence"].any()
-    assert value(read_json(tmp_path / "evidence.json"), "notes") == ["no photo was asked"]
+    assert value(read_json(tmp_path / "evidence.json"), "notes") == ["no photo was compared"]
     assert len(around) == (scene.points[:, 0] <= 3).sum() + added
     assert len(read_changes(tmp_path / "checked.ply").rows) == 0

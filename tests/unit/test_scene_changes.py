@@ -7,8 +7,8 @@ from support.changed_scene import write_changes
 from scenefuse.cloud.clouds import Cloud, concatenate, write_cloud
 from scenefuse.cloud.tiles import tiled_cloud
 from scenefuse.cloud.tiles.tiled_cloud import open_cloud
-from scenefuse.fuse.changes import added_by, after_fusion, merged, read_changes
-from scenefuse.fuse.evidence import MEASURED, STEREO_ONLY
+from scenefuse.fuse.measure import MEASURED, STEREO_ONLY
+from scenefuse.fuse.write import added_by, after_fusion, merged, read_changes
 
 
 @pytest.fixture

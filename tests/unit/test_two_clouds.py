@@ -24,7 +24,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.register import Registration, RegistrationSettings, second_place
-from scenefuse.two_clouds.complete import append_to_las, complete, write_completed
+from scenefuse.two_clouds.complete import append_to_las, complete, write_files
 from scenefuse.two_clouds.page import write_page
 from scenefuse.two_clouds.register import register
 
@@ -69,7 +69,7 @@ def test_an_index_that_more_points_make_untrue_is_left_out_and_other_records_sta
     las.write(str(tmp_path / "yard.laz"))
     scene = CloudFile.of(tmp_path / "yard.laz")
     done = complete(own(sheet(2, 8)), scene, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+    write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     header = laspy.read(tmp_path / "completed.laz").header
     kept = [(record.user_id, bytes(record.record_data_bytes())) for record in [*header.vlrs, *header.evlrs]]
     assert {("surveyor", b"Smith"), ("surveyor", b"Jones")} <= set(kept)
@@ -141,7 +141,7 @@ def test_a_laz_keeps_all_that_its_points_have(tmp_path):
     write_survey(tmp_path / "yard.laz", scene)
     scene = CloudFile.of(tmp_path / "yard.laz")
     done = complete(own(obj), scene, POSE, FusionSettings(mode="fill", match_colors=False))
-    written = write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+    written = write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in written] == ["completed.ply", "completed.laz", "completed.json"]
     before, after = laspy.read(tmp_path / "yard.laz"), laspy.read(tmp_path / "completed.laz")
     count = len(before.points)
@@ -169,7 +169,7 @@ def test_a_laz_has_finer_steps_where_the_object_asks_for_them_or_says_that_it_ca
     file = CloudFile.of(tmp_path / "yard.laz")
     dense = Cloud(np.random.default_rng(0).random((3000, 3)) * [1, 1, 0] + [5, 0, 0])
     done = complete(own(dense), file, POSE, FusionSettings(mode="append"))
-    write_completed(tmp_path, done, tmp_path / "shed.ply", file)
+    write_files(tmp_path, done, tmp_path / "shed.ply", file)
     after, count = laspy.read(tmp_path / "completed.laz"), len(scene)
     assert after.header.scales == pytest.approx([step] * 3)
     assert np.array_equal(after.X[:count], laspy.read(tmp_path / "yard.laz").X * round(0.1 / step))
@@ -185,7 +185,7 @@ def test_colours_of_8_bits_stay_8_bits(tmp_path, ending):
     write_survey(tmp_path / f"yard.{ending}", scene, bright=1)
     scene = CloudFile.of(tmp_path / f"yard.{ending}")
     done = complete(own(obj), scene, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+    write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     after = laspy.read(tmp_path / "completed.laz")
     assert after.red.max() <= 255 and after.red[-1] > 100
 
@@ -197,7 +197,7 @@ def test_a_completed_scene_takes_further_objects_and_keeps_what_is_known(tmp_pat
         out = tmp_path / str(number)
         scene = CloudFile.of(scene)
         done = complete(own(sheet(low, high)), scene, POSE, FILL)
-        write_completed(out, done, tmp_path / "shed.ply", scene)
+        write_files(out, done, tmp_path / "shed.ply", scene)
         scene = out / "completed.laz"
         if number == 1:
             first = laspy.read(scene)
@@ -233,7 +233,7 @@ def test_a_scene_with_some_field_of_the_same_name_keeps_it(tmp_path):
     survey.write(tmp_path / "yard.laz")
     scene = CloudFile.of(tmp_path / "yard.laz")
     done = complete(own(sheet(2, 8)), scene, POSE, FILL)
-    write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+    write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     after = laspy.read(tmp_path / "completed.laz")
     assert set(after.source[: len(survey.points)].tolist()) == {7}
     assert set(after.source_after.tolist()) == {0, 1}
@@ -258,7 +258,7 @@ def test_columns_that_the_object_lacks_are_named_and_a_grey_object_is_said_to_be
     write_cloud(tmp_path / "yard.ply", scene)
     scene = CloudFile.of(tmp_path / "yard.ply")
     done = complete(own(obj), scene, POSE, FusionSettings())
-    written = write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+    written = write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in written] == ["completed.ply", "completed.json"]
     notes, printed = value(read_json(written[-1]), "notes"), capsys.readouterr().out
     for words in ("leaves out the columns height", "grey in the scene", "neither side has photos"):
@@ -274,7 +274,7 @@ def test_an_object_beyond_the_coordinates_of_a_las_file_is_one_sentence(tmp_path
     scene = CloudFile.of(tmp_path / "yard.laz")
     done = complete(own(far), scene, POSE, FILL)
     with pytest.raises(StageError, match="coordinates of .*yard.laz end before the object"):
-        write_completed(tmp_path, done, tmp_path / "shed.ply", scene)
+        write_files(tmp_path, done, tmp_path / "shed.ply", scene)
     assert [path.name for path in tmp_path.iterdir()] == ["yard.laz"]
 
 
@@ -291,7 +291,7 @@ def test_a_completed_scene_that_does_not_fit_is_an_error_and_leaves_nothing(tmp_
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limits[1]))
     try:
         with pytest.raises(StageError, match=r"completed\.laz could not be written .* GB of its disk are free: free"):
-            write_completed(tmp_path / "out", done, tmp_path / "shed.ply", scene)
+            write_files(tmp_path / "out", done, tmp_path / "shed.ply", scene)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list((tmp_path / "out").iterdir())
@@ -303,7 +303,7 @@ def test_completed_files_appear_together_or_not_at_all(tmp_path, monkeypatch):
     done = complete(own(sheet(2, 8)), scene, POSE, FILL)
     monkeypatch.setattr("scenefuse.two_clouds.complete.VERSION", float("nan"))  # which no JSON holds
     with pytest.raises(ValueError):
-        write_completed(tmp_path / "out", done, tmp_path / "shed.ply", scene)
+        write_files(tmp_path / "out", done, tmp_path / "shed.ply", scene)
     assert not list((tmp_path / "out").iterdir())
 
 
@@ -394,16 +394,16 @@ def test_a_scene_in_parts_is_completed_as_one_in_one_piece(tmp_path, monkeypatch
     settings = FusionSettings(mode="replace")  # which takes points away, too
     whole = CloudFile.of(path)
     done = complete(own(sheet(2, 8)), whole, POSE, settings)
-    write_completed(tmp_path / "whole", done, tmp_path / "shed.ply", whole)
+    write_files(tmp_path / "whole", done, tmp_path / "shed.ply", whole)
     in_parts(monkeypatch, 70, 1 << 22)
     parts = CloudFile.of(path)
     assert len(list(parts.parts())) > 5 and parts.every == 1
     again = complete(own(sheet(2, 8)), parts, POSE, settings)
-    write_completed(tmp_path / "parts", again, tmp_path / "shed.ply", parts)
+    write_files(tmp_path / "parts", again, tmp_path / "shed.ply", parts)
     for one in (tmp_path / "whole").glob("completed.[pl]*"):
         assert one.read_bytes() == (tmp_path / "parts" / one.name).read_bytes(), one.name
-    assert 0 < len(again.gone) < len(scene) and len(again.added) > 0
-    assert len(read_cloud(tmp_path / "parts/completed.ply")) == len(scene) - len(again.gone) + len(again.added)
+    assert 0 < len(again.removed) < len(scene) and len(again.added) > 0
+    assert len(read_cloud(tmp_path / "parts/completed.ply")) == len(scene) - len(again.removed) + len(again.added)
 
 
 def test_of_a_large_part_every_so_manyth_point_is_searched_and_all_stay(tmp_path, house, monkeypatch):

@@ -1,24 +1,29 @@
-"""What fusion changes in a scene: points of its cloud that are taken away or known better, and points that come in.
+"""Write: what fusion changes in a scene, and the completed scene with the changes of one object or of several (F3).
 
 A scene is never copied for an object: its changes name the rows of the scene's cloud, and are laid on the part of it
 that is read.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import Cloud, concatenate
+from scenefuse.cloud.clouds import Cloud, concatenate, records_of
 from scenefuse.cloud.formats import LAS_DIMENSIONS
-from scenefuse.cloud.tiles.tiled_cloud import Rows, TiledCloud, open_cloud
+from scenefuse.cloud.tiles.tiled_cloud import ROW_OF_TILE, Rows, TiledCloud, open_cloud
+from scenefuse.cloud.tiles.write_tiles import reserved
 from scenefuse.core.transforms import Array
-from scenefuse.fuse.evidence import FIELDS, KEPT, MEASURED, unchecked
+from scenefuse.fuse.compare import KEPT
+from scenefuse.fuse.measure import FIELDS, MEASURED, unchecked
 
 FROM_SCENE, FROM_OBJECT = 0, 1
 """Values of the field `source` of an object's clouds."""
+NO_TILES = np.zeros(0, ROW_OF_TILE)
 
 
 @dataclass(frozen=True)
@@ -38,11 +43,16 @@ class Changes:
     def left_of(self, rows: Rows, cloud: Cloud) -> Cloud:
         """What is left of some points of the scene, with fields of evidence, `source` 0, and what LAS knows of them.
 
+        A scene that was completed before keeps its fields of evidence and its `source`.
+
         Args:
             rows: (N,) rising, of these points in the scene's cloud.
             cloud: the points.
         """
-        part, kept = with_source(unchecked(cloud), FROM_SCENE), np.ones(len(cloud), dtype=bool)
+        part, left = with_source(unchecked(cloud), FROM_SCENE), np.ones(len(cloud), dtype=bool)
+        if was_completed(cloud):
+            known = {name: cloud.fields[name].astype(values.dtype) for name, values in part.fields.items()}
+            part = replace(part, fields=known)
         mine = slice(*np.searchsorted(self.rows, [rows[0], rows[-1] + 1])) if len(rows) else slice(0, 0)
         at = np.searchsorted(rows, self.rows[mine])
         there = rows[at] == self.rows[mine]
@@ -50,12 +60,17 @@ class Changes:
         for name, values in self.fields.items():
             part.fields[name][at] = values[mine][there]
         part.fields.update({name: cloud.fields[name] for name in LAS_DIMENSIONS if name in cloud.fields})
-        kept[at] = ~self.removed[mine][there]
-        return part[kept]
+        left[at] = ~self.removed[mine][there]
+        return part[left]
 
     def removed_in(self, starts: Rows) -> Rows:
         """(T,) how many points are taken away of each of T runs of rows from `starts` (T + 1,)."""
         return np.diff(np.searchsorted(self.rows[self.removed], starts))
+
+
+def was_completed(scene: Cloud) -> bool:
+    """Whether a scene has the fields of a completed one."""
+    return set(scene.fields) >= {*FIELDS, "source"}
 
 
 def read_changes(checked: Path) -> Changes:
@@ -107,3 +122,47 @@ def with_source(cloud: Cloud, source: int) -> Cloud:
     """The cloud with its fields of evidence and `source`, wide enough for 65535 objects."""
     known = {name: cloud.fields[name] for name in FIELDS}
     return replace(cloud, fields=known | {"source": np.full(len(cloud), source, dtype=np.uint16)})
+
+
+def write_completed(
+    path: Path,
+    like: Cloud,
+    parts: Iterable[tuple[Rows, Cloud]],
+    changes: Changes,
+    added: list[Cloud],
+    count: int,
+    tiles: NDArray[Any] = NO_TILES,
+) -> None:
+    """Write a completed scene as PLY, part by part: what the changes leave of the scene, then what comes in.
+
+    Args:
+        path: output.
+        like: none of the scene's points, with the columns that they have.
+        parts: the scene's points with their rows, in the order of its cloud.
+        changes: that objects make to it.
+        added: clouds with the fields of evidence and `source`.
+        count: points that are left and come in.
+        tiles: (T,) ROW_OF_TILE, a row for each tile, for the file's end.
+    """
+    columns = changes.left_of(np.zeros(0, np.int64), like)
+    columns = replace(columns, fields=dict(sorted(columns.fields.items())))
+    with reserved(path, records_of(columns, path).dtype, count, len(tiles)) as (file, _):
+        for cloud in chain((changes.left_of(*part) for part in parts), added):
+            file.write(records_of(_with_columns_of(columns, cloud), path).tobytes())
+        file.write(tiles.tobytes())
+
+
+def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
+    """A cloud with only the columns that another has; normals and colours that only the object has are left out, and
+    classes and intensities that only the scene has are 0."""
+    return replace(
+        cloud,
+        normals=None if like.normals is None else cloud.normals,
+        colors=None if like.colors is None else cloud.colors,
+        fields={
+            name: np.zeros(len(cloud), values.dtype)
+            if name in LAS_DIMENSIONS and name not in cloud.fields
+            else cloud.fields[name]
+            for name, values in like.fields.items()
+        },
+    )

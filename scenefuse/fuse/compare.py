@@ -1,0 +1,267 @@
+"""Compare: the points of an object and of the scene around it against each other, and what goes and why (F4).
+
+Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through, what
+none of them can see and what the object's photos match elsewhere goes; where both sides measured a place, one stays.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.cloud.clouds import Cloud, concatenate, spacing
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import Array
+from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_DROP, MIN_MATCH, Matches
+from scenefuse.geometry.visibility import Visibility, see
+from scenefuse.photos.workspace import View
+
+Mask = NDArray[np.bool_]
+
+KEPT, SEEN_THROUGH, ENCLOSED, REPLACED, ELSEWHERE = 0, 1, 2, 3, 4
+"""What becomes of a point of the scene, field `reason` of those taken away."""
+REASONS = {
+    SEEN_THROUGH: "photos see a surface behind it",
+    ENCLOSED: "no photo can see it: a measured surface stands before it in all",
+    REPLACED: "the object measured the place better",
+    ELSEWHERE: "the object's photos match clearly better before or behind it",
+}
+# Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
+MARGIN = 0.01
+# Photos that must see through a point, and the share of those that it is open to, where it is not measured: a surface
+# that is wrong itself lies behind good points in some photos; a point that is not there has surfaces behind it in many.
+THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
+# A measured point that more than this share of the compared photos confirm is not seen through.
+SAFE_SHARE = 0.5
+# Steps along the ray (about a pixel) that the object's pose may be off for its photos to say that they match a single
+# point of the scene elsewhere, and the share of what the scene measured beyond which the pose is off after all.
+MAX_POSE_STEPS, MAX_ELSEWHERE_SHARE = 0.5, 0.1
+# Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
+# the sparser side where that is more; never farther than this share of the diagonal.
+SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS, MAX_SAME_PLACE = 5.0, 1.5, 0.02
+# The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
+# denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise.
+BETTER_FACTOR = 1.5
+# Standard deviations of the object within which a point that the scene did not measure may be right.
+CONSISTENT_DEVIATIONS = 3.5
+# Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
+DENSER_FACTOR = 2.0
+# Side of the cells in which both sides' scatter is compared, over the diagonal, and in spacings of the sparser side
+# where that is more. Photos may confirm a point that is off, by chance; that a whole surface is rough shows beside the
+# other side's.
+ROUGH_SIDE, ROUGH_SPACINGS = 0.02, 4.0
+
+
+@dataclass(frozen=True)
+class Compared:
+    """What becomes of the points of both sides.
+
+    Attributes:
+        added: (N,) of the object's points that come into the scene.
+        contradicted: (N,) of the object's points that photos see through.
+        reason: (M,) uint8 of the scene's points: KEPT, or why it is taken away.
+    """
+
+    added: Mask
+    contradicted: Mask
+    reason: NDArray[np.uint8]
+
+
+def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], share: float = 1.0) -> Compared:
+    """Decide which points of both sides stay.
+
+    Measured points are the surface that hides and is seen. What the scene measured goes only where something is left
+    beside it.
+
+    Args:
+        obj: the object where it settled in the scene.
+        scene: the scene's points around it, measured by the photos of both sides.
+        elsewhere: (M,) of the scene's points, see `matched_elsewhere`.
+        views: the photos of both sides.
+        share: of the scene's points there that are given.
+    """
+    diagonal = obj.cloud.diagonal
+    surface = obj.cloud[obj.surface]
+    seen = see(scene.cloud.points, surface, views, spacing(surface.points), MARGIN * diagonal)
+    reason = np.zeros(len(scene.cloud), np.uint8)
+    reason[(seen.hidden == seen.in_view) & (seen.in_view >= CONFIRMING_PHOTOS)] = ENCLOSED
+    reason[elsewhere & (reason == KEPT)] = ELSEWHERE
+    reason[is_seen_through(seen, scene.matches, scene.surface)] = SEEN_THROUGH
+
+    left = scene.surface & (reason == KEPT)
+    both = concatenate([surface, scene.cloud[left]])
+    behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
+    through = is_seen_through(behind, obj.matches, obj.surface)
+    contradicted = np.where(obj.surface, through, behind.through >= THROUGH_PHOTOS)
+    added = obj.surface & ~contradicted
+
+    worse, better = better_measured(replace(obj, surface=added), replace(scene, surface=left), diagonal, share)
+    reason[worse & (reason == KEPT)] = REPLACED
+    added &= ~better
+    replaced = np.flatnonzero(left & (reason == REPLACED))
+    stays = concatenate([obj.cloud[added], scene.cloud[reason == KEPT]])
+    reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
+    reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = KEPT
+    return Compared(added, contradicted, reason)
+
+
+def is_seen_through(seen: Visibility, matches: Matches, measured: Mask) -> Mask:
+    """(N,) points where photos see a surface behind them: enough of those they are open to; of measured ones, a larger
+    share than confirms them.
+
+    All photos are tested against a surface, only the best are matched: their numbers cannot be compared. A measured
+    point that most of the compared photos confirm stays: all photos of a pot before a wall have the wall behind it.
+    """
+    confirming = matches.photos / (matches.tested + 1.0)  # the reference is among both
+    least = np.where(measured, confirming, THROUGH_SHARE) * (seen.in_view - seen.hidden)
+    least = np.where(measured & (confirming > SAFE_SHARE), np.inf, least)
+    return np.asarray(seen.through >= np.maximum(THROUGH_PHOTOS, least))
+
+
+def matched_elsewhere(across: Matches, measured: Mask, pose_error: float) -> Mask:
+    """(N,) points of the scene that the object's photos match clearly better elsewhere along the ray.
+
+    None where the object's pose is uncertain by more than half a pixel, or where that holds for so many that it is off.
+
+    Args:
+        across: matches of the scene's points in the object's photos.
+        measured: (N,) points that the scene's own photos measured.
+        pose_error: how far the object's pose may be off, unit of the points.
+    """
+    better = (across.best >= MIN_MATCH) & (across.best - across.match > MAX_DROP)
+    found = measured & better & (across.photos < CONFIRMING_PHOTOS)
+    both = found | (measured & across.measured)
+    certain = both.any() and pose_error <= MAX_POSE_STEPS * np.median(across.step[both])
+    return found if certain and found.sum() <= MAX_ELSEWHERE_SHARE * both.sum() else np.zeros_like(found)
+
+
+def better_measured(obj: Measured, scene: Measured, diagonal: float, share: float) -> tuple[Mask, Mask]:
+    """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
+
+    `surface` of both sides are the measured points that stay so far; share: of the scene's points that are given.
+    """
+    worse, better = np.zeros(len(scene.cloud), dtype=bool), np.zeros(len(obj.cloud), dtype=bool)
+    if not obj.surface.any() or len(scene.cloud) == 0:
+        return worse, better
+    points = scene.cloud.points
+    first, second = obj.cloud[obj.surface], scene.cloud[scene.surface]
+    mine = _smooth(first.points, obj.matches.deviation[obj.surface])
+    other = _smooth(second.points, scene.matches.deviation[scene.surface])
+    fine = spacing(first.points)
+    coarse = max(fine, spacing(points))
+    if len(second):
+        rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
+        mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
+    is_denser = _times_as_many(second.points, first.points, coarse) > DENSER_FACTOR * share
+    factor = 1 / BETTER_FACTOR if is_denser else BETTER_FACTOR
+    theirs = np.full(len(points), np.inf)
+    theirs[scene.surface] = other
+    # What the scene did not measure lies as far off as what it measured, at least.
+    typical = float(np.median(other)) if len(second) else 0.0
+
+    def is_same(distance: Array, one: Array, two: Array, least: Array | float) -> Mask:
+        common = np.hypot(one, np.where(np.isfinite(two), two, typical))
+        return np.asarray(distance <= np.clip(SAME_PLACE_DEVIATIONS * common, least, MAX_SAME_PLACE * diagonal))
+
+    distance, partner = cKDTree(first.points).query(points, workers=threads())
+    # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
+    least = SAME_PLACE_SPACINGS * np.where(scene.surface, fine, coarse)
+    worse = is_same(distance, mine[partner], theirs, least) & (mine[partner] <= factor * theirs)
+    # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
+    worse &= ~scene.surface | (_beside(points, first[partner]) <= coarse)
+    if len(second):
+        # What it did not measure may well be right where the object measures less exactly than the scene.
+        inexact = (mine[partner] > BETTER_FACTOR * typical) & (distance <= CONSISTENT_DEVIATIONS * mine[partner])
+        worse &= scene.surface | ~inexact
+        distance, partner = cKDTree(second.points).query(first.points, workers=threads())
+        # A better point of a sparser side stands for what lies within a spacing of the object's.
+        there = is_same(distance, mine, other[partner], SAME_PLACE_SPACINGS * coarse)
+        there &= _beside(first.points, second[partner]) <= fine
+        if is_denser:
+            # Of equals the object's points stay in the holes of a denser scene.
+            hole = np.where(mine > BETTER_FACTOR * other[partner], np.inf, SAME_PLACE_SPACINGS * spacing(second.points))
+            there &= _beside(first.points, second[partner]) <= hole
+        better[obj.surface] = there & (mine > factor * other[partner])
+    return worse, better
+
+
+def _alone(points: Array, others: Cloud, reach: float) -> Mask:
+    """(N,) points beside which, along the surface, none of the others lies within reach."""
+    if not len(points) or not len(others):
+        return np.full(len(points), not len(others))
+    count = min(MIN_NEIGHBOURS, len(others))
+    near = cKDTree(others.points).query(points, k=count, workers=threads())[1].reshape(-1)
+    beside = _beside(np.repeat(points, count, axis=0), others[near])
+    return np.asarray(beside.reshape(-1, count).min(1) > reach)
+
+
+def _times_as_many(points: Array, others: Array, reach: float) -> float:
+    """How many of (N, 3) points there are for each of the others (M, 3), where both are within `reach` of each other.
+
+    Counted, since regular points lie farther from their nearest ones than as many irregular ones; doubles are one.
+    """
+    if not len(points):
+        return 0.0
+    shared = [a[cKDTree(b).query(a, workers=threads())[0] < reach] for a, b in ((points, others), (others, points))]
+    return len(np.unique(shared[0], axis=0)) / max(len(shared[1]), 1)
+
+
+def _beside(points: Array, partners: Cloud) -> Array:
+    """How far (N,) points lie beside their partners, along the surface of these."""
+    assert partners.normals is not None
+    away = points - partners.points
+    along = (away * partners.normals).sum(1)
+    return np.asarray(np.sqrt(np.maximum((away**2).sum(1) - along**2, 0)))
+
+
+def _rougher(one: Cloud, two: Cloud, side: float) -> tuple[Array, Array]:
+    """How much more each of two clouds scatters about planes than the other does there, for its points (N,), (M,).
+
+    A standard deviation, by cells of a side, those of points that face the same way apart from the others. What is bent
+    or has an edge scatters in both alike.
+    """
+    keys = [_cells_by_side(cloud, one.points.min(0), side) for cloud in (one, two)]
+    group = np.unique(np.concatenate(keys), axis=0, return_inverse=True)[1].reshape(-1)
+    count, groups = int(group.max()) + 1, (group[: len(one)], group[len(one) :])
+    first, second = (_scatter(cloud.points, of, count) for cloud, of in zip((one, two), groups))
+    known = np.isfinite(first + second)
+    more = [np.sqrt(np.where(known, np.maximum(a**2 - b**2, 0), 0)) for a, b in ((first, second), (second, first))]
+    return more[0][groups[0]], more[1][groups[1]]
+
+
+def _cells_by_side(cloud: Cloud, low: Array, side: float) -> NDArray[np.int64]:
+    """(N, 4) cell of each point, and which of six ways it faces."""
+    assert cloud.normals is not None
+    axis = np.abs(cloud.normals).argmax(1)
+    backwards = cloud.normals[np.arange(len(cloud)), axis] < 0
+    cells = np.floor((cloud.points - low) / side).astype(np.int64)
+    return np.column_stack([cells, axis + 3 * backwards])
+
+
+def _scatter(points: Array, group: NDArray[np.int64], count: int) -> Array:
+    """RMS distance (count,) of the points in each group from the plane through them; NaN where there are too few."""
+    sizes = np.maximum(np.bincount(group, minlength=count), 1)
+    means = np.stack([np.bincount(group, points[:, k], count) / sizes for k in range(3)], axis=1)
+    away = points - means[group]
+    pairs = [np.bincount(group, away[:, i] * away[:, j], count) / sizes for i in range(3) for j in range(3)]
+    least = np.linalg.eigvalsh(np.stack(pairs, axis=1).reshape(-1, 3, 3))[:, 0]
+    return np.where(sizes >= 6, np.sqrt(np.maximum(least, 0)), np.nan)
+
+
+def _smooth(points: Array, deviation: Array) -> Array:
+    """Median standard deviation (N,) of the points around each: single points would mix both sides."""
+    if not len(points):
+        return deviation
+    near = cKDTree(points).query(points, k=min(MIN_NEIGHBOURS, len(points)), workers=threads())[1]
+    return np.median(deviation[near.reshape(len(points), -1)], axis=1)
+
+
+def gaps(points: Array, wanted: Mask, added: Mask, scene: Array) -> Mask:
+    """(N,) of the wanted points those where neither the added ones nor the scene have any."""
+    there = np.concatenate([points[added], scene])
+    if len(there) == 0 or not wanted.any():
+        return wanted
+    free = cKDTree(there).query(points, workers=threads())[0] > SAME_PLACE_SPACINGS * spacing(points)
+    return wanted & free

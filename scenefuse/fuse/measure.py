@@ -1,0 +1,121 @@
+"""Measure: which points of a cloud photos confirm, how exactly, and the fields in which a fused cloud says so (F4)."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from scenefuse.cloud.clouds import Cloud, plane_normals, spacing
+from scenefuse.core.stage import threads
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.photo_check import Matches, Photos, match_in
+
+UNCHECKED, MEASURED, NERF_ONLY, STEREO_ONLY = 0, 1, 2, 3
+"""Values of the field `evidence`."""
+FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
+"""What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
+# A point is measured where photos confirm this share of it and its neighbours: here and there one matches by chance.
+# Neighbours are as many as a plane has within SUPPORT_RADIUS of the object's diagonal, from MIN_ to MAX_NEIGHBOURS.
+SUPPORT, SUPPORT_RADIUS, MIN_NEIGHBOURS, MAX_NEIGHBOURS = 0.5, 0.01, 8, 64
+# Neighbours that a missing normal is fitted to.
+NORMAL_POINTS = 16
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A cloud after its points were matched in photos.
+
+    Attributes:
+        cloud: with normals.
+        matches: of its points.
+        surface: (N,) points that photos confirm together with most of their neighbours.
+    """
+
+    cloud: Cloud
+    matches: Matches
+    surface: NDArray[np.bool_]
+
+    def moved(self, pose: Sim3) -> "Measured":
+        """The same, the cloud in another place."""
+        return replace(self, cloud=self.cloud.transformed(pose))
+
+
+def measure(cloud: Cloud, photos: Photos, diagonal: float) -> Measured:
+    """Match a cloud's points in photos of the same frame; diagonal: of the object."""
+    cloud = with_normals(cloud)
+    matches = match_in(cloud.points, cloud.normals, photos)
+    return Measured(cloud, matches, supported(cloud.points, matches.measured, diagonal))
+
+
+def measure_again(known: Measured, photos: Photos, diagonal: float) -> tuple[Measured, Matches]:
+    """The same cloud by further photos: of each point what those say that confirm it more often, and the smaller
+    standard deviation; and its matches in the further photos alone."""
+    one, two = known.matches, match_in(known.cloud.points, known.cloud.normals, photos)
+    more = two.photos > one.photos
+    best = Matches(**{
+        name: np.where(more, getattr(two, name), values) for name, values in vars(one).items()
+    } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
+    surface = supported(known.cloud.points, one.measured | two.measured, diagonal)
+    return Measured(known.cloud, best, surface), two
+
+
+def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> NDArray[np.bool_]:
+    """(N,) measured points of which most neighbours are measured too."""
+    if not measured.any():
+        return measured
+    step = spacing(points)
+    on_plane = np.pi * (SUPPORT_RADIUS * diagonal / step) ** 2 if step > 0 else MAX_NEIGHBOURS
+    count = min(int(np.clip(on_plane, MIN_NEIGHBOURS, MAX_NEIGHBOURS)) + 1, len(points))
+    near = cKDTree(points).query(points[measured], k=count, workers=threads())[1]
+    found = measured.copy()
+    found[measured] = measured[near.reshape(-1, count)].mean(1) >= SUPPORT
+    return found
+
+
+def with_normals(cloud: Cloud) -> Cloud:
+    """The cloud, with normals of local planes where it has none; their side is unknown then."""
+    if cloud.normals is not None:
+        return cloud
+    if len(cloud) < 3:
+        return replace(cloud, normals=np.tile(np.array([0, 0, 1], np.float32), (len(cloud), 1)))
+    index = cKDTree(cloud.points).query(cloud.points, k=min(NORMAL_POINTS, len(cloud)), workers=threads())[1]
+    return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
+
+
+def with_evidence(known: Measured, otherwise: int) -> Cloud:
+    """The cloud with only these fields: what photos know of its points, and `evidence`: MEASURED or `otherwise`."""
+    matches = known.matches
+    deviation = np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32)
+    fields: dict[str, NDArray[Any]] = {
+        "photos": matches.photos.astype(np.uint16),
+        "match": np.where(matches.tested > 0, matches.match, np.nan).astype(np.float32),
+        "deviation": deviation,
+        "world_deviation": deviation.copy(),
+        "evidence": np.where(known.surface, MEASURED, otherwise).astype(np.uint8),
+    }
+    return replace(known.cloud, fields=fields)
+
+
+def unchecked(cloud: Cloud) -> Cloud:
+    """The cloud with the same fields, empty: it was matched in no photo."""
+    nothing, none = np.full(len(cloud), np.nan), np.zeros(len(cloud), np.int64)
+    return with_evidence(Measured(cloud, Matches(nothing, nothing, none, none, *[nothing] * 3), none > 0), UNCHECKED)
+
+
+def with_pose_uncertainty(cloud: Cloud, covariance: Array, centre: Array) -> Cloud:
+    """Points of an object, `world_deviation` with what its pose adds along their normals (method M10).
+
+    Args:
+        cloud: in the scene, with normals and fields of evidence.
+        covariance: (7, 7) of the pose about `centre`: rotation vector (radians), shift, log scale.
+        centre: (3,) in the scene.
+    """
+    if cloud.normals is None:
+        return cloud
+    lever, normals = cloud.points - centre, cloud.normals.astype(np.float64)
+    along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
+    of_pose = np.einsum("ni,ij,nj->n", along, covariance, along)
+    whole = np.sqrt(cloud.fields["deviation"].astype(np.float64) ** 2 + np.maximum(of_pose, 0))
+    return replace(cloud, fields=cloud.fields | {"world_deviation": whole.astype(np.float32)})
