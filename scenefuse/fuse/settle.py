@@ -1,4 +1,4 @@
-"""The last step of a pose: what photos measured of the object, laid on what photos measured of the scene."""
+"""Settle: the last step of a pose lays what photos measured of the object on what they measured of the scene (F4)."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,24 +9,22 @@ from scenefuse.geometry.icp import COLOR_WEIGHT, ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface, with_queries
 from scenefuse.register.uncertainty import half_sampling
 
+# Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles.
 REACHES = (0.04, 0.02, 0.01)
-"""Pairs within these shares of the diagonal, one after the other: an object a few per cent off still settles."""
+# The scale stays within five per cent of what the registration found.
 SCALE_WIDTH = 0.05
-"""The scale stays within five per cent of what the registration found."""
-MOST_SETTLED = 0.04
-"""An object that would move by more than this share of its diagonal (RMS) is not where the registration put it."""
-LEAST_POINTS = 200
-"""Measured points that each side needs."""
-MOST, QUERIES = 20000, 5000
-"""Points at most of each side, drawn evenly, and of these those that look for a partner. They are not averaged, which
-would round corners off."""
+# An object that would move by more than this share of its diagonal (RMS) is not where the registration put it.
+MAX_MOVED = 0.04
+# Measured points that each side needs; of each side at most so many, drawn evenly, and of these those that look for a
+# partner. They are not averaged, which would round corners off.
+MIN_POINTS, MAX_POINTS, MAX_QUERIES = 200, 20000, 5000
 ROUNDS = 10
-OUT_OF_PLACE = 0.005
-"""An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed: a
-registration's position may be as uncertain as that."""
-HALVES, STEADY = 6, 0.003
-"""Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale
-to be settled too: a roof alone does not say how large a house is."""
+# An object that moves by more than this share of its diagonal was put at a wrong place, however certain that seemed: a
+# registration's position may be as uncertain as that.
+MIN_MISPLACED = 0.005
+# Halves of the surfaces that are settled alike, and how far their poses may spread, over the diagonal, for the scale to
+# be settled too: a roof alone does not determine how large a house is.
+HALVES, MAX_SPREAD = 6, 0.003
 
 
 def settle(
@@ -38,7 +36,7 @@ def settle(
     both sides are what their photos confirmed, so the same refinement (method R8: planes, points and colours both ways)
     is more exact. The scale stays what it is where the surfaces do not determine it. Where the registration was more
     certain than that, by the photos that both sides share for instance, the object stays as it is, unless it would move
-    by more than OUT_OF_PLACE: the surfaces of a scene's stereo have errors of their own.
+    by more than MIN_MISPLACED: the surfaces of a scene's stereo have errors of their own.
 
     Args:
         obj: measured points in the scene's frame, with normals, and colours if both have them.
@@ -49,19 +47,19 @@ def settle(
 
     Returns:
         settled_from_placed and the RMS distance that it moves the object's points, over the diagonal; None where a side
-        has too few points, or where they would move by more than MOST_SETTLED.
+        has too few points, or where they would move by more than MAX_MOVED.
     """
-    if min(len(obj), len(scene)) < LEAST_POINTS:
+    if min(len(obj), len(scene)) < MIN_POINTS:
         return None
     mine, theirs = _surface(obj, seed), _surface(scene, seed)
     pose, scales = _refined(mine, theirs, SCALE_WIDTH, diagonal), ScaleRange(1.0, SCALE_WIDTH)
     spread = half_sampling([(mine, theirs)], pose, scales, REACHES[1] * diagonal, HALVES, seed)
-    if spread is None or spread.size(diagonal) > STEADY:
+    if spread is None or spread.size(diagonal) > MAX_SPREAD:
         pose = _refined(mine, theirs, 0.0, diagonal)
     moved = float(np.sqrt(((pose.apply(obj.points) - obj.points) ** 2).sum(1).mean())) / diagonal
-    if certain is not None and moved <= OUT_OF_PLACE and (spread is None or certain < spread.size(diagonal)):
+    if certain is not None and moved <= MIN_MISPLACED and (spread is None or certain < spread.size(diagonal)):
         return Sim3.identity(), 0.0
-    return (pose, moved) if moved <= MOST_SETTLED else None
+    return (pose, moved) if moved <= MAX_MOVED else None
 
 
 def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float) -> Sim3:
@@ -75,9 +73,9 @@ def _refined(mine: Surface, theirs: Surface, scale_width: float, diagonal: float
 def _surface(cloud: Cloud, seed: int) -> Surface:
     """A cloud made ready for refinement."""
     rng = np.random.default_rng(seed)
-    thin = cloud[np.sort(rng.permutation(len(cloud))[:MOST])]
+    thin = cloud[np.sort(rng.permutation(len(cloud))[:MAX_POINTS])]
     colors = None if thin.colors is None else thin.colors / 255.0
     assert thin.normals is not None
     normals = thin.normals.astype(np.float64)
     surface = Surface(thin.points, normals, colors, cKDTree(thin.points), np.arange(len(thin)))
-    return with_queries(surface, QUERIES, seed)
+    return with_queries(surface, MAX_QUERIES, seed)

@@ -5,28 +5,25 @@ import math
 import numpy as np
 from numba import njit, prange
 
+# Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart.
 RADIUS = 3
-"""Samples on each side of a patch's middle: 7 x 7 of them, a pixel of the sharpest photo apart."""
+# Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos.
 OFFSETS = 4
-"""Steps before and behind the point that are matched too; a step moves a patch by about a pixel in the other photos."""
-OTHERS = 10
-"""Photos at most that one point is compared in, beside its reference."""
-BEST = 3
-"""Of these so many count at each offset: the others may not see the place (Goesele et al. 2006)."""
-SIGMA_GREY = 25.0
-"""Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon and Kweon
-2006)."""
+# Photos at most that one point is compared in, beside its reference, and how many of them count at each offset: the
+# others may not see the place (Goesele et al. 2006).
+OTHERS, BEST = 10, 3
+# Grey levels over which a sample's weight falls: across an edge a patch does not mix two surfaces (Yoon, Kweon 2006).
+GREY_FALL = 25.0
+# Photos that look along a surface (beyond 75 degrees) show little of it.
 MIN_COSINE = 0.25
-"""Photos that look along a surface (beyond 75 degrees) show little of it."""
+# Between two rays to a point: below the first a match does not locate it, beyond the last patches look different; the
+# second is as good as any up to half way to the last.
 MIN_ANGLE, GOOD_ANGLE, MAX_ANGLE = math.radians(3), math.radians(12), math.radians(60)
-"""Between two rays to a point: under the first a match says nothing about its place, over the last patches look
-different; the second is as good as any up to half way to the last."""
-REFERENCES, REFERENCE_ANGLE = 3, math.radians(20)
-"""Photos that a point is seen from as reference, one after the other, and the least angle between them."""
-ENOUGH = 4
-"""Photos that confirm a point after which no other reference is tried."""
+# Photos that a point is seen from as reference, one after the other, and the least angle between them; no other one is
+# tried where so many photos confirm the point.
+REFERENCES, REFERENCE_ANGLE, ENOUGH = 3, math.radians(20), 4
+# Grey levels (one standard deviation) that a photo's pixels are off at least.
 NOISE = 1.5
-"""Grey levels (one standard deviation) that a photo's pixels are off at least."""
 
 _REFERENCE_COSINE = math.cos(REFERENCE_ANGLE)
 _BLOCK = 64
@@ -135,7 +132,7 @@ def _reference_patch(pixels, start, width, height, p, point, across, down, patch
     total = mean = 0.0
     for k in range(_SAMPLES):
         a, b = k % _SIDE - RADIUS, k // _SIDE - RADIUS
-        grey = (patch[k] - middle) / SIGMA_GREY
+        grey = (patch[k] - middle) / GREY_FALL
         weight[k] = math.exp(-0.5 * (a * a + b * b) / (RADIUS * RADIUS) - 0.5 * grey * grey)
         total += weight[k]
         mean += weight[k] * patch[k]
@@ -228,15 +225,15 @@ def _match(
 
 
 @njit(error_model="numpy")
-def _next_reference(point, centres, quality, asked, count):
-    """The best photo that looks from more than REFERENCE_ANGLE beside all `asked` so far, or -1."""
+def _next_reference(point, centres, quality, tried, count):
+    """The best photo that looks from more than REFERENCE_ANGLE from all that were tried, or -1."""
     best = -1
     for v in range(len(quality)):
         if quality[v] <= 0.0 or (best >= 0 and quality[v] <= quality[best]):
             continue
         apart = True
         for k in range(count):
-            apart &= _cosine(point, centres[v], centres[asked[k]]) < _REFERENCE_COSINE
+            apart &= _cosine(point, centres[v], centres[tried[k]]) < _REFERENCE_COSINE
         if apart:
             best = v
     return best
@@ -264,7 +261,7 @@ def match_points(  # type: ignore[no-untyped-def]
     count, views = len(points), len(focals)
     for block in prange((count + _BLOCK - 1) // _BLOCK):
         quality, cosine = np.zeros(views), np.zeros(views)
-        chosen, angles, asked = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
+        chosen, angles, tried = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
         patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
         samples, ncc = np.zeros((_STEPS, _SAMPLES), np.float32), np.zeros((OTHERS, _STEPS))
         information, at_offset, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
@@ -273,10 +270,10 @@ def match_points(  # type: ignore[no-untyped-def]
             point, normal = points[i], normals[i]
             _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)
             for attempt in range(REFERENCES):
-                ref = _next_reference(point, centres, quality, asked, attempt)
+                ref = _next_reference(point, centres, quality, tried, attempt)
                 if ref < 0 or confirming[i] >= ENOUGH:
                     break
-                asked[attempt] = ref
+                tried[attempt] = ref
                 others = _choose(point, ref, centres, quality, chosen, angles, worth)
                 if others < 2:
                     continue
