@@ -29,11 +29,11 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.object_cloud import CloudSettings
-from scenefuse.nerf.prior.refine_depth import FeedbackSettings
 from scenefuse.nerf.prior.train_depth import DepthTrainingSettings
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import Schedule
 from scenefuse.paper.compare_with_paper import ComparisonSettings
+from scenefuse.paper.monocular import MonocularSettings
 from scenefuse.photos.frames import FrameSettings
 from scenefuse.register.agreement import AgreementSettings
 from scenefuse.register.coarse import CoarseSettings
@@ -142,7 +142,7 @@ SECTIONS: dict[str, list[Any]] = {
     "object.masks": [MaskSettings()],
     "object.stage1": [PoseSourceSettings(), DepthTrainingSettings()],
     "object.stage2": [Schedule()],
-    "object.stage3": [FeedbackSettings()],
+    "object.stage3": [MonocularSettings(epochs=5)],
     "object.stage4": [Schedule()],
     "object.nerf": [NerfSettings(), FieldSettings(), Schedule()],
     "object.cloud": [CloudSettings()],

@@ -62,9 +62,7 @@ def hash_grid(levels: int, log2_table: int, coarsest: int, finest: int) -> HashG
     )
 
 
-def encode_reference(
-    x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None = None, fine_from: int = 0
-) -> Tensor:
+def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor) -> Tensor:
     """`encode` in plain PyTorch, on every device."""
     device = x.device
     resolution = torch.from_numpy(grid.resolution).to(device)
@@ -80,42 +78,30 @@ def encode_reference(
     hashed = (vx ^ (vy * kernels.PRIMES[1]) ^ (vz * kernels.PRIMES[2])) & mask
     row = torch.where(stride > 0, vx + stride * (vy + stride * vz), hashed) + offset
     weight = torch.where(corners.bool(), part, 1 - part).prod(-1)
-    values = table[row]
-    if boost is not None:
-        fine = torch.arange(len(grid.resolution), device=device) >= fine_from
-        boosted = values * torch.where(fine, boost[:, None], 1.0)[:, :, None, None]
-        values = boosted + (values - boosted).detach()
-    features = (values * weight[..., None]).sum(2)
+    features = (table[row] * weight[..., None]).sum(2)
     return (features * level_weight.to(device)[None, :, None]).flatten(1)
 
 
 class _Encode(torch.autograd.Function):
-    """The kernels of a device as one differentiable function of positions and table."""
+    """The kernels of a device as one function, differentiable by the table."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None,
-                fine_from: int) -> Tensor:  # fmt: skip
+    def forward(ctx: Any, x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor) -> Tensor:
         kernel, plain = kernel_module(x.device)
         levels = tuple(plain(t) for t in (*grid.on(x.device), level_weight))
         out = torch.empty(len(x), 2 * len(grid.resolution), device=x.device)
         kernel.encode(plain(x), plain(table), levels, plain(out))
-        ctx.save_for_backward(x, table, torch.ones(len(x), device=x.device) if boost is None else boost)
-        ctx.levels, ctx.fine_from = levels, fine_from
+        ctx.save_for_backward(x, table)
+        ctx.levels = levels
         return out
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> Any:
-        x, table, boost = ctx.saved_tensors
+        x, table = ctx.saved_tensors
         kernel, plain = kernel_module(x.device)
-        given = plain(x), plain(gradients[0].contiguous())
-        g_x = g_table = None
-        if ctx.needs_input_grad[0]:
-            g_x = torch.empty_like(x)
-            kernel.encode_backward_x(*given, plain(table), ctx.levels, plain(g_x))
-        if ctx.needs_input_grad[1]:
-            g_table = torch.empty_like(table)
-            kernel.encode_backward(*given, ctx.levels, plain(boost), ctx.fine_from, plain(g_table))
-        return g_x, g_table, None, None, None, None
+        g_table = torch.empty_like(table)
+        kernel.encode_backward(plain(x), plain(gradients[0].contiguous()), ctx.levels, plain(g_table))
+        return None, g_table, None, None
 
 
 def kernels_on(device: str) -> str:
@@ -133,22 +119,18 @@ def kernel_module(device: torch.device) -> tuple[Any, Callable[[Tensor], Any]]:
     return None, Tensor.detach
 
 
-def encode(
-    x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor, boost: Tensor | None = None, fine_from: int = 0
-) -> Tensor:
-    """Encode (N, 3) positions in 0..1 as (N, 2 L) features.
+def encode(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Tensor) -> Tensor:
+    """Encode (N, 3) positions in 0..1 as (N, 2 L) features, differentiable by the table.
 
     Args:
         x: positions; the upper bound 1 itself is excluded.
         table: (T, 2) trainable features.
         grid: the levels.
         level_weight: (L,) in 0..1: coarse-to-fine training holds fine levels back.
-        boost: (N,) factor on each sample's gradient on levels >= fine_from (adaptive grid update), or None.
-        fine_from: first level that `boost` acts on.
     """
     if kernel_module(x.device)[0] is not None:
-        return _Encode.apply(x.contiguous(), table, grid, level_weight, boost, fine_from)
-    return encode_reference(x, table, grid, level_weight, boost, fine_from)
+        return _Encode.apply(x.contiguous(), table, grid, level_weight)
+    return encode_reference(x, table, grid, level_weight)
 
 
 def spherical_harmonics(direction: Tensor) -> Tensor:

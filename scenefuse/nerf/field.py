@@ -15,7 +15,6 @@ LARGEST_LOG_DENSITY = 11.0
 FIRST_FEATURE = 1e-4  # initial features are uniform in +-1e-4, as in instant-ngp
 # Training from coarse to fine begins with half of the levels, and with so many at least.
 LEVELS_AT_START = 4
-TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -55,10 +54,10 @@ class Field(nn.Module):
         self.level_weight: Tensor
         self.register_buffer("level_weight", torch.ones(settings.levels))
 
-    def geometry(self, x: Tensor, boost: Tensor | None = None, fine_from: int = 0) -> tuple[Tensor, Tensor]:
+    def geometry(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Density (N,) per unit of length and features (N, 16) at positions (N, 3), in the unit cube."""
         inside = x.clamp(0.0, 1.0 - 1e-6)
-        features = encode(inside, self.table, self.grid, self.level_weight, boost, fine_from)
+        features = encode(inside, self.table, self.grid, self.level_weight)
         out = self.density_out(torch.relu(self.density_in(features)))
         return torch.exp(out[:, 0].clamp(max=LARGEST_LOG_DENSITY)), out
 
@@ -83,50 +82,6 @@ def coarse_to_fine(field: Field, progress: float, finished: float) -> None:
     first = max(LEVELS_AT_START, levels // 2)
     opened = levels if finished <= 0 else first + (levels - first) * progress / finished
     field.level_weight.copy_((opened - torch.arange(levels, device=field.level_weight.device)).clamp(0.0, 1.0))
-
-
-@dataclass
-class EdgeRates:
-    """The paper's adaptive grid as longer steps (method N9): rows of the fine levels learn faster where edges are.
-
-    Adam divides every row's gradient by its own usual size, and with it any factor that a row's gradients share. A
-    factor on Adam's steps stays.
-
-    Attributes:
-        boost: a row that shows nothing but edges takes steps 1 + `boost` times as long; 0 for Adam's own.
-        use: (T, 2) opacity that each row of the table has shown at edges, and in all; (0, 2) without a boost.
-    """
-
-    boost: float
-    use: Tensor
-
-    @staticmethod
-    def of(field: Field, boost: float) -> "EdgeRates":
-        """Before anything has been seen."""
-        return EdgeRates(boost, torch.zeros(len(field.table) if boost else 0, 2, device=field.table.device))
-
-    def see(self, field: Field, x: Tensor, opacity: Tensor, edge: Tensor) -> None:
-        """Count N samples at positions (N, 3): their opacities (N,), and how much of an edge, 0..1, each is (N,)."""
-        table = torch.zeros_like(field.table, requires_grad=True)
-        features = encode(x.clamp(0.0, 1.0 - 1e-6), table, field.grid, torch.ones_like(field.level_weight))
-        seen = torch.stack([opacity * edge, opacity], dim=1).repeat(1, field.settings.levels)
-        self.use += torch.autograd.grad(features, table, seen)[0]
-
-    def factor(self, field: Field) -> Tensor:
-        """(T, 1) how much longer the step of each row is: 1 on the coarse half of the levels."""
-        factor = 1 + self.boost * self.use[:, :1] / self.use[:, 1:].clamp(min=TINY)
-        factor[: int(field.grid.offset[field.settings.levels // 2])] = 1.0
-        return factor
-
-    @torch.no_grad()
-    def step(self, field: Field, optimizer: torch.optim.Optimizer) -> None:
-        """The optimiser's step, longer where edges are."""
-        if not self.boost:
-            optimizer.step()
-            return
-        before = field.table.clone()
-        optimizer.step()
-        field.table.copy_(before + self.factor(field) * (field.table - before))
 
 
 def _linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:

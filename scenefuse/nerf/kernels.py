@@ -56,17 +56,9 @@ def encode(x, table, levels, out):  # type: ignore[no-untyped-def]
     _encode(nb.get_num_threads(), x, table, levels, out)
 
 
-def encode_backward(x, gradient, levels, boost, fine_from, out):  # type: ignore[no-untyped-def]
-    """Gradient of `encode` with respect to the table, written to out (T, 2).
-
-    gradient (N, 2 L); boost (N,) multiplies a sample's gradient on levels >= fine_from.
-    """
-    _encode_backward(nb.get_num_threads(), x, gradient, levels, boost, fine_from, out)
-
-
-def encode_backward_x(x, gradient, table, levels, out):  # type: ignore[no-untyped-def]
-    """Gradient of `encode` with respect to the positions, written to out (N, 3)."""
-    _encode_backward_x(nb.get_num_threads(), x, gradient, table, levels, out)
+def encode_backward(x, gradient, levels, out):  # type: ignore[no-untyped-def]
+    """Gradient (N, 2 L) of `encode` with respect to the table, written to out (T, 2)."""
+    _encode_backward(nb.get_num_threads(), x, gradient, levels, out)
 
 
 @_inline
@@ -177,7 +169,7 @@ def _add(out, row, weight, a, b):
 
 
 @_jit
-def _encode_backward(threads, x, gradient, levels, boost, fine_from, out):
+def _encode_backward(threads, x, gradient, levels, out):
     """One thread owns a level, and sets it to zero just before adding to it: its rows are still in the cache then."""
     resolution, stride, offset, mask, level_weight = levels
     last_level = resolution.shape[0] - 1
@@ -193,8 +185,7 @@ def _encode_backward(threads, x, gradient, levels, boost, fine_from, out):
             for n in range(x.shape[0]):
                 if far:
                     _fetch(out, x[min(n + AHEAD, x.shape[0] - 1)], size, step, start, bits)
-                scale = weight * boost[n] if level >= fine_from else weight
-                ga, gb = scale * gradient[n, 2 * level], scale * gradient[n, 2 * level + 1]
+                ga, gb = weight * gradient[n, 2 * level], weight * gradient[n, 2 * level + 1]
                 if ga == ZERO and gb == ZERO:
                     continue
                 ix, fx = _cell(x[n, 0], size)
@@ -211,37 +202,6 @@ def _encode_backward(threads, x, gradient, levels, boost, fine_from, out):
                 _add(out, r5, fx * c, ga, gb)
                 _add(out, r6, gx * d, ga, gb)
                 _add(out, r7, fx * d, ga, gb)
-
-
-@_jit
-def _encode_backward_x(threads, x, gradient, table, levels, out):
-    resolution, stride, offset, mask, level_weight = levels
-    count = x.shape[0]
-    for thread in prange(threads):
-        first, last = count * thread // threads, count * (thread + 1) // threads
-        out[first:last] = ZERO
-        for level in range(resolution.shape[0]):
-            weight = level_weight[level]
-            if weight == ZERO:
-                continue
-            size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
-            far = _is_far(step, bits)
-            for n in range(first, last):
-                if far:
-                    _fetch(table, x[min(n + AHEAD, last - 1)], size, step, start, bits)
-                p, q = weight * size * gradient[n, 2 * level], weight * size * gradient[n, 2 * level + 1]
-                ix, fx = _cell(x[n, 0], size)
-                iy, fy = _cell(x[n, 1], size)
-                iz, fz = _cell(x[n, 2], size)
-                r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
-                v0, v1 = p * table[r0, 0] + q * table[r0, 1], p * table[r1, 0] + q * table[r1, 1]
-                v2, v3 = p * table[r2, 0] + q * table[r2, 1], p * table[r3, 0] + q * table[r3, 1]
-                v4, v5 = p * table[r4, 0] + q * table[r4, 1], p * table[r5, 0] + q * table[r5, 1]
-                v6, v7 = p * table[r6, 0] + q * table[r6, 1], p * table[r7, 0] + q * table[r7, 1]
-                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
-                out[n, 0] += gz * (gy * (v1 - v0) + fy * (v3 - v2)) + fz * (gy * (v5 - v4) + fy * (v7 - v6))
-                out[n, 1] += gz * (gx * (v2 - v0) + fx * (v3 - v1)) + fz * (gx * (v6 - v4) + fx * (v7 - v5))
-                out[n, 2] += gy * (gx * (v4 - v0) + fx * (v5 - v1)) + fy * (gx * (v6 - v2) + fx * (v7 - v3))
 
 
 @_inline

@@ -3,7 +3,7 @@
 `inside` rays were drawn from the object's pixels, the others beside it.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
@@ -15,8 +15,6 @@ COLOR_DELTA = 0.1
 SOLID = 0.5
 # Absolute depth is quadratic within this distance of the prior, in nerf units (the cube's side is 1).
 DEPTH_DELTA = 0.01
-# Pairs of the ranking loss lie apart by so much of the photo's width (method N3), and differ by so much in nerf units.
-RANK_APART, RANK_MARGIN = 0.02, 0.02
 
 
 @dataclass(frozen=True)
@@ -27,18 +25,16 @@ class LossWeights:
     """Photometric loss inside the mask."""
     depth_weight: float = 2.0
     """Absolute depth against the prior."""
-    rank_weight: float = 0.02
-    """Relative depth: order of pairs of pixels as the prior has it."""
     mask_weight: float = 0.1
     """Opacity against the mask."""
     sparsity_weight: float = 0.05
     """Density on rays that miss the object."""
     distortion_weight: float = 0.01
-    """Spread of the weights along a ray."""
+    """Spread of the weights along a ray: equation (15) of Mip-NeRF 360 (Barron et al. 2022), see `render.composite`."""
 
-    def total(self, terms: dict[str, Tensor]) -> Tensor:
-        """Weighted sum of loss terms by their name."""
-        return torch.stack([getattr(self, f"{name}_weight") * term for name, term in terms.items()]).sum()
+    def by_name(self) -> dict[str, float]:
+        """The weights by the names of their losses."""
+        return {name.removesuffix("_weight"): weight for name, weight in asdict(self).items()}
 
 
 def color_loss(predicted: Tensor, target: Tensor, weight: Tensor) -> Tensor:
@@ -57,33 +53,6 @@ def depth_loss(distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor)
     return (error * weight[valid]).sum() / (weight > 0).sum().clamp(min=1)
 
 
-def rank_loss(
-    distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor, uv: Tensor, images: int, apart_px: float
-) -> Tensor:
-    """The paper's relative depth: order of two pixels' depths as the prior has it (method N3).
-
-    The ranking hinge of SparseNeRF (Wang et al. 2023), in units of its margin.
-
-    Args:
-        distance: (R,) expected depth along the ray, `images` equal groups of rays one after the other.
-        opacity: (R,); both pixels of a pair have to be solid.
-        prior: (R,) prior depth along the ray.
-        weight: (R,) confidence of the prior, 0 where there is none (also outside the mask).
-        uv: (R, 2) pixels.
-        images: number of groups; pairs never cross them.
-        apart_px: least distance between two pixels of a pair.
-    """
-    groups = [a.view(images, -1) for a in (distance, opacity.detach(), prior, weight)]
-    half = groups[0].shape[1] // 2
-    (d, d2), (o, o2), (p, p2), (w, w2) = ((a[:, -2 * half : -half], a[:, -half:]) for a in groups)
-    grouped = uv.view(images, -1, 2)
-    apart = (grouped[:, -2 * half : -half] - grouped[:, -half:]).norm(dim=-1) >= apart_px
-    sign = torch.sign(p2 - p)
-    valid = apart & (w > 0) & (w2 > 0) & (o > SOLID) & (o2 > SOLID) & ((p2 - p).abs() > RANK_MARGIN)
-    hinge = torch.relu(RANK_MARGIN - sign * (d2 - d)) / RANK_MARGIN
-    return (hinge * torch.minimum(w, w2) * valid).sum() / valid.sum().clamp(min=1)
-
-
 def mask_loss(opacity: Tensor, matte: Tensor) -> Tensor:
     """Binary cross-entropy of opacity (R,) against the matte (R,) in 0..1 (method N5)."""
     clipped = opacity.clamp(1e-4, 1 - 1e-4)
@@ -95,8 +64,3 @@ def sparsity_loss(sigma: Tensor, delta: Tensor, inside: Tensor) -> Tensor:
     empty = ~inside
     opacity = 1 - torch.exp(-sigma[empty] * delta[empty])
     return opacity.mean() if len(opacity) else sigma.sum() * 0
-
-
-def distortion_loss(distortion: Tensor) -> Tensor:
-    """Mean distortion (R,): equation (15) of Mip-NeRF 360 (Barron et al. 2022), see `render.composite`."""
-    return distortion.mean()

@@ -111,7 +111,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
         known["up_in_camera_frame"] = up
     views = _views(inputs, saved["names"])
     maps = read_maps(inputs.stage, views, settings.gates.min_confidence)
-    poses, rendered = saved["object_from_cam"].numpy(), max(int((maps.depths > 0).sum()), 1)
+    poses, rendered = views.object_from_cam, max(int((maps.depths > 0).sum()), 1)
     refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
     maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
     raw, diagonal = fuse_depths(_neutral(views, saved), poses, maps, settings)

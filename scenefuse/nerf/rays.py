@@ -10,10 +10,6 @@ from torch.nn.functional import max_pool2d
 
 # Pixels beside the object are drawn from a ring of so many pixels around its mask: farther away the hull is empty.
 RING_PX = 12
-# Half-width of the zone around mask edges and depth jumps in which the adaptive grid learns faster.
-EDGE_PX = 3
-# A neighbour's depth that differs by more than this share is a jump, no slanted surface.
-DEPTH_JUMP = 0.03
 # Share of a photo's rays that are drawn beside the object: they teach that nothing is there.
 OUTSIDE_SHARE = 0.1
 # A mask that the ignored band would leave less than this share of is drawn from as a whole: it is thin everywhere.
@@ -33,8 +29,6 @@ class PhotoTensors:
         center: (V, 3) float32 camera centres.
         depths: (V, H, W) float32 prior depth along z in nerf units, 0 where there is none.
         confidence: (V, H, W) float32 in 0..1, weight of the prior.
-        order: (V, H, W) float32 depth along z in nerf units whose order alone is learned, 0 where there is none; None
-            to learn that of the prior, where it is confident.
         hidden: (V, H, W) bool, pixels beside the object that do not say that nothing is there, since something stands
             before it; None for none.
     """
@@ -47,7 +41,6 @@ class PhotoTensors:
     center: Tensor
     depths: Tensor
     confidence: Tensor
-    order: Tensor | None = None
     hidden: Tensor | None = None
 
     def __len__(self) -> int:
@@ -72,14 +65,12 @@ class PixelPool:
         inside_start: bounds of each view in `inside`.
         outside: pixels beside the object.
         outside_start: bounds of each view in `outside`.
-        edge: (V, H, W) float32 in 0..1, 1 at mask edges and at jumps of the prior depth.
     """
 
     inside: NDArray[np.int32]
     inside_start: NDArray[np.int64]
     outside: NDArray[np.int32]
     outside_start: NDArray[np.int64]
-    edge: Tensor
 
 
 @dataclass(frozen=True)
@@ -94,8 +85,6 @@ class RayBatch:
         color: (R, 3) float32 in 0..1.
         depth: (R,) float32 prior along z, 0 without one.
         confidence: (R,) float32.
-        edge: (R,) float32.
-        order: (R,) float32 depth along z whose order is learned, or None; see `PhotoTensors`.
     """
 
     view: Tensor
@@ -105,12 +94,10 @@ class RayBatch:
     color: Tensor
     depth: Tensor
     confidence: Tensor
-    edge: Tensor
-    order: Tensor | None = None
 
     def to(self, device: torch.device) -> "RayBatch":
         """The same on a device."""
-        return RayBatch(**{name: part.to(device) for name, part in vars(self).items() if part is not None})
+        return RayBatch(**{name: part.to(device) for name, part in vars(self).items()})
 
 
 def dilate(masks: Tensor, radius_px: int) -> Tensor:
@@ -139,20 +126,7 @@ def pixel_pool(photos: PhotoTensors, band_px: int) -> PixelPool:
     ring = dilate(outer, RING_PX) & ~outer
     if photos.hidden is not None:
         ring &= ~photos.hidden
-    border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
-    edges = dilate(border | depth_jumps(photos.depths), EDGE_PX)
-    return PixelPool(*_flatten(inner), *_flatten(ring), edges.float())
-
-
-def depth_jumps(depths: Tensor) -> Tensor:
-    """Pixels (V, H, W) where the depth jumps from one to the next; never those without depth."""
-    jump = torch.zeros_like(depths, dtype=torch.bool)
-    for axis in (1, 2):
-        a, b = depths.narrow(axis, 0, depths.shape[axis] - 1), depths.narrow(axis, 1, depths.shape[axis] - 1)
-        found = (a > 0) & (b > 0) & ((a - b).abs() > DEPTH_JUMP * torch.minimum(a, b))
-        jump.narrow(axis, 0, depths.shape[axis] - 1).logical_or_(found)
-        jump.narrow(axis, 1, depths.shape[axis] - 1).logical_or_(found)
-    return jump
+    return PixelPool(*_flatten(inner), *_flatten(ring))
 
 
 def _flatten(masks: Tensor) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
@@ -188,8 +162,6 @@ def draw_batch(photos: PhotoTensors, pool: PixelPool, seed: int, step: int, imag
         photos.images[view, down, across].float() / 255.0,
         photos.depths[view, down, across],
         photos.confidence[view, down, across],
-        pool.edge[view, down, across],
-        None if photos.order is None else photos.order[view, down, across],
     )
 
 

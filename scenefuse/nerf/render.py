@@ -161,6 +161,11 @@ class Composited:
     distortion: Tensor
     weights: Tensor
 
+    @property
+    def distance(self) -> Tensor:
+        """Expected distance (R,) of the surface along the ray."""
+        return self.moment / self.opacity.clamp(min=1e-3)
+
 
 def composite(sigma: Tensor, rgb: Tensor, t: Tensor, delta: Tensor) -> Composited:
     """Volume rendering by quadrature: equation (3) of NeRF (Mildenhall et al. 2020).

@@ -13,12 +13,13 @@ from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
 from scenefuse.nerf.appearance import falloff_map, fitted_log_gain, gains_nearby
+from scenefuse.nerf.prior.confirmed import MAP_AGREEMENT
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
 from scenefuse.photos.maps import write_depth, write_normals
 from scenefuse.photos.pictures import write_picture
-from scenefuse.photos.views import Views, chosen_by
+from scenefuse.photos.views import Views
 
 Maps = NDArray[np.float32]
 
@@ -38,7 +39,7 @@ class RenderedMapSettings:
 
     render_samples: int = 32
     """Samples per ray when views are rendered."""
-    map_agreement: float = 0.005
+    map_agreement: float = MAP_AGREEMENT
     """Two depths of one place agree within this share of the object's diagonal."""
 
 
@@ -48,7 +49,6 @@ class RenderedMaps:
 
     Attributes:
         views: photos, masks and cameras.
-        poses: (V, 4, 4) object_from_cam of the maps.
         depths: (V, H, W) along z, 0 for none.
         confidence: (V, H, W) in 0..1.
         rendered: V renders in nerf units, with the vignetting and `log_gain`; those of photos that do not measure
@@ -60,7 +60,6 @@ class RenderedMaps:
     """
 
     views: Views
-    poses: NDArray[np.float64]
     depths: Maps
     confidence: Maps
     rendered: list[RenderedView]
@@ -74,7 +73,6 @@ def render_maps(
     nerf: Nerf,
     photos: PhotoTensors,
     views: Views,
-    poses: NDArray[np.float64],
     scale: float,
     settings: RenderedMapSettings,
 ) -> RenderedMaps:
@@ -84,7 +82,6 @@ def render_maps(
         nerf: trained.
         photos: as tensors in the unit cube's frame.
         views: the same photos.
-        poses: (V, 4, 4) object_from_cam, those of `photos`.
         scale: nerf units per object unit.
         settings: samples, and what agrees.
 
@@ -107,9 +104,11 @@ def render_maps(
         raise StageError(
             f"the NeRF found no surface: no ray reached an opacity of {LEAST_OPACITY}; check the masks and the cameras"
         )
-    diagonal = extent(np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, poses)]))
-    confidence = _confidence(depths, rendered, views, poses, settings.map_agreement * diagonal)
-    return RenderedMaps(views, poses, depths, confidence, rendered, log_gain, looks[1], measured, diagonal)
+    diagonal = extent(
+        np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, views.object_from_cam)])
+    )
+    confidence = _confidence(depths, rendered, views, settings.map_agreement * diagonal)
+    return RenderedMaps(views, depths, confidence, rendered, log_gain, looks[1], measured, diagonal)
 
 
 def write_maps(maps: RenderedMaps, folder: Path) -> None:
@@ -129,7 +128,7 @@ def write_maps(maps: RenderedMaps, folder: Path) -> None:
 
 
 def write_nerf(path: Path, nerf: Nerf, nerf_from_object: Sim3, maps: RenderedMaps) -> None:
-    """Write what a later stage goes on from: the field, its cube, and poses and appearance of the photos.
+    """Write what a later stage goes on from: the field, its cube, and the appearance of the photos.
 
     The gains of held-out photos, which the cloud's colours need too, are fitted to the whole photo here.
     """
@@ -141,7 +140,6 @@ def write_nerf(path: Path, nerf: Nerf, nerf_from_object: Sim3, maps: RenderedMap
         "model": nerf.state(),
         "nerf_from_object": torch.from_numpy(nerf_from_object.matrix),
         "names": maps.views.names,
-        "object_from_cam": torch.from_numpy(maps.poses),
         "log_gain": log_gain,
         "falloff": maps.falloff,
     }
@@ -173,8 +171,7 @@ def read_nerf(stage: Path) -> dict[str, Any]:
 def measure_quality(
     views: Views, rendered: list[RenderedView], measured: NDArray[np.bool_], exact: bool
 ) -> dict[str, Any]:
-    """Mean quality on the photos `measured` (V,), for the report; `psnr_unused` on held-out ones by which stage 3 chose
-    nothing.
+    """Mean quality on the photos `measured` (V,), for the report.
 
     Renders are on black, and so is the photo where mattes are `exact`: its grey pixels hold part of the background. The
     quality of the right half is given twice: as rendered, and with gains fitted to the left half, as in NeRF in the
@@ -193,11 +190,9 @@ def measure_quality(
         fitted = fitted_to_left_half(rendered[index].color, masked, mask).clamp(0, 1)
         halves.append([rate(p, masked, right) for rate in (psnr, ssim) for p in (picture, fitted)])
     inside, whole, structure, outline = np.mean(rows, axis=0)
-    unused = np.array(rows)[~chosen_by(views.held_out)[measured], 0] if views.held_out.any() else np.zeros(0)
     half = np.mean(halves, axis=0)
     return {
         "psnr_held_out": quantity(float(inside), "dB"),
-        "psnr_unused": quantity(float(unused.mean()) if len(unused) else None, "dB"),
         "psnr_held_out_masked_photo": quantity(float(whole), "dB"),
         "ssim": quantity(float(structure), "1"),
         "psnr_right_half": quantity(float(half[0]), "dB"),
@@ -258,14 +253,12 @@ def _solid_depth(rendered: RenderedView) -> Tensor:
     return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth))
 
 
-def _confidence(
-    depths: Maps, rendered: list[RenderedView], views: Views, poses: NDArray[np.float64], tolerance: float
-) -> Maps:
+def _confidence(depths: Maps, rendered: list[RenderedView], views: Views, tolerance: float) -> Maps:
     """Opacity times the share of the views that should see a point and agree; of two views at least."""
     confidence = np.zeros_like(depths)
     for index in range(len(depths)):
-        points, rows, columns = surface_points(depths[index], views.intrinsics[index], poses[index])
-        found = compare(points, index, depths, views.masks, views.intrinsics, poses, tolerance)
+        points, rows, columns = surface_points(depths[index], views.intrinsics[index], views.object_from_cam[index])
+        found = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
         share = found.agree / np.maximum(found.agree + found.through, 2)
         confidence[index, rows, columns] = share * rendered[index].opacity.numpy()[rows, columns].clip(0, 1)
     return confidence

@@ -2,6 +2,7 @@
 
 import shutil
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -15,14 +16,12 @@ from scenefuse.core.checkpoints import State, key_of
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.mvs.sparse_depths import own_points, sparse_depths
 from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.pose_refinement import refined_poses
-from scenefuse.nerf.prior.prior import DepthPrior, Unconfirmed, read_prior
+from scenefuse.nerf.prior.confirmed import DepthPrior, read_prior
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.rendered_maps import (
     RenderedMaps,
@@ -33,13 +32,24 @@ from scenefuse.nerf.rendered_maps import (
     write_maps,
     write_nerf,
 )
-from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, go_on_from, keep_memory, new_nerf, train
+from scenefuse.nerf.training import (
+    Additions,
+    Nerf,
+    NerfRecipe,
+    Schedule,
+    Training,
+    go_on_from,
+    keep_memory,
+    new_nerf,
+    train,
+)
 from scenefuse.nerf.volume import Volume, find_volume, hidden_pixels, silhouettes
 from scenefuse.photos.views import Views, load_views
 
 # A rendered depth is confident from here on; what later stages and the export call confident.
 CONFIDENT = 0.5
-TERMS = ("color", "depth", "rank", "mask", "sparsity", "distortion")
+# What a training returns beside its losses.
+NO_LOSSES = ("steps", "seconds", "rays_per_second", "samples_per_second", "psnr")
 
 
 @dataclass(frozen=True)
@@ -61,9 +71,7 @@ class NerfSettings:
     losses: LossWeights = LossWeights()
     """Weights of the losses."""
     maps: RenderedMapSettings = RenderedMapSettings()
-    """Of the rendered maps, and of the depths that a prior begins with."""
-    refinement: RefinementSettings = RefinementSettings()
-    """Of the prior's depths by photos."""
+    """Of the rendered maps."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +85,7 @@ class NerfInputs:
     prior: Path | None = None
     """Stage folder with depth_maps/ and confidence_maps/ (object units, along z), or none."""
     previous: Path | None = None
-    """Folder of an earlier NeRF stage to go on from, with its poses, or none to start afresh."""
+    """Folder of an earlier NeRF stage to go on from, or none to start afresh."""
 
 
 def train_object_nerf(
@@ -93,7 +101,7 @@ def train_object_nerf(
     """Train a NeRF of one object and render depth, normals and confidence for every photo.
 
     Instant-ngp's field (Mueller et al. 2022) in a cube around the visual hull of the masks, with the paper's losses:
-    photometric, absolute and relative depth, mask, sparsity, distortion (method N2 to N9). Depth is the median along
+    photometric, depth, mask, sparsity, distortion (method N2 to N9). Depth is the median along
     the ray where opacity exceeds 0.9; its confidence is opacity times the share of other views that agree.
 
     Args:
@@ -109,6 +117,20 @@ def train_object_nerf(
         StageError: no masks, an empty visual hull, CUDA asked for and missing, a training that diverged, or no
             surface found.
     """
+    train_stage(inputs, stage, report, checkpoints, settings, hold_out_every, seed)
+
+
+def train_stage(
+    inputs: NerfInputs,
+    stage: Path,
+    report: Path,
+    checkpoints: Path,
+    settings: NerfSettings,
+    hold_out_every: int,
+    seed: int,
+    add: Callable[[Nerf, PhotoTensors], Additions] | None = None,
+) -> None:
+    """`train_object_nerf`, with what another recipe adds to the training of its photos, or nothing."""
     start = time.monotonic()
     device = prepare_device(settings.device)
     given = _read(inputs, settings, hold_out_every)
@@ -117,26 +139,24 @@ def train_object_nerf(
     if given.earlier is not None and warm:
         go_on_from(nerf, given.earlier["model"])
     photos = given.photos.select(given.trained)
+    additions = None if add is None else add(nerf, photos)
     weight = torch.ones(len(photos))
     if settings.recipe.appearance:
         weight = photo_weights(measured_sharpness(photos.images, photos.masks), photos.center)
-    training = Training(photos, settings.schedule, settings.recipe, settings.losses, warm, seed, weight)
+    training = Training(photos, settings.schedule, settings.recipe, settings.losses, warm, seed, weight, additions)
     checkpoint = checkpoints / _key(given, settings, device, seed) / "state.pt"
     what = f"{len(given.trained)} photos, hull {given.volume.hull.mean():.1%} of the cube, {training.steps} steps"
     print(f"{what} on {device} ({kernels_on(device)})", flush=True)
     result = train(nerf, training, checkpoint=checkpoint, report=lambda line: print(line, flush=True))
-    poses, nerf_from_object, drift = refined_poses(
-        given.views.object_from_cam, given.trained, given.volume.nerf_from_object, nerf.pose
-    )
-    photos = photo_tensors(replace(given.views, object_from_cam=poses), nerf_from_object, None, exact=True)
-    maps = render_maps(nerf, photos, given.views, poses, nerf_from_object.scale, settings.maps)
+    nerf_from_object = given.volume.nerf_from_object
+    photos = photo_tensors(given.views, nerf_from_object, None, exact=True)
+    maps = render_maps(nerf, photos, given.views, nerf_from_object.scale, settings.maps)
     exact = settings.recipe.mask_band_px == 0
     content = {
         "nerf_from_object": quantity(nerf_from_object.matrix, "nerf units per object unit"),
         "started_from_previous": quantity(warm, ""),
         **_report(nerf, given, settings, result, maps),
         **_appearance(given, weight, maps),
-        **drift,
         **measure_quality(given.views, maps.rendered, maps.measured, exact),
     }
     with atomic_directory(stage) as folder:
@@ -151,7 +171,7 @@ def train_object_nerf(
 def photo_tensors(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None, exact: bool) -> PhotoTensors:
     """All photos in the unit cube's frame, with the depth prior if there is one; grey mattes only where `exact`."""
     rotation = np.stack([nerf_from_object.rotation @ pose[:3, :3] for pose in views.object_from_cam])
-    nothing, scale = np.zeros(views.masks.shape, np.float32), np.float32(nerf_from_object.scale)
+    nothing = np.zeros(views.masks.shape, np.float32)
     depths, confidence = (nothing, nothing) if prior is None else (prior.depths, prior.confidence)
     return PhotoTensors(
         torch.from_numpy(views.images),
@@ -162,7 +182,6 @@ def photo_tensors(views: Views, nerf_from_object: Sim3, prior: DepthPrior | None
         torch.from_numpy(nerf_from_object.apply(views.object_from_cam[:, :3, 3]).astype(np.float32)),
         torch.from_numpy((depths * nerf_from_object.scale).astype(np.float32)),
         torch.from_numpy(confidence),
-        None if prior is None or prior.order is None else torch.from_numpy(prior.order * scale),
     )
 
 
@@ -179,23 +198,18 @@ class _Given:
 
 
 def _read(inputs: NerfInputs, settings: NerfSettings, hold_out_every: int) -> _Given:
-    """Photos with the poses of the earlier stage, the object's volume (in the earlier stage's cube), and the prior."""
+    """Photos, the object's volume (in the earlier stage's cube), and the prior."""
     views = load_views(inputs.workspace, inputs.masks, settings.width_px, hold_out_every)
     earlier, cube = None, None
     if inputs.previous is not None:
         earlier = read_nerf(inputs.previous)
         cube = Sim3.from_matrix(earlier["nerf_from_object"].numpy())
-        if earlier["names"] == views.names:
-            views = replace(views, object_from_cam=earlier["object_from_cam"].numpy())
     trained = np.flatnonzero(~views.held_out)
     outlines = silhouettes(views.masks, sparse_depths(views), views.intrinsics, views.object_from_cam, views.sizes)
     seen = [outlines[row] for row in trained]
     cells, tolerance = settings.recipe.occupancy_cells, settings.hull_tolerance
     volume = find_volume(seen, cells, tolerance, cube, views.sparse[own_points(views)])
-    prior = None
-    if inputs.prior is not None:
-        of_all = Unconfirmed(settings.recipe.order_of_all, settings.recipe.prior_of_all)
-        prior = read_prior(inputs.prior, views, settings.refinement, settings.maps.map_agreement, of_all)
+    prior = None if inputs.prior is None else read_prior(inputs.prior, views)
     photos = photo_tensors(views, volume.nerf_from_object, prior, exact=settings.recipe.mask_band_px == 0)
     photos = replace(photos, hidden=torch.from_numpy(hidden_pixels(volume, outlines)))
     return _Given(views, trained, volume, prior, photos, earlier)
@@ -237,15 +251,20 @@ def _report(
         "device": quantity(device, ""),
         "kernels": quantity(kernels_on(device), ""),
         "depth_prior": quantity(prior is not None, ""),
-        "prior_refined_share": quantity(prior and prior.refined_share, "1"),
-        "prior_confident_share": quantity(prior and prior.confident_share, "1"),
+        "prior_confident_share": quantity(prior and _confident_share(prior, given), "1"),
         "hull_share": quantity(float(given.volume.hull.mean()), "1"),
         "occupied_share": quantity(float(nerf.occupancy.occupied.float().mean()), "1"),
         "diagonal": quantity(maps.diagonal, "object units"),
-        **{f"loss_{name}": quantity(result[name], "1") for name in TERMS if name in result},
+        **{f"loss_{name}": quantity(value, "1") for name, value in result.items() if name not in NO_LOSSES},
         "psnr_training": quantity(result.get("psnr"), "dB"),
         "confident_share": quantity(float((maps.confidence > CONFIDENT).sum() / given.views.masks.sum()), "1"),
     }
+
+
+def _confident_share(prior: DepthPrior, given: _Given) -> float:
+    """Share of the training photos' masks that have a prior."""
+    masked = int(given.views.masks[given.trained].sum())
+    return float((prior.confidence > 0).sum() / max(masked, 1))
 
 
 def _appearance(given: _Given, weight: Tensor, maps: RenderedMaps) -> dict[str, Any]:

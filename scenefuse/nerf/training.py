@@ -6,38 +6,33 @@ Everything lies in the frame of the unit cube ("nerf"): lengths and depths are s
 import contextlib
 import ctypes
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from scenefuse.core.checkpoints import Progress, State, checkpointed, learning_rate_factor, load_checkpoint
 from scenefuse.core.stage import setting
 from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
-from scenefuse.nerf.field import EdgeRates, Field, FieldSettings, coarse_to_fine
+from scenefuse.nerf.field import Field, FieldSettings, coarse_to_fine
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.occupancy import Occupancy, updated
-from scenefuse.nerf.pose_refinement import corrected
 from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
 
 # Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
 ADAM_BETAS, ADAM_EPSILON = (0.9, 0.99), 1e-15
 OCCUPANCY_EVERY = 16
-# Steps between looks at which rows of the grid show edges.
-EDGES_EVERY = 4
 # The grid drops no cell in the first tenth of a training: the densities there mean nothing yet.
 PRUNE_FROM = 0.1
 # Samples fall to their last number by the middle of the training, when the grid knows the surface.
 SAMPLES_FALL_UNTIL = 0.5
 # The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
 LOWEST_RATE = 0.02
-# Poses stay as they are at first: the gradients of an untrained field would scatter them.
-POSES_FROM = 0.2
 # Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
 # again when they are better. A warm training finds them at its start too.
 APPEARANCE_AT = (0.15, 0.4)
@@ -81,15 +76,6 @@ class NerfRecipe:
     """Samples per ray from the middle of the training on."""
     coarse_until: float = 0.3
     """Share of the steps after which all levels are open (method N9)."""
-    edge_boost: float = 1.0
-    """Gradients of fine levels are multiplied by 1 + this at edges; Adam divides most of it out again (method N9)."""
-    edge_rate: float = 0.0
-    """The paper's adaptive grid: steps of fine levels are up to 1 + this times as long at edges (method N9)."""
-    order_of_all: bool = False
-    """Whether the ranking loss takes all depths of the earlier stage, and not only those of the prior that photos and
-    views confirm: where the absolute loss has the same, there is little left to rank (method N3)."""
-    prior_of_all: bool = False
-    """Whether the absolute loss takes all depths of the earlier stage as well, as the paper does (method N4)."""
     prior_share: float = PRIOR_SHARE
     """Where a prior expects the surface, at most this share of a ray's samples lies near it."""
     turned_share: float = 0.25
@@ -97,8 +83,6 @@ class NerfRecipe:
     photos show that they do, and elsewhere are what all photos agree on (method N8)."""
     appearance: bool = True
     """Whether gains and vignetting of the photos are found (method N15), and blurred photos count less."""
-    pose_learning_rate: float = 0.0
-    """The paper's pose refinement: learning rate of the camera poses, 0 keeps them (method N11)."""
     mask_band_px: int = 2
     """Half-width of the band around a mask's edge that no loss touches; 0: masks are exact, grey values included."""
 
@@ -113,13 +97,11 @@ class NerfRecipe:
 
 @dataclass
 class Nerf:
-    """All that is trained: the field, its occupancy grid, the photos' appearance, and corrections (V, 6) of their poses
-    (rotation, centre)."""
+    """All that is trained: the field, its occupancy grid, and the photos' appearance."""
 
     field: Field
     occupancy: Occupancy
     appearance: Appearance
-    pose: Tensor
 
     def state(self) -> State:
         """As plain tensors on the CPU, for a file that any machine can read."""
@@ -131,15 +113,13 @@ class Nerf:
             "occupied": self.occupancy.occupied.cpu(),
             "log_gain": self.appearance.log_gain.cpu(),
             "falloff": self.appearance.falloff.cpu(),
-            "pose": self.pose.detach().cpu(),
         }
 
 
 def new_nerf(settings: FieldSettings, hull: Tensor, photos: int, seed: int, device: str) -> Nerf:
     """An untrained NeRF in a hull (G, G, G), for a number of training photos."""
     field = Field(settings, torch.Generator().manual_seed(seed)).to(device)
-    looks = Appearance.none(photos, device)
-    return Nerf(field, Occupancy.from_hull(hull.to(device)), looks, torch.zeros(photos, 6, device=device))
+    return Nerf(field, Occupancy.from_hull(hull.to(device)), Appearance.none(photos, device))
 
 
 def go_on_from(nerf: Nerf, earlier: State) -> None:
@@ -148,6 +128,54 @@ def go_on_from(nerf: Nerf, earlier: State) -> None:
     nerf.field.level_weight.fill_(1.0)
     hull = nerf.occupancy.hull
     nerf.occupancy = Occupancy(hull, earlier["density"].to(hull.device), hull)
+
+
+@dataclass(frozen=True)
+class Rays:
+    """R rays of a batch: origin (R, 3), unit direction (R, 3), length (R,) per unit of depth along z, where the prior
+    expects the surface on them, and its confidence (R,) in 0..1."""
+
+    origin: Tensor
+    direction: Tensor
+    length: Tensor
+    prior: RayPrior
+    confidence: Tensor
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a step has rendered.
+
+    Attributes:
+        step: its number.
+        batch: the pixels of its R rays.
+        rays: the rays.
+        drawn: samples on the H rays that meet an occupied cell.
+        sigma: (H, S) densities of the samples.
+        seen: what the H rays look like.
+    """
+
+    step: int
+    batch: RayBatch
+    rays: Rays
+    drawn: RaySamples
+    sigma: Tensor
+    seen: Composited
+
+
+class Additions(Protocol):
+    """What another recipe adds to a training."""
+
+    weights: Mapping[str, float]
+    """Weight of each loss that it adds."""
+    state: Tensor
+    """What a checkpoint keeps of it."""
+
+    def losses(self, rendered: Rendered, nerf: Nerf) -> dict[str, Tensor]:
+        """Further losses of a step, by name."""
+
+    def descend(self, nerf: Nerf, optimizer: torch.optim.Optimizer) -> None:
+        """Take the optimiser's step."""
 
 
 @dataclass(frozen=True)
@@ -162,6 +190,7 @@ class Training:
         warm: the NeRF is already trained: all levels are open and the grid is pruned from the start.
         seed: decides every random draw together with the step's number.
         photo_weight: (V,) weight of each photo's colours, or None for 1.
+        additions: of another recipe, or None.
     """
 
     photos: PhotoTensors
@@ -171,6 +200,7 @@ class Training:
     warm: bool
     seed: int
     photo_weight: Tensor | None = None
+    additions: Additions | None = None
 
     @property
     def steps(self) -> int:
@@ -202,51 +232,48 @@ def train(
         StageError: the training diverged.
     """
     pool = pixel_pool(training.photos, training.recipe.mask_band_px)
-    pose = nn.Parameter(nerf.pose.clone())
-    optimizer = _optimizer(nerf.field, pose)
-    rates = EdgeRates.of(nerf.field, training.recipe.edge_rate)
+    optimizer, added = _optimizer(nerf.field), training.additions
     done = 0
 
     def state() -> State:
-        own = {"optimizer": optimizer.state_dict(), "pose": pose.detach(), "edges": rates.use, "step": done}
-        return {"model": nerf.state(), **own}
+        own = {} if added is None else {"additions": added.state}
+        return {"model": nerf.state(), "optimizer": optimizer.state_dict(), "step": done, **own}
 
     saved = load_checkpoint(checkpoint, like=state())
     if saved is not None:
-        done = _resume(saved, nerf, optimizer, pose)
-        rates.use = saved["edges"].to(rates.use.device)
+        done = _resume(saved, nerf, optimizer)
+        if added is not None:
+            added.state = saved["additions"].to(added.state.device)
         report(f"resumed at step {done} of {training.steps}")
     progress = Progress(training.steps, done, report)
     with checkpointed(checkpoint, state) as step_done:
         for step in range(done, training.steps):
             _prepare(nerf, training, step)
             batch = _draw(training, pool, step, nerf.field.table.device)
-            terms, samples = _loss_terms(nerf, training, batch, pose, step, rates)
-            _descend(nerf.field, optimizer, training, terms, step, rates)
+            terms, samples = _loss_terms(nerf, training, batch, step)
+            _descend(nerf, optimizer, training, terms, step)
             progress.add(step, {name: float(term.detach()) for name, term in terms.items()}, len(batch.view), samples)
             done = step + 1
             step_done(done)
-    nerf.pose = pose.detach().clone()
     return progress.summary()
 
 
-def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer, pose: Tensor) -> int:
-    """Put a checkpoint into NeRF, optimiser and poses; the steps that are done."""
+def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer) -> int:
+    """Put a checkpoint into NeRF and optimiser; the steps that are done."""
     nerf.field.load_state_dict(saved["model"]["field"])
     device = nerf.field.table.device
     nerf.appearance = Appearance(*(saved["model"][name].to(device) for name in ("log_gain", "falloff")))
     nerf.occupancy = Occupancy(*(saved["model"][name].to(device) for name in ("hull", "density", "occupied")))
     optimizer.load_state_dict(saved["optimizer"])
-    with torch.no_grad():
-        pose.copy_(saved["pose"])
     return int(saved["step"])
 
 
-def _optimizer(field: Field, pose: nn.Parameter) -> torch.optim.Optimizer:
-    """Adam, with a group each for the hash grid, the networks and the poses: each has its own rate."""
+def _optimizer(field: Field) -> torch.optim.Optimizer:
+    """Adam, with a group each for the hash grid and the networks: each has its own rate."""
     networks = [parameter for name, parameter in field.named_parameters() if name != "table"]
-    groups = [{"params": [field.table]}, {"params": networks}, {"params": [pose]}]
-    return torch.optim.Adam(groups, betas=ADAM_BETAS, eps=ADAM_EPSILON, fused=True)
+    return torch.optim.Adam(
+        [{"params": [field.table]}, {"params": networks}], betas=ADAM_BETAS, eps=ADAM_EPSILON, fused=True
+    )
 
 
 def _prepare(nerf: Nerf, training: Training, step: int) -> None:
@@ -269,60 +296,41 @@ def _draw(training: Training, pool: PixelPool, step: int, device: torch.device) 
 
 
 def _descend(
-    field: Field,
-    optimizer: torch.optim.Optimizer,
-    training: Training,
-    terms: dict[str, Tensor],
-    step: int,
-    edges: EdgeRates,
+    nerf: Nerf, optimizer: torch.optim.Optimizer, training: Training, terms: dict[str, Tensor], step: int
 ) -> None:
     """One step of Adam on the weighted sum of the losses, at this step's rates; gradients are cleared."""
-    training.weights.total({name: term for name, term in terms.items() if name != "psnr"}).backward()
+    added = training.additions
+    weights = {**training.weights.by_name(), **({} if added is None else added.weights)}
+    torch.stack([weights[name] * term for name, term in terms.items() if name != "psnr"]).sum().backward()
     factor = learning_rate_factor(step, training.steps, training.warmup_steps, LOWEST_RATE)
-    recipe = training.recipe
-    rates = recipe.grid_learning_rate, recipe.learning_rate, recipe.pose_learning_rate
+    rates = training.recipe.grid_learning_rate, training.recipe.learning_rate
     for group, rate in zip(optimizer.param_groups, rates):
         group["lr"] = rate * factor
-    edges.step(field, optimizer)
+    if added is None:
+        optimizer.step()
+    else:
+        added.descend(nerf, optimizer)
     optimizer.zero_grad(set_to_none=True)
 
 
-@dataclass(frozen=True)
-class _Rays:
-    """R rays of a batch: origin (R, 3), unit direction (R, 3), the prior on them and its confidence (R,) in 0..1, and
-    the depth (R,) along them whose order is learned, with its weight (R,)."""
-
-    origin: Tensor
-    direction: Tensor
-    prior: RayPrior
-    confidence: Tensor
-    order: Tensor
-    order_weight: Tensor
-
-
-def _loss_terms(
-    nerf: Nerf, training: Training, batch: RayBatch, pose: Tensor, step: int, edges: EdgeRates
-) -> tuple[dict[str, Tensor], int]:
+def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> tuple[dict[str, Tensor], int]:
     """Loss terms of a batch and `psnr` in dB inside the masks, by name, each a scalar; and the number of samples."""
-    progress = step / training.steps
-    refine = training.recipe.pose_learning_rate > 0 and progress > POSES_FROM
-    rays = _rays(training.photos, batch, pose if refine else None, training.recipe.prior_share)
+    rays = _rays(training.photos, batch, training.recipe.prior_share)
     device = rays.origin.device
-    count = _samples_per_ray(training.recipe, progress)
+    count = _samples_per_ray(training.recipe, step / training.steps)
     rng = torch.Generator().manual_seed(training.seed * SEED_STRIDE + step)
     jitter = torch.rand(len(rays.origin), count, generator=rng).to(device)
     background = torch.rand(len(rays.origin), 3, generator=rng).to(device)
     seen_from = _partly_turned(rays.direction, training.recipe.turned_share, rng)
-    origin, direction = rays.origin.detach().contiguous(), rays.direction.detach().contiguous()
-    drawn = march(origin, direction, nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior)
-    sigma, seen = _render(nerf.field, rays, seen_from, drawn, batch, training.recipe.edge_boost)
-    if edges.boost and step % EDGES_EVERY == 0:
-        x = (origin[drawn.ray, None] + drawn.t[..., None] * direction[drawn.ray, None]).view(-1, 3)
-        opacity = (1 - torch.exp(-sigma.detach() * drawn.delta)).view(-1)
-        edges.see(nerf.field, x, opacity, batch.edge[drawn.ray].repeat_interleave(count))
-    color, psnr = _photometric(nerf.appearance, training, seen, batch, drawn.ray, background)
-    terms = {"color": color, **_geometric(training, rays, batch, drawn, sigma, seen), "psnr": psnr}
-    return terms, drawn.t.numel()
+    drawn = march(
+        rays.origin.contiguous(), rays.direction.contiguous(), nerf.occupancy, jitter, UNIFORM_SHARE, rays.prior
+    )
+    rendered = Rendered(step, batch, rays, drawn, *_render(nerf.field, rays, seen_from, drawn))
+    color, psnr = _photometric(nerf.appearance, training, rendered, background)
+    terms = {"color": color, **_geometric(training.weights, rendered)}
+    if training.additions is not None:
+        terms |= training.additions.losses(rendered, nerf)
+    return terms | {"psnr": psnr}, drawn.t.numel()
 
 
 def _samples_per_ray(recipe: NerfRecipe, progress: float) -> int:
@@ -330,20 +338,16 @@ def _samples_per_ray(recipe: NerfRecipe, progress: float) -> int:
     return round(recipe.samples_first + (recipe.samples_last - recipe.samples_first) * fallen)
 
 
-def _rays(photos: PhotoTensors, batch: RayBatch, pose: Tensor | None, prior_share: float) -> _Rays:
-    """The batch's rays, through cameras corrected by `pose` (V, 6) if it is given, and where their prior lies."""
+def _rays(photos: PhotoTensors, batch: RayBatch, prior_share: float) -> Rays:
+    """The batch's rays, and where their prior lies."""
     device = batch.view.device
-    rotation, center = photos.rotation.to(device)[batch.view], photos.center.to(device)[batch.view]
-    if pose is not None:
-        rotation, center = corrected(rotation, center, pose[batch.view])
-    origin, direction, length = camera_rays(photos.intrinsics.to(device)[batch.view], rotation, center, batch.uv)
+    intrinsics, rotation, center = (
+        part.to(device)[batch.view] for part in (photos.intrinsics, photos.rotation, photos.center)
+    )
+    origin, direction, length = camera_rays(intrinsics, rotation, center, batch.uv)
     confidence = batch.confidence * ((batch.depth > 0) & batch.inside)
-    width = torch.full_like(length, PRIOR_HALF_WIDTH).detach()
-    prior = RayPrior(batch.depth * length.detach(), width, prior_share * confidence)
-    if batch.order is None:
-        return _Rays(origin, direction, prior, confidence, prior.distance, confidence)
-    ranked = ((batch.order > 0) & batch.inside).float()
-    return _Rays(origin, direction, prior, confidence, batch.order * length.detach(), ranked)
+    prior = RayPrior(batch.depth * length, torch.full_like(length, PRIOR_HALF_WIDTH), prior_share * confidence)
+    return Rays(origin, direction, length, prior, confidence)
 
 
 def _partly_turned(direction: Tensor, share: float, rng: torch.Generator) -> Tensor:
@@ -355,27 +359,23 @@ def _partly_turned(direction: Tensor, share: float, rng: torch.Generator) -> Ten
     return torch.where(turned.to(direction.device), other.to(direction.device), direction)
 
 
-def _render(
-    field: Field, rays: _Rays, seen_from: Tensor, drawn: RaySamples, batch: RayBatch, edge_boost: float
-) -> tuple[Tensor, Composited]:
+def _render(field: Field, rays: Rays, seen_from: Tensor, drawn: RaySamples) -> tuple[Tensor, Composited]:
     """Densities (H, S) of the samples, and what the H rays that have any look like from directions (R, 3)."""
     x = rays.origin[drawn.ray, None] + drawn.t[..., None] * rays.direction[drawn.ray, None]
-    boost = None
-    if edge_boost > 0:
-        boost = (1 + edge_boost * batch.edge[drawn.ray])[:, None].expand(drawn.t.shape).reshape(-1)
-    sigma, features = field.geometry(x.view(-1, 3), boost, fine_from=field.settings.levels // 2)
+    sigma, features = field.geometry(x.view(-1, 3))
     sigma = sigma.view(drawn.t.shape)
     return sigma, composite(sigma, field.color(features, seen_from[drawn.ray]), drawn.t, drawn.delta)
 
 
 def _photometric(
-    appearance: Appearance, training: Training, seen: Composited, batch: RayBatch, ray: Tensor, background: Tensor
+    appearance: Appearance, training: Training, rendered: Rendered, background: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Photometric loss and PSNR of the rays `ray` (H,), both on random colours (R, 3).
+    """Photometric loss and PSNR of the rays that have samples, on random colours (R, 3).
 
     The field's colours are compared as their photo shows them. On a random background a field cannot pass off emptiness
     as colour, so colours teach opacity as well (instant-ngp's training on images with alpha).
     """
+    batch, seen, ray = rendered.batch, rendered.seen, rendered.drawn.ray
     view, inside, matte, shown = batch.view[ray], batch.inside[ray], batch.matte[ray, None], background[ray]
     height, width = training.photos.images.shape[1:3]
     intrinsics = training.photos.intrinsics.to(view.device)[view]
@@ -387,28 +387,19 @@ def _photometric(
     return losses.color_loss(composed, target, weight), -10 * torch.log10(error)
 
 
-def _geometric(
-    training: Training, rays: _Rays, batch: RayBatch, drawn: RaySamples, sigma: Tensor, seen: Composited
-) -> dict[str, Tensor]:
-    """The losses of depth, mask and density that have a weight (method N2 to N5)."""
-    weights, ray = training.weights, drawn.ray
-    distance = seen.moment / seen.opacity.clamp(min=1e-3)
-    known, confidence = rays.prior.distance, rays.confidence
+def _geometric(weights: LossWeights, rendered: Rendered) -> dict[str, Tensor]:
+    """The losses of depth, mask and density that have a weight (method N2, N4, N5)."""
+    seen, ray, rays, batch = rendered.seen, rendered.drawn.ray, rendered.rays, rendered.batch
     terms = {}
     if weights.depth_weight > 0:
-        terms["depth"] = losses.depth_loss(distance, seen.opacity, known[ray], confidence[ray])
-    if weights.rank_weight > 0:
-        nothing = torch.zeros_like(known)
-        far, opaque = (nothing.index_put((ray,), part) for part in (distance, seen.opacity))
-        apart_px = losses.RANK_APART * training.photos.images.shape[2]
-        images = training.recipe.images_per_batch
-        terms["rank"] = losses.rank_loss(far, opaque, rays.order, rays.order_weight, batch.uv, images, apart_px)
+        known = rays.prior.distance[ray], rays.confidence[ray]
+        terms["depth"] = losses.depth_loss(seen.distance, seen.opacity, *known)
     if weights.mask_weight > 0:
         terms["mask"] = losses.mask_loss(seen.opacity, batch.matte[ray])
     if weights.sparsity_weight > 0:
-        terms["sparsity"] = losses.sparsity_loss(sigma, drawn.delta, batch.inside[ray])
+        terms["sparsity"] = losses.sparsity_loss(rendered.sigma, rendered.drawn.delta, batch.inside[ray])
     if weights.distortion_weight > 0:
-        terms["distortion"] = losses.distortion_loss(seen.distortion)
+        terms["distortion"] = seen.distortion.mean()
     return terms
 
 

@@ -21,18 +21,11 @@ def encode(x, table, levels, out):  # type: ignore[no-untyped-def]
     _encode[triton.cdiv(len(x), BLOCK), count](x, table, *levels, out, len(x), count, BLOCK)
 
 
-def encode_backward(x, gradient, levels, boost, fine_from, out):  # type: ignore[no-untyped-def]
+def encode_backward(x, gradient, levels, out):  # type: ignore[no-untyped-def]
     """As `kernels.encode_backward`."""
     count = len(levels[0])
     out.zero_()
-    _encode_backward[triton.cdiv(len(x), BLOCK), count](
-        x, gradient, *levels, boost, out, len(x), fine_from, count, BLOCK
-    )
-
-
-def encode_backward_x(x, gradient, table, levels, out):  # type: ignore[no-untyped-def]
-    """As `kernels.encode_backward_x`."""
-    _encode_backward_x[(triton.cdiv(len(x), BLOCK),)](x, gradient, table, *levels, out, len(x), len(levels[0]), BLOCK)
+    _encode_backward[triton.cdiv(len(x), BLOCK), count](x, gradient, *levels, out, len(x), count, BLOCK)
 
 
 @triton.jit
@@ -102,39 +95,14 @@ def _encode(
 
 @triton.jit
 def _encode_backward(
-    x, gradient, resolution, stride, offset, mask, level_weight, boost, out, count, fine_from, LEVELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+    x, gradient, resolution, stride, offset, mask, level_weight, out, count, LEVELS: tl.constexpr, BLOCK: tl.constexpr
+):  # type: ignore[no-untyped-def]
     n, inside = _samples(count, BLOCK)
     level = tl.program_id(1)
     sizes, weight = _level(resolution, stride, offset, mask, level_weight, level)
     cells, place = _cells(x, n, inside, sizes[0])
     used = (n < tl.where(weight != 0.0, count, 0))[:, None]
-    factor = weight * tl.where(level >= fine_from, tl.load(boost + n, mask=inside, other=1.0), 1.0)
-    given = factor[:, None] * tl.load(_features(gradient, n, level, LEVELS), mask=used, other=0.0)
+    given = weight * tl.load(_features(gradient, n, level, LEVELS), mask=used, other=0.0)
     for corner in tl.static_range(8):
         wx, wy, wz = _weights(place, corner)
         tl.atomic_add(_rows(out, cells, sizes, corner), (wx * wy * wz)[:, None] * given, mask=used, sem="relaxed")
-
-
-@triton.jit
-def _encode_backward_x(
-    x, gradient, table, resolution, stride, offset, mask, level_weight, out, count, LEVELS: tl.constexpr,
-    BLOCK: tl.constexpr,
-):  # type: ignore[no-untyped-def]  # fmt: skip
-    n, inside = _samples(count, BLOCK)
-    gx, gy, gz = tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32), tl.zeros([BLOCK], tl.float32)
-    for level in range(LEVELS):
-        sizes, weight = _level(resolution, stride, offset, mask, level_weight, level)
-        cells, place = _cells(x, n, inside, sizes[0])
-        used = (n < tl.where(weight != 0.0, count, 0))[:, None]
-        given = weight * sizes[0] * tl.load(_features(gradient, n, level, LEVELS), mask=used, other=0.0)
-        for corner in tl.static_range(8):
-            wx, wy, wz = _weights(place, corner)
-            value = tl.sum(given * tl.load(_rows(table, cells, sizes, corner), mask=used, other=0.0), 1)
-            gx += value * wy * wz if corner & 1 else -value * wy * wz
-            gy += value * wx * wz if corner >> 1 & 1 else -value * wx * wz
-            gz += value * wx * wy if corner >> 2 else -value * wx * wy
-    tl.store(out + 3 * n, gx, mask=inside)
-    tl.store(out + 3 * n + 1, gy, mask=inside)
-    tl.store(out + 3 * n + 2, gz, mask=inside)

@@ -12,7 +12,7 @@ from torch import Tensor
 from scenefuse.core.stage import StageError, atomic_directory, quantity
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.pose_network import PoseNetwork, small_photos
+from scenefuse.paper.networks import PoseNetwork, small_photos
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import read_workspace, write_model
 from scenefuse.sfm.gravity import estimate_up

@@ -3,7 +3,7 @@
 import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
@@ -12,15 +12,14 @@ from torch import Tensor
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.nerf.prior.consistency import consistency_between_views, residuals_at_points
-from scenefuse.nerf.prior.crops import Crops
+from scenefuse.nerf.prior.alignment import align_maps, residual_at_checks
+from scenefuse.nerf.prior.confirmed import DepthPrior, write_prior
 from scenefuse.nerf.prior.inputs import DepthPhotos, depth_photos
-from scenefuse.nerf.prior.maps import Content, align_maps, map_quantities, print_quality, tolerance_of, write_maps
 from scenefuse.nerf.prior.networks import parameters
-from scenefuse.nerf.prior.pose_network import pose_quantities
 from scenefuse.nerf.prior.self_supervision import sample
-from scenefuse.nerf.prior.training import Networks, loss_quantities, optimise, predict, prepare_torch, save_networks
+from scenefuse.nerf.prior.training import loss_quantities, optimise, predict, prepare_torch
 from scenefuse.paper.chain import chain_quantities, chained, place_chain, write_posed
+from scenefuse.paper.fused_depth import Content, consistency_between_views, map_quantities, print_quality
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
@@ -29,6 +28,7 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
+from scenefuse.paper.networks import Networks, pose_quantities, save_networks
 from scenefuse.paper.recipe import BATCH_PHOTOS
 from scenefuse.photos.views import Views, load_views
 
@@ -40,7 +40,7 @@ class StageOutputs:
     """What stages 1 and 3 write."""
 
     stage: Path
-    """Folder: depth_maps/{photo}.bin, confidence_maps/{photo}.bin (0..1) and networks.pt."""
+    """Folder: depth_maps/{photo}.bin, confidence_maps/{photo}.bin (1 wherever there is a depth) and networks.pt."""
     report: Path
     """JSON."""
     posed: Path
@@ -108,8 +108,8 @@ def estimate_as_paper(
     print(f"{len(views.names)} frames, {recipe.steps(frames)} steps of at most {BATCH_PHOTOS} frames", flush=True)
     checkpoint = checkpoints / key_of("paper, stage 1", recipe, seed, frames, supervision) / "state.pt"
     objective = monocular_losses(networks, frames, supervision, recipe)
-    losses = optimise(networks, frames, objective, recipe, checkpoint, seed)
-    raw = predict(networks.depth, frames, supervision)
+    losses = optimise(networks.parts(), frames, objective, recipe, checkpoint, seed)
+    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
     placed = place(raw, networks, frames, views, pose_source, seed)
     content: Content = {
         "workspace": quantity(outputs.posed.name, ""),
@@ -187,24 +187,16 @@ def write_stage(
 ) -> Content:
     """Write maps, networks and the posed workspace; what the stage's report says of them."""
     depth, measured = placed.depth * placed.measured.masks, placed.measured
-    consistency = consistency_between_views(depth, measured, tolerance_of(measured))
+    consistency, maps = consistency_between_views(depth, measured), depth[:, 0].cpu().numpy()
     with atomic_directory(outputs.stage) as folder:
-        write_maps(folder, whole_frames(views), depth, consistency.confidence)
+        write_prior(folder, views, DepthPrior(maps, (maps > 0).astype(np.float32)))
         save_networks(folder / "networks.pt", networks, asdict(settings) | {"unit": placed.unit})
     write_posed(workspace, outputs.posed, views, placed.poses)
     chain = chain_quantities(placed.chain, views.object_from_cam, placed.poses, pose_source)
     write_json(outputs.posed_json, chain)
-    aligned = align_maps(placed.depth, measured, 0)
-    residuals = np.concatenate(residuals_at_points(aligned, measured.checks))
     return {
         **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
         "unit": quantity(placed.unit, "object units per unit of the networks"),
         **map_quantities(depth, consistency, measured),
-        "residual_each_map_aligned": quantity(float(np.median(residuals)) if len(residuals) else None, "1"),
+        "residual_each_map_aligned": quantity(residual_at_checks(align_maps(placed.depth, measured, 0), measured), "1"),
     }
-
-
-def whole_frames(views: Views) -> Crops:
-    """The frames as they are, for what reads and writes maps of cut ones."""
-    same: Any = np.tile(np.eye(3)[:2], (len(views.names), 1, 1))
-    return Crops(views, same, views.masks, views.sizes)

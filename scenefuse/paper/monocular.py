@@ -14,17 +14,9 @@ from torch import Tensor
 from scenefuse.core.stage import StageError, setting
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, disparity_from_depth
-from scenefuse.nerf.prior.pose_network import PoseNetwork, small_photos
 from scenefuse.nerf.prior.self_supervision import masked_mean, smoothness
-from scenefuse.nerf.prior.training import (
-    Networks,
-    Objective,
-    PhotoScale,
-    Recipe,
-    Supervision,
-    error_against_target,
-    reprojection_error,
-)
+from scenefuse.nerf.prior.training import Objective, PhotoScale, Recipe, huber, reprojection_error
+from scenefuse.paper.networks import Networks, PoseNetwork, small_photos
 from scenefuse.paper.recipe import BATCH_PHOTOS, WARMUP_EPOCHS
 from scenefuse.photos.views import Views
 
@@ -34,6 +26,17 @@ NEAR, FAR = 0.5, 2.0
 SHRINKS = (4, 2, 1)
 # Frames that differ less on the object, on the mean, show no motion: two grey levels.
 LEAST_CHANGE = 2 / 255
+
+
+@dataclass(frozen=True)
+class Supervision:
+    """What the networks are trained on, (V, 3, H, W) colours from -1 to 1 and (V, 1, H, W) first disparities; in stage
+    3 (V, 1, H, W) depths to learn and their weights, 0 where there is none."""
+
+    colors: Tensor
+    first: Tensor
+    target: Tensor | None = None
+    weight: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ class MonocularSettings:
 
 def recipe_of(settings: MonocularSettings) -> Recipe:
     """The paper's batches and warm-up."""
-    return Recipe(settings.epochs, WARMUP_EPOCHS, BATCH_PHOTOS, coarse_share=0.0, even=False)
+    return Recipe(settings.epochs, WARMUP_EPOCHS, BATCH_PHOTOS, even=False)
 
 
 def frames_of(views: Views, device: torch.device) -> DepthPhotos:
@@ -116,12 +119,9 @@ def new_monocular_networks(device: torch.device) -> Networks:
 
 
 def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Tensor | None = None) -> Supervision:
-    """What the networks see, colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights.
-
-    Nothing says that these networks' depth is nearly right: every error counts in full.
-    """
+    """Colours, with a first depth of 1 everywhere; (V, 1, H, W) target depths and weights."""
     one = disparity_from_depth(torch.ones_like(frames.masks), NEAR, FAR)
-    return Supervision(frames.images * 2.0 - 1.0, one, target, weight, large_error=math.inf)
+    return Supervision(frames.images * 2.0 - 1.0, one, target, weight)
 
 
 def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Supervision, recipe: Recipe) -> Objective:
@@ -136,7 +136,7 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
 
     def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         scale = scales[step * len(scales) // steps]
-        disparity = networks.depth(supervision.inputs[chosen], supervision.first[chosen])
+        disparity = networks.depth(supervision.colors[chosen], supervision.first[chosen])
         depth = depth_from_disparity(disparity, NEAR, FAR)
         sources = frames.sources[chosen]
         moves = torch.stack([networks.pose(small[chosen], small[of]) for of in sources.T], 1)
@@ -146,11 +146,13 @@ def monocular_losses(networks: Networks, frames: DepthPhotos, supervision: Super
             "photometric": masked_mean(error, counts),
             "smoothness": smoothness(disparity, frames.images[chosen], frames.masks[chosen]),
         }
-        if supervision.target is not None and supervision.target_weight is not None:
-            known = supervision.target_weight[chosen] > 0
-            given = torch.where(known, supervision.target[chosen], depth.detach())
+        if supervision.target is not None and supervision.weight is not None:
+            target, weight = supervision.target[chosen], supervision.weight[chosen]
+            given = torch.where(weight > 0, target, depth.detach())
             error, seen = reprojection_error(scale, chosen, sources, given, moves, None)
-            parts["target"] = error_against_target(depth, supervision, chosen, NEAR)
+            # Nothing says that these networks' depth is nearly right: every error counts in full.
+            off = huber(depth / target.clamp_min(NEAR) - 1.0, math.inf)
+            parts["target"] = (off * weight).sum() / weight.sum().clamp_min(1.0)
             parts["pose"] = masked_mean(error, seen)
         return parts
 

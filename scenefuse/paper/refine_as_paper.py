@@ -1,18 +1,18 @@
 """Stage 3 by the paper: depth rendered by the NeRF, fused with stage 1's, refines the depth and the pose network."""
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from torch import Tensor
 
 from scenefuse.core.checkpoints import key_of
-from scenefuse.core.stage import quantity, write_json
+from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.nerf.prior.maps import print_quality, read_maps
-from scenefuse.nerf.prior.pose_network import pose_quantities
-from scenefuse.nerf.prior.refine_depth import EarlierStages, blend_depths, read_rendered
-from scenefuse.nerf.prior.training import load_networks, loss_quantities, optimise, predict, prepare_torch
+from scenefuse.nerf.prior.confirmed import read_stage_maps
+from scenefuse.nerf.prior.training import loss_quantities, optimise, predict, prepare_torch
 from scenefuse.paper.chain import chained
 from scenefuse.paper.estimate_as_paper import (
     PoseSource,
@@ -20,9 +20,9 @@ from scenefuse.paper.estimate_as_paper import (
     in_unit,
     photos_at,
     place,
-    whole_frames,
     write_stage,
 )
+from scenefuse.paper.fused_depth import blend_depths, print_quality
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
@@ -31,7 +31,21 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
-from scenefuse.photos.views import load_views
+from scenefuse.paper.networks import load_networks, pose_quantities
+from scenefuse.photos.views import Views, load_views
+
+# Rendered depths below this confidence (0..1) are not used.
+MIN_RENDERED_CONFIDENCE = 0.5
+
+
+@dataclass(frozen=True)
+class EarlierStages:
+    """What stage 3 starts from."""
+
+    previous: Path
+    """Stage 1's folder."""
+    rendered: Path
+    """Stage 2's folder, with depth_maps/ and confidence_maps/."""
 
 
 def refine_as_paper(
@@ -76,16 +90,16 @@ def refine_as_paper(
     used = load_views(poses, masks, state["settings"]["width_px"], hold_out_every).object_from_cam
     frames, networks = frames_of(views, device), new_monocular_networks(device)
     networks.load(state)
-    crops, before = whole_frames(views), chained(networks.pose, frames)
-    predicted, _ = read_maps(earlier.previous, crops, device)
-    rendered = read_rendered(earlier.rendered, *read_maps(earlier.rendered, crops, device)) * frames.masks
+    before = chained(networks.pose, frames)
+    predicted, rendered = _depths(earlier, views, device)
     blend = blend_depths(predicted, rendered, photos_at(used, views, frames))
     supervision, recipe = supervision_of(frames, blend.depth / unit, blend.weight), recipe_of(settings)
-    key = key_of("paper, stage 3", recipe, seed, frames, supervision, networks.state())
+    key = key_of("paper, stage 3", recipe, seed, frames, supervision, state)
     checkpoint = checkpoints / key / "state.pt"
     objective = monocular_losses(networks, frames, supervision, recipe)
-    losses = optimise(networks, frames, objective, recipe, checkpoint, seed)
-    placed = place(predict(networks.depth, frames, supervision), networks, frames, views, pose_source, seed)
+    losses = optimise(networks.parts(), frames, objective, recipe, checkpoint, seed)
+    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
+    placed = place(raw, networks, frames, views, pose_source, seed)
     settings = replace(settings, width_px=views.images.shape[2])
     content = {
         **{name: quantity(share, "1") for name, share in blend.shares.items()},
@@ -99,6 +113,17 @@ def refine_as_paper(
     checkpoint.unlink(missing_ok=True)
     print(f"accepted {100 * blend.shares['accepted_share']:.0f} % of the object's pixels", flush=True)
     print_quality(content)
+
+
+def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(V, 1, H, W) depths of stage 1, and those of stage 2 that are confident; an error where the latter has none."""
+    rendered = read_stage_maps(earlier.rendered / "depth_maps", views)
+    if not rendered.any():
+        raise StageError(f"{earlier.rendered}/depth_maps holds no depth for any photo of the object; run stage 2 again")
+    confident = read_stage_maps(earlier.rendered / "confidence_maps", views) >= MIN_RENDERED_CONFIDENCE
+    found = read_stage_maps(earlier.previous / "depth_maps", views), rendered * confident * views.masks
+    predicted, kept = (torch.from_numpy(maps.astype(np.float32))[:, None].to(device) for maps in found)
+    return predicted, kept
 
 
 def shift_over_extent(before: Array, after: Array) -> float:

@@ -7,10 +7,11 @@ from pathlib import Path
 import torch
 
 from scenefuse.core.stage import quantity, read_json, write_json
-from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.field import Field, FieldSettings
-from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_object_nerf
-from scenefuse.nerf.training import Schedule
+from scenefuse.nerf.rays import PhotoTensors
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
+from scenefuse.nerf.training import Nerf, Schedule
+from scenefuse.paper.order_and_edges import OrderAndEdges
 from scenefuse.paper.recipe import FIELD, LOSSES, NERF
 from scenefuse.photos.views import load_views
 
@@ -61,10 +62,9 @@ def train_nerf_as_paper(
         f"{drawn.schedule.rays_per_epoch} rays an epoch are drawn: about {seconds['drawn']:.0f} s",
         flush=True,
     )
-    train_object_nerf(
-        inputs=NerfInputs(workspace, masks, prior), stage=stage, report=report, checkpoints=checkpoints,
-        settings=drawn, hold_out_every=hold_out_every, seed=seed,
-    )  # fmt: skip
+    train_stage(
+        NerfInputs(workspace, masks, prior), stage, report, checkpoints, drawn, hold_out_every, seed, order_and_edges
+    )
     content = read_json(report) | {
         "rays_per_epoch": quantity(drawn.schedule.rays_per_epoch, "1"),
         "rays_per_epoch_paper": quantity(letter, "1"),
@@ -81,10 +81,12 @@ def as_paper(settings: NerfSettings, letter: int, device: str) -> NerfSettings:
     if device == "cuda":
         field, rays = FIELD, letter
     schedule = Schedule(settings.schedule.epochs, rays)
-    depths_as_they_are = RefinementSettings(match_reach_px=0)
-    return replace(
-        settings, field=field, schedule=schedule, recipe=NERF, losses=LOSSES, refinement=depths_as_they_are
-    )  # fmt: skip
+    return replace(settings, field=field, schedule=schedule, recipe=NERF, losses=LOSSES)
+
+
+def order_and_edges(nerf: Nerf, photos: PhotoTensors) -> OrderAndEdges:
+    """What the paper adds to the training."""
+    return OrderAndEdges(nerf, photos, NERF.images_per_batch)
 
 
 def rays_of_an_epoch(workspace: Path, masks: Path, width_px: int, hold_out_every: int) -> int:

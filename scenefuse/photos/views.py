@@ -16,12 +16,6 @@ from scenefuse.photos.workspace import View, read_workspace
 Pixel = TypeVar("Pixel", bound=np.generic)
 
 
-def chosen_by(held_out: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which of (V,) held-out photos may choose between results: every other one; the rest is for measuring alone."""
-    rows = np.flatnonzero(held_out)[::2]
-    return np.isin(np.arange(len(held_out)), rows)
-
-
 @dataclass(frozen=True)
 class Views:
     """V photos of one object, undistorted, on pictures of one size, with their cameras in the object's SfM frame.

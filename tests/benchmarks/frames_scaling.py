@@ -24,18 +24,20 @@ from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.prior.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.nerf.prior.refine_depth import refine_depth
 from scenefuse.nerf.prior.train_depth import DepthTrainingSettings, train_depth
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 
 # A quarter of stage 1's pixels: what counts is how the cost grows with the photos.
-SMALL = {"width_px": 160, "crop_px": 72}
+SMALL_PX = 72
 # Functions of a stage whose share is listed by itself: module, function -> part.
 PARTS = {
     ("scenefuse.nerf.prior.train_depth", "load_views"): "loading",
     ("scenefuse.nerf.prior.train_depth", "network_inputs"): "plane sweep",
-    ("scenefuse.nerf.prior.train_depth", "train_networks"): "training",
-    ("scenefuse.nerf.prior.refine_depth", "train_networks"): "training",
+    ("scenefuse.nerf.prior.train_depth", "train_network"): "training",
+    ("scenefuse.nerf.prior.train_depth", "confirm"): "refinement",
+    ("scenefuse.nerf.prior.refine_depth", "load_views"): "loading",
+    ("scenefuse.nerf.prior.refine_depth", "confirm"): "refinement",
     ("scenefuse.nerf.train_object_nerf", "load_views"): "loading",
     ("scenefuse.nerf.train_object_nerf", "read_prior"): "prior",
     ("scenefuse.nerf.train_object_nerf", "find_volume"): "visual hull",
@@ -108,15 +110,16 @@ def measure(part: str, folder: Path, own: dict[str, Any], seed: int) -> dict[str
     if part == "stage1":
         train_depth(
             workspace=undistorted, masks=masks, **common, stage=folder / part,
-            report=folder / "stage1.json", settings=replace(build(DepthTrainingSettings, own["stage1"]), **SMALL),
+            report=folder / "stage1.json",
+            settings=replace(build(DepthTrainingSettings, own["stage1"]), crop_px=SMALL_PX),
+            width_px=own["nerf"]["width_px"],
         )  # fmt: skip
     elif part == "stage2":
         nerf(2, 1, None)
     elif part == "stage3":
         refine_depth(
-            workspace=undistorted, masks=masks, **common, stage=folder / part,
-            earlier=EarlierStages(previous=folder / "stage1", rendered=folder / "stage2"),
-            report=folder / "stage3.json", settings=build(FeedbackSettings, own["stage3"]),
+            workspace=undistorted, masks=masks, rendered=folder / "stage2", stage=folder / part,
+            report=folder / "stage3.json", width_px=own["nerf"]["width_px"], hold_out_every=own["hold_out_every"],
         )  # fmt: skip
     elif part == "stage4":
         nerf(4, 3, folder / "stage2")

@@ -36,7 +36,6 @@ FLAGS = {
     "grid_learning_rate": 4e-2,
     "samples_last": 24,
     "coarse_until": 0.1,
-    "edge_boost": 0,
     "mask_weight": 0.01,
     "distortion_weight": 0,
     "render_samples": 48,

@@ -23,15 +23,14 @@ from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import belongs_to_object, distances
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
-from scenefuse.nerf.prior.refine_depth import EarlierStages, FeedbackSettings, refine_depth
+from scenefuse.nerf.prior.refine_depth import refine_depth
 from scenefuse.nerf.rendered_maps import psnr
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper
 from scenefuse.paper.monocular import MonocularSettings
 from scenefuse.photos.pictures import read_rgb
-from scenefuse.photos.views import chosen_by, load_views
+from scenefuse.photos.views import load_views
 
-POSE_RATE = 5e-4
 # Of stage 1 in config/paper.yaml.
 PAPER_EPOCHS = 15
 
@@ -53,14 +52,8 @@ class Variant:
 VARIANTS = {
     "full": Variant(),
     "no_masks": Variant(nerf={"mask_weight": 0, "sparsity_weight": 0}, masks=False),
-    "no_depth": Variant(nerf={"depth_weight": 0, "rank_weight": 0}, prior=False),
-    "no_relative_depth": Variant(nerf={"rank_weight": 0}),
-    "prior_unrefined": Variant(nerf={"match_reach_px": 0}),
+    "no_depth": Variant(nerf={"depth_weight": 0}, prior=False),
     "no_feedback": Variant(feedback=False),
-    "poses_refined": Variant(nerf={"pose_learning_rate": POSE_RATE}),
-    "no_adaptive_grid": Variant(nerf={"edge_boost": 0}),
-    "adaptive_steps": Variant(nerf={"edge_boost": 0, "edge_rate": 1.0}),
-    "order_of_all": Variant(nerf={"order_of_all": True}),
     "no_samples_at_prior": Variant(nerf={"prior_share": 0.0}),
     "papers_rates": Variant(nerf={"learning_rate": 1e-3, "grid_learning_rate": 1e-3, "warmup_epochs": 2}),
     "stage2_longer": Variant(long=True),
@@ -101,19 +94,17 @@ def one(
         if variant.feedback and variant.prior and not variant.long:
             prior = work / "stage3"
             refine_depth(
-                workspace=folder / "undistorted", masks=masks, **common, stage=prior,
-                earlier=EarlierStages(previous=folder / "stage1", rendered=work / "stage2"),
-                report=work / "stage3.json", settings=build(FeedbackSettings, settings["stage3"]),
+                workspace=folder / "undistorted", masks=masks, rendered=work / "stage2", stage=prior,
+                report=work / "stage3.json", width_px=settings["nerf"]["width_px"],
+                hold_out_every=settings["hold_out_every"],
             )  # fmt: skip
         if not variant.long:
             nerf(4, prior, work / "stage2", late)
         last = work / ("stage2" if variant.long else "stage4")
         seconds, fusing = time.monotonic() - start, settings["cloud"]
-        psnr_last, psnr_unused = held_out_psnr(folder, last, settings)
         measured = {
-            "psnr_2": held_out_psnr(folder, work / "stage2", settings)[0],
-            "psnr_4": psnr_last,
-            "psnr_4_unused": psnr_unused,
+            "psnr_2": held_out_psnr(folder, work / "stage2", settings),
+            "psnr_4": held_out_psnr(folder, last, settings),
             "silhouettes": value(read_json(last.with_suffix(".json")), "silhouette_iou"),
             **cloud(folder, masks, last, truth, fusing, seed),
             "seconds": seconds,
@@ -169,22 +160,17 @@ def cloud(
     }
 
 
-def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> tuple[float, float]:
-    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every variant.
-
-    Of all of them, and of those by which stage 3 chose no depth (for the variants without feedback as well).
-    """
+def held_out_psnr(folder: Path, stage: Path, settings: dict[str, Any]) -> float:
+    """Mean PSNR of the renders of held-out photos inside the workflow's masks, the same pixels for every variant."""
     views = load_views(
         folder / "undistorted", folder / "masks", settings["nerf"]["width_px"], settings["hold_out_every"]
     )
     scores = []
-    held_out = np.flatnonzero(views.held_out)
-    for index in held_out:
+    for index in np.flatnonzero(views.held_out):
         picture = read_rgb(stage / "renders" / f"{Path(views.names[index]).stem}.png")
         render, photo = (torch.from_numpy(p).float() / 255 for p in (picture, views.images[index]))
         scores.append(psnr(render, photo, torch.from_numpy(views.masks[index])))
-    unused = np.array(scores)[~chosen_by(views.held_out)[held_out]]
-    return float(np.mean(scores)), float(unused.mean()) if len(unused) else np.nan
+    return float(np.mean(scores))
 
 
 def white(masks: Path, folder: Path) -> Path:
@@ -207,9 +193,8 @@ def object_ablation(
 
     Stage 1 is the workflow's in every variant but `papers_stage1` (to compare with `no_feedback`). `no_masks` calls
     everything the object, for the NeRF and for the cloud; its cloud thus holds the surroundings, which `F 1 %, cut`
-    leaves out. `no_depth` has no prior at all, `prior_unrefined` one that photos did not move, `no_feedback` takes
-    stage 1's depth in stage 4, `stage2_longer` has as many epochs without alternation. `adaptive_steps` is the
-    paper's adaptive grid as longer steps, `order_of_all` ranks depths that nothing confirms as well (method N9, N3).
+    leaves out. `no_depth` has no prior at all, `no_feedback` takes stage 1's depth in stage 4, `stage2_longer` has as
+    many epochs without alternation.
     Depth errors are medians over pixels that truly show the object; without a truth, columns that need one are empty.
 
     Args:
@@ -250,7 +235,6 @@ HEAD = {
     "within_4": "within 1 %",
     "psnr_2": "PSNR, stage 2 (dB)",
     "psnr_4": "stage 4 (dB)",
-    "psnr_4_unused": "on photos that chose no depth (dB)",
     "silhouettes": "silhouettes",
     "refined": "depths that photos moved",
     "inconsistent": "inconsistent depths",

@@ -5,13 +5,14 @@ python tests/benchmarks/paper_order.py --results results --objects fountain --se
 """
 
 import tempfile
-from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import read_json, run, value
-from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
-from scenefuse.paper.recipe import LOSSES
+from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_stage
+from scenefuse.paper.order_and_edges import RANK_WEIGHT, OrderAndEdges
+from scenefuse.paper.recipe import NERF
 from scenefuse.paper.train_nerf_as_paper import as_paper, rays_of_an_epoch
 
 # So small a weight teaches nothing, and the loss is still measured.
@@ -25,7 +26,7 @@ def paper_order(
     results: Path = Path("results"),
     objects: tuple[str, ...] = ("fountain",),
     seeds: int = 3,
-    weights: tuple[float, ...] = (NOTHING, LOSSES.rank_weight),
+    weights: tuple[float, ...] = (NOTHING, RANK_WEIGHT),
 ) -> None:
     """Print stage 2 of the preset with weights of the ranking loss, a line a run.
 
@@ -47,11 +48,10 @@ def paper_order(
             for weight in weights:
                 with tempfile.TemporaryDirectory() as temporary:
                     report = Path(temporary) / "stage2.json"
-                    train_object_nerf(
-                        inputs=NerfInputs(workspace, masks, folder / "stage1"),
-                        stage=report.with_suffix(""), report=report, checkpoints=Path(temporary) / "checkpoints",
-                        settings=replace(preset, losses=replace(LOSSES, rank_weight=weight)),
-                        hold_out_every=own["hold_out_every"], seed=seed,
+                    train_stage(
+                        NerfInputs(workspace, masks, folder / "stage1"), report.with_suffix(""), report,
+                        Path(temporary) / "checkpoints", preset, own["hold_out_every"], seed,
+                        partial(OrderAndEdges, images=NERF.images_per_batch, rank_weight=weight),
                     )  # fmt: skip
                     cells = [f"{value(read_json(report), measure):.4g}" for measure in MEASURES]
                 print(f"| {name} | {weight:g} | {seed} | " + " | ".join(cells) + " |", flush=True)

@@ -25,7 +25,6 @@ from scenefuse.demo import bodies, textures
 from scenefuse.demo.cameras import Cameras, pinhole
 from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
-from scenefuse.nerf.prior.pose_network import pose_quantities
 from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
 from scenefuse.paper.chain import chained, trajectory_error
 from scenefuse.paper.monocular import (
@@ -36,6 +35,7 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
+from scenefuse.paper.networks import pose_quantities
 from scenefuse.photos.views import Views
 
 # As the demo's photos, at the width of the paper's stage 1.
@@ -99,11 +99,12 @@ def learned(views: Views, true: Array, diagonal: float, epochs: int, seed: int) 
     supervision, recipe = supervision_of(frames), recipe_of(MonocularSettings(epochs, WIDTH))
     objective = monocular_losses(networks, frames, supervision, recipe)
     with tempfile.TemporaryDirectory() as folder:
-        optimise(networks, frames, objective, recipe, Path(folder) / "state.pt", seed)
+        optimise(networks.parts(), frames, objective, recipe, Path(folder) / "state.pt", seed)
     own = chained(networks.pose, frames)
     motions = pose_quantities(networks.pose, frames, unit_of(own, views.object_from_cam))
     chain = trajectory_error("chain", own, views.object_from_cam)
-    depth = predict(networks.depth, frames, supervision)[:, 0].cpu().numpy().astype(np.float64)
+    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
+    depth = raw[:, 0].cpu().numpy().astype(np.float64)
     return {
         "steps": recipe.steps(frames),
         "one_motion_deg": value(motions, "pose_network_rotation_error_deg"),

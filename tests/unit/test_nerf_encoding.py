@@ -51,38 +51,17 @@ def test_dense_level_interpolates_trilinearly():
     assert out[0].tolist() == pytest.approx([0.5 + 10.0 + 180.0, 0.5], rel=1e-5)
 
 
-@pytest.mark.parametrize("boosted", [False, True])
 @pytest.mark.parametrize("log2_table", [10, 18])  # the larger one has levels that are fetched ahead
-def test_kernel_values_and_gradients_match_the_reference(device, boosted, log2_table):
+def test_kernel_values_and_gradients_match_the_reference(device, log2_table):
     grid, table, x, weight = _problem(log2_table)
-    boost = torch.linspace(1, 4, len(x), device=device) if boosted else None
     results = []
     for function in (encode, encode_reference):
-        t, p = (part.clone().to(device).requires_grad_() for part in (table, x))
-        out = function(p, t, grid, weight.to(device), boost, 2)
+        t = table.clone().to(device).requires_grad_()
+        out = function(x.to(device), t, grid, weight.to(device))
         (out * torch.linspace(-1, 1, out.numel(), device=device).view_as(out)).sum().backward()
-        results.append((out.detach(), t.grad, p.grad))
+        results.append((out.detach(), t.grad))
     for ours, reference in zip(*results):
         assert (ours - reference).abs().max() <= 1e-5 * reference.abs().max()
-
-
-def test_boost_multiplies_fine_gradients_only_and_no_values(device):
-    grid, table, x, weight = _problem()
-    boost = torch.full((len(x),), 3.0, device=device)
-    gradients, values = [], []
-    for factor in (None, boost):
-        t = table.clone().to(device).requires_grad_()
-        out = encode(x.to(device), t, grid, weight.to(device), factor, 3)
-        out.sum().backward()
-        gradients.append(t.grad)
-        values.append(out.detach())
-    first_fine = int(grid.offset[3])
-    assert torch.equal(values[0], values[1])
-    if device == "cuda":  # atomic additions in any order
-        assert torch.allclose(gradients[0][:first_fine], gradients[1][:first_fine], rtol=1e-4, atol=1e-6)
-    else:
-        assert torch.equal(gradients[0][:first_fine], gradients[1][:first_fine])
-    assert torch.allclose(3 * gradients[0][first_fine:], gradients[1][first_fine:], rtol=1e-4, atol=1e-6)
 
 
 COMPILE = """
@@ -93,8 +72,7 @@ from scenefuse.nerf import triton_kernels
 floats, levels = "*fp32", ["*fp32", "*u32", "*u32", "*u32", "*fp32"]
 arguments = {
     "_encode": [floats, floats, *levels, floats, "i32"],
-    "_encode_backward": [floats, floats, *levels, floats, floats, "i32", "i32"],
-    "_encode_backward_x": [floats, floats, floats, *levels, floats, "i32"],
+    "_encode_backward": [floats, floats, *levels, floats, "i32"],
 }
 for name, types in arguments.items():
     function = getattr(triton_kernels, name)
@@ -120,7 +98,6 @@ def test_gpu_kernels_compile_to_one_load_or_addition_per_vertex(tmp_path):
     assert done.stdout.split("\n")[:-1] == [
         "_encode 75 8 0 0", "_encode 80 8 0 0", "_encode 90 8 0 0",
         "_encode_backward 75 1 16 0", "_encode_backward 80 1 16 0", "_encode_backward 90 1 8 0",
-        "_encode_backward_x 75 9 0 0", "_encode_backward_x 80 9 0 0", "_encode_backward_x 90 9 0 0",
     ]  # fmt: skip
 
 

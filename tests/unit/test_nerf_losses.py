@@ -22,19 +22,6 @@ def test_depth_is_huber_where_opaque_and_known():
     assert float(value) == pytest.approx((quadratic + 0.5 * linear) / 3, rel=1e-3)
 
 
-def test_rank_punishes_the_wrong_order_only():
-    opacity, weight = torch.ones(2), torch.ones(2)
-    uv = torch.tensor([[0.0, 0.0], [50.0, 0.0]])
-    prior = torch.tensor([1.0, 2.0])
-
-    def rank(a, b, apart=10.0):
-        return float(losses.rank_loss(torch.tensor([a, b]), opacity, prior, weight, uv, 1, apart))
-
-    assert rank(1.0, 2.0) == 0.0
-    assert rank(2.0, 1.0) == pytest.approx((losses.RANK_MARGIN + 1.0) / losses.RANK_MARGIN, rel=1e-4)
-    assert rank(2.0, 1.0, apart=60.0) == 0.0
-
-
 def test_mask_is_binary_cross_entropy():
     value = losses.mask_loss(torch.tensor([0.9, 0.2]), torch.tensor([1.0, 0.0]))
     assert float(value) == pytest.approx(-(math.log(0.9) + math.log(0.8)) / 2, rel=1e-5)

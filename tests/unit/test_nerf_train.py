@@ -15,15 +15,13 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import MAX_VIEWS, back_project, compare, normals_from_depth, others, surface_points
-from scenefuse.nerf.encoding import encode
-from scenefuse.nerf.field import EdgeRates, Field, FieldSettings
+from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import dilate, draw_batch, pixel_pool
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.rendered_maps import psnr, silhouette_iou, ssim
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.nerf.volume import cube_from_cameras, silhouettes, visual_hull
-from scenefuse.paper import recipe
 
 
 @pytest.fixture(scope="module")
@@ -47,13 +45,13 @@ RECIPE = NerfRecipe(
 )
 
 
-def _train(sphere, steps=60, pose=0.0, checkpoint=None, report=lambda line: None, seed=0, **recipe):
+def _train(sphere, steps=60, checkpoint=None, report=lambda line: None, seed=0, **recipe):
     use_threads(1)
     cube, hull = sphere_volume(sphere)
     photos = photos_of(sphere, cube, prior=1.0)
     nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), seed, "cpu")
     schedule = Schedule(epochs=2, rays_per_epoch=steps * 512 // 2)
-    recipe = replace(RECIPE, pose_learning_rate=pose, **recipe)
+    recipe = replace(RECIPE, **recipe)
     training = Training(photos, schedule, recipe, WEIGHTS, warm=False, seed=seed)
     return nerf, photos, cube, train(nerf, training, checkpoint=checkpoint, report=report)
 
@@ -132,11 +130,10 @@ def test_training_finds_the_sphere(sphere):
     assert result["steps"] == 400
 
 
-@pytest.mark.parametrize("edge_rate", [0.0, 1.0])
-def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch, edge_rate):
-    whole = _train(sphere, steps=24, edge_rate=edge_rate)[0]
-    assert torch.equal(whole.field.table, _train(sphere, steps=24, edge_rate=edge_rate)[0].field.table)
-    assert not torch.equal(whole.field.table, _train(sphere, steps=24, edge_rate=edge_rate, seed=1)[0].field.table)
+def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, monkeypatch):
+    whole = _train(sphere, steps=24)[0]
+    assert torch.equal(whole.field.table, _train(sphere, steps=24)[0].field.table)
+    assert not torch.equal(whole.field.table, _train(sphere, steps=24, seed=1)[0].field.table)
 
     def draw_and_end_at_ten(*arguments):
         if arguments[3] == 10:
@@ -146,11 +143,11 @@ def test_same_seed_same_model_and_resuming_changes_nothing(sphere, tmp_path, mon
     monkeypatch.setattr(training_module, "draw_batch", draw_and_end_at_ten)
     checkpoint = tmp_path / "state.pt"
     with pytest.raises(SystemExit):
-        _train(sphere, steps=24, edge_rate=edge_rate, checkpoint=checkpoint)
+        _train(sphere, steps=24, checkpoint=checkpoint)
     assert torch.load(checkpoint, weights_only=True)["step"] == 11
     monkeypatch.setattr(training_module, "draw_batch", draw_batch)
     lines = []
-    resumed = _train(sphere, steps=24, edge_rate=edge_rate, checkpoint=checkpoint, report=lines.append)[0]
+    resumed = _train(sphere, steps=24, checkpoint=checkpoint, report=lines.append)[0]
     assert "resumed at step 11 of 24" in lines[0]
     assert torch.equal(whole.field.table, resumed.field.table)
     assert torch.equal(whole.occupancy.density, resumed.occupancy.density)
@@ -170,11 +167,6 @@ def test_a_training_that_diverges_is_one_sentence_and_leaves_no_checkpoint(spher
     with pytest.raises(StageError, match="the training diverged"):
         _train(sphere, steps=3, checkpoint=tmp_path / "state.pt")
     assert not list(tmp_path.iterdir())
-
-
-def test_poses_move_with_a_learning_rate_only(sphere):
-    assert not _train(sphere, steps=12)[0].pose.any()
-    assert _train(sphere, steps=12, pose=1e-4)[0].pose.any()
 
 
 def test_depth_maps_confirm_each_other_and_give_normals(sphere):
@@ -256,92 +248,6 @@ def test_of_many_views_the_near_ones_and_fewer_far_ones_are_compared():
     away = np.abs((compared - 7 + 200) % 400 - 200)
     assert away.min() == 1 and away.max() == 200
     assert (away <= 10).sum() > (away >= 180).sum() > 0
-
-
-def _fine_steps(sphere, **recipe):
-    """How far one step of Adam moves the rows of the coarse and of the fine levels, both in learning rates."""
-    nerf = _train(sphere, steps=1, **recipe)[0]
-    cube, hull = sphere_volume(sphere)
-    start = new_nerf(FIELD, torch.from_numpy(hull), 12, 0, "cpu").field
-    moved = (nerf.field.table - start.table).detach().abs() / RECIPE.grid_learning_rate
-    first_fine = int(start.grid.offset[FIELD.levels // 2])
-    return moved[:first_fine], moved[first_fine:]
-
-
-def test_adam_divides_a_factor_on_gradients_out_and_not_one_on_its_steps(sphere):
-    coarse, fine = _fine_steps(sphere, edge_boost=0.0)
-    _, boosted = _fine_steps(sphere, edge_boost=3.0)
-    assert torch.allclose(boosted, fine, atol=1e-3)
-    same, faster = _fine_steps(sphere, edge_boost=0.0, edge_rate=3.0)
-    assert torch.equal(same, coarse)
-    ratio = (faster / fine)[fine > 0.9]
-    assert float(ratio.min()) > 0.99 and float(ratio.max()) == pytest.approx(4.0, rel=1e-3)
-    assert (ratio > 2).float().mean() > 0.05 and (ratio < 1.1).float().mean() > 0.05
-
-
-def _errors(gradient=0.0, rate=0.0):
-    """What is left of a wave after 40 steps, root mean square, where x < 0.5 is called an edge, and elsewhere."""
-    rng = torch.Generator().manual_seed(0)
-    field = Field(FieldSettings(levels=4, log2_table=14, coarsest=4, finest=24), rng)
-    optimizer = torch.optim.Adam([field.table], lr=1e-2, betas=(0.9, 0.99), eps=1e-15)
-    rates = EdgeRates.of(field, rate)
-
-    def off(x, boost):
-        wave = torch.sin(60 * x[:, 0]) * torch.sin(60 * x[:, 1])
-        return encode(x, field.table, field.grid, field.level_weight, boost, fine_from=2).sum(1) - wave
-
-    for _ in range(40):
-        x = torch.rand(2000, 3, generator=rng)
-        edge = (x[:, 0] < 0.5).float()
-        (off(x, 1 + gradient * edge) ** 2).mean().backward()
-        if rate:
-            rates.see(field, x, torch.ones(len(x)), edge)
-        rates.step(field, optimizer)
-        optimizer.zero_grad()
-    x = torch.rand(5000, 3, generator=rng)
-    left = off(x, None).detach() ** 2
-    return [float(left[at].mean().sqrt()) for at in (x[:, 0] < 0.5, x[:, 0] >= 0.5)]
-
-
-def test_the_adaptive_grid_learns_edges_better_and_the_rest_as_well():
-    plain, gradients, steps = _errors(), _errors(gradient=3.0), _errors(rate=3.0)
-    as_papers = _errors(rate=recipe.NERF.edge_rate)
-    assert as_papers[0] < 0.95 * plain[0] and as_papers[1] == pytest.approx(plain[1], rel=0.02)
-    assert gradients == pytest.approx(plain, rel=0.01)  # Adam divides the factor out again
-    assert steps[0] < 0.9 * plain[0] and steps[1] == pytest.approx(plain[1], rel=0.02)
-
-
-def test_the_order_of_depths_that_nothing_confirms_is_learned_only_where_it_is_asked_for(sphere):
-    cube, hull = sphere_volume(sphere)
-    known = photos_of(sphere, cube, prior=1.0)
-    inside_out = torch.where(known.depths > 0, 2 * known.depths[known.depths > 0].mean() - known.depths, 0.0)
-
-    def trained(weight, order):
-        photos = replace(known, confidence=torch.zeros_like(known.confidence), order=order)
-        nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), 0, "cpu")
-        weights = LossWeights(rank_weight=weight, color_weight=0.01)
-        training = Training(photos, Schedule(2, 60 * 512 // 2), RECIPE, weights, warm=False, seed=0)
-        return nerf, train(nerf, training, checkpoint=None, report=lambda line: None)
-
-    shipped, unranked = trained(0.5, None), trained(0.0, None)
-    assert torch.equal(shipped[0].field.table, unranked[0].field.table) and shipped[1]["rank"] == 0
-    ranked, barely = trained(0.5, inside_out)[1]["rank"], trained(1e-9, inside_out)[1]["rank"]
-    assert ranked < 0.8 * barely
-
-
-def test_by_the_paper_s_recipe_the_order_is_learned_beside_the_depths_that_it_is_of(sphere):
-    """Both losses of the same maps, each with a scale of its own as monocular maps have, at the recipe's weights."""
-    cube, hull = sphere_volume(sphere)
-    known = photos_of(sphere, cube, prior=1.0)
-    scales = 1 + 0.15 * torch.randn((len(known), 1, 1), generator=torch.Generator().manual_seed(2))
-    photos = replace(known, depths=scales * known.depths, order=scales * known.depths)
-
-    def left(weights):
-        nerf = new_nerf(FIELD, torch.from_numpy(hull), len(photos), 0, "cpu")
-        training = Training(photos, Schedule(2, 60 * 512 // 2), RECIPE, weights, warm=False, seed=0)
-        return train(nerf, training, checkpoint=None, report=lambda line: None)["rank"]
-
-    assert left(recipe.LOSSES) < 0.9 * left(replace(recipe.LOSSES, rank_weight=1e-9))
 
 
 def test_from_directions_that_no_photo_has_colours_are_those_that_photos_agree_on():

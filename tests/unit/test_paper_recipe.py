@@ -17,9 +17,7 @@ from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.prior import training
-from scenefuse.nerf.prior.pose_network import small_photos
-from scenefuse.nerf.prior.refine_depth import EarlierStages
-from scenefuse.nerf.prior.training import Recipe, load_networks, optimise, predict
+from scenefuse.nerf.prior.training import Recipe, optimise, predict
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
 from scenefuse.paper import recipe
@@ -35,7 +33,9 @@ from scenefuse.paper.monocular import (
     recipe_of,
     supervision_of,
 )
-from scenefuse.paper.refine_as_paper import refine_as_paper
+from scenefuse.paper.networks import load_networks, small_photos
+from scenefuse.paper.order_and_edges import RANK_WEIGHT
+from scenefuse.paper.refine_as_paper import EarlierStages, refine_as_paper
 from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
 from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm import adjustment, matches
@@ -52,11 +52,10 @@ def test_the_constants_are_the_papers():
     assert FieldSettings(levels=16, log2_table=19, finest=2048, width=64) == recipe.FIELD
     assert nerf == NerfRecipe(
         images_per_batch=24, rays_per_image=170, warmup_epochs=2, learning_rate=1e-3, grid_learning_rate=1e-3,
-        coarse_until=0.0, edge_boost=0.0, edge_rate=1.0, order_of_all=True, prior_of_all=True, prior_share=0.0,
-        turned_share=0.0, appearance=False,
+        coarse_until=0.0, prior_share=0.0, turned_share=0.0, appearance=False,
     )  # fmt: skip
     assert replace(LossWeights(), distortion_weight=0.0) == recipe.LOSSES
-    assert recipe.LOSSES.rank_weight > 0 and recipe.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
+    assert RANK_WEIGHT > 0 and recipe.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
     preset = read_settings(ROOT / "config/paper.yaml")
     assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == recipe.EPOCHS == 60
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
@@ -82,7 +81,7 @@ def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_
     assert (on_gpu.field, on_gpu.schedule.rays_per_epoch) == (recipe.FIELD, 900_000)
     assert (on_cpu.field, on_cpu.schedule.rays_per_epoch) == (settings.field, settings.schedule.rays_per_epoch)
     assert as_paper(settings, 500, "cpu").schedule.rays_per_epoch == 500
-    assert on_cpu.recipe is recipe.NERF and on_cpu.refinement.match_reach_px == 0
+    assert on_cpu.recipe is recipe.NERF
 
 
 def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
@@ -94,7 +93,7 @@ def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
         return {"photometric": nothing, "smoothness": nothing}
 
     networks = new_monocular_networks(CPU)
-    optimise(networks, frames, losses, recipe_of(MonocularSettings(2)), tmp_path / "state.pt", 0)
+    optimise(networks.parts(), frames, losses, recipe_of(MonocularSettings(2)), tmp_path / "state.pt", 0)
     assert sizes == [24, 24, 11] * 2  # of 60, one is held out
 
 
@@ -104,7 +103,7 @@ def test_where_nothing_moves_with_the_camera_nothing_is_learned():
     stuck = video.images.copy()
     stuck[:, :, :32] = stuck[0, :, :32]  # as a sticker on the lens
     frames = frames_of(replace(video, images=stuck), CPU)
-    networks, length = new_monocular_networks(CPU), Recipe(3, 1, 24, 0.0)
+    networks, length = new_monocular_networks(CPU), Recipe(3, 1)
     objective, chosen = monocular_losses(networks, frames, supervision_of(frames), length), torch.arange(3)
     last = length.steps(frames) - 1  # the full size
     masked = objective(chosen, last, torch.Generator())["photometric"]
@@ -117,9 +116,10 @@ def test_where_nothing_moves_with_the_camera_nothing_is_learned():
 def _trained(frames, path, epochs=50, **target):
     """Networks trained on frames, and their losses."""
     torch.manual_seed(0)
-    networks, length = new_monocular_networks(CPU), Recipe(epochs, 2, 24, 0.0)
+    networks, length = new_monocular_networks(CPU), Recipe(epochs, 2)
     supervision = supervision_of(frames, **target)
-    losses = optimise(networks, frames, monocular_losses(networks, frames, supervision, length), length, path, 0)
+    objective = monocular_losses(networks, frames, supervision, length)
+    losses = optimise(networks.parts(), frames, objective, length, path, 0)
     return networks, supervision, losses
 
 
@@ -127,7 +127,8 @@ def _trained(frames, path, epochs=50, **target):
 def _shifts_px(networks, frames, supervision):
     """Columns by which depth and motion together move the middle of each frame into the next."""
     small = small_photos(frames)
-    motion, depth = networks.pose(small[:-1], small[1:]), predict(networks.depth, frames, supervision)
+    motion = networks.pose(small[:-1], small[1:])
+    depth = predict(networks.depth, frames, supervision.colors, supervision.first)
     middle = torch.zeros(len(small) - 1, 3)
     middle[:, 2] = depth[:-1, 0, depth.shape[2] // 2, depth.shape[3] // 2]
     moved = (motion[:, :3, :3] @ middle[:, :, None])[..., 0] + motion[:, :3, 3]
@@ -147,7 +148,7 @@ def test_fused_depth_refines_the_depth_network_however_far_off_it_is(tmp_path, w
     frames = frames_of(sideways_video(), CPU)
     target, weight = torch.full_like(frames.masks, wanted), torch.ones_like(frames.masks)
     networks, supervision, losses = _trained(frames, tmp_path / "state.pt", target=target, weight=weight)
-    depth = predict(networks.depth, frames, supervision)
+    depth = predict(networks.depth, frames, supervision.colors, supervision.first)
     assert torch.median((depth - wanted).abs()) < 0.05 and losses[-1]["target"] < 0.05 * losses[0]["target"]
     assert float(_shifts_px(networks, frames, supervision).median()) == pytest.approx(-SHIFT_PX, abs=0.5)
 
@@ -155,7 +156,7 @@ def test_fused_depth_refines_the_depth_network_however_far_off_it_is(tmp_path, w
 def test_fused_depth_teaches_the_pose_network_what_the_frames_look_like_through_it():
     frames = frames_of(sideways_video(), CPU)
     target, weight = torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks)
-    networks, length = new_monocular_networks(CPU), Recipe(1, 1, 24, 0.0)
+    networks, length = new_monocular_networks(CPU), Recipe(1, 1)
     objective = monocular_losses(networks, frames, supervision_of(frames, target, weight), length)
     objective(torch.arange(3), 0, torch.Generator())["pose"].backward()
     slope = {
@@ -169,10 +170,10 @@ def test_fused_depth_teaches_the_pose_network_what_the_frames_look_like_through_
 def test_every_step_moves_both_networks(tmp_path, name):
     frames = frames_of(sideways_video(), CPU)
     supervision = supervision_of(frames, torch.full_like(frames.masks, 1.4), torch.ones_like(frames.masks))
-    networks, length = new_monocular_networks(CPU), Recipe(2, 1, 24, 0.0)
+    networks, length = new_monocular_networks(CPU), Recipe(2, 1)
     before = [part.clone() for part in getattr(networks, name).parameters()]
     objective = monocular_losses(networks, frames, supervision, length)
-    optimise(networks, frames, objective, length, tmp_path / "state.pt", 0)
+    optimise(networks.parts(), frames, objective, length, tmp_path / "state.pt", 0)
     assert any(not torch.equal(a, b) for a, b in zip(before, getattr(networks, name).parameters()))
 
 

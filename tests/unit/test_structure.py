@@ -20,7 +20,7 @@ MAY_IMPORT |= {"demo": {"core", "cloud", "photos", "demo"}, "config": {*PACKAGES
 MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "command_line": {*PACKAGES, "new_project"}}
 MAY_IMPORT |= {"__main__": {"command_line"}}
 CORE = ("field", "encoding", "kernels", "triton_kernels", "rays", "render", "occupancy", "losses", "training")
-CORE += ("appearance", "pose_refinement")
+CORE += ("appearance",)
 OUTSIDE = {"numpy", "torch", "numba", "llvmlite", "triton", *sys.stdlib_module_names}
 OURS = {f"scenefuse.core.{name}" for name in ("stage", "transforms", "machine", "checkpoints")}
 

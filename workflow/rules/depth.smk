@@ -1,6 +1,6 @@
-# Depth and pose networks of an object: stage 1 trains them, stage 3 refines them by what the NeRF renders.
+# Depth of an object: a network in stage 1, what the NeRF renders in stage 3, both corrected by the photos.
 #
-# INPUTS    results/objects/{object}/undistorted/, masks/; config: object.stage1, object.stage3
+# INPUTS    results/objects/{object}/undistorted/, masks/, stage2/; config: object.stage1, object.nerf.width_px
 # OUTPUTS   results/objects/{object}/stage1/, stage1.json, stage3/, stage3.json
 
 
@@ -14,7 +14,7 @@ POSED = (
 
 
 rule train_depth:
-    """Self-supervised depth and pose networks (paper 3.2 and 4.2.2, stage 1)."""
+    """Self-supervised depth network, its depth corrected by the photos (paper 3.2 and 4.2.2, stage 1)."""
     input:
         workspace=POSED,
         workspace_json=f"{POSED}.json",
@@ -31,33 +31,31 @@ rule train_depth:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=by_photos(6000, 2000, 10, masked_photos),
+        mem_mb=by_photos(8000, 1000, 80, masked_photos),
         runtime=lambda wildcards, attempt: 240 * attempt,
         gpu=config["gpu"],
     params:
         options=settings(
-            "object.stage1", "object.hold_out_every", without=["pose_source"]
+            "object.stage1.epochs", "object.nerf.width_px", "object.hold_out_every"
         ),
         checkpoints="results/checkpoints/{object}/stage1",
         seed=config["seed"],
         script=script("nerf/train_depth.py"),
         code=code("nerf/train_depth.py"),
     message:
-        "{wildcards.object}: stage 1, depth and pose networks"
+        "{wildcards.object}: stage 1, depth network"
     shell:
         "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --stage {output.stage} --report {output.report}"
         " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
 
 
 rule refine_depth:
-    """Feedback: depth rendered by the NeRF refines the networks (stage 3)."""
+    """Feedback: photos correct the depth that the NeRF rendered (stage 3)."""
     input:
         workspace=POSED,
         workspace_json=f"{POSED}.json",
         masks="results/objects/{object}/masks",
         masks_json="results/objects/{object}/masks.json",
-        previous="results/objects/{object}/stage1",
-        previous_json="results/objects/{object}/stage1.json",
         rendered="results/objects/{object}/stage2",
         rendered_json="results/objects/{object}/stage2.json",
     output:
@@ -71,18 +69,14 @@ rule refine_depth:
         "../../envs/training.yaml"
     threads: OBJECT_THREADS
     resources:
-        mem_mb=by_photos(6000, 2000, 10, masked_photos),
-        runtime=lambda wildcards, attempt: 240 * attempt,
-        gpu=config["gpu"],
+        mem_mb=by_photos(4000, 1000, 80, masked_photos),
+        runtime=lambda wildcards, attempt: 60 * attempt,
     params:
-        options=settings("object.stage3", "object.hold_out_every"),
-        checkpoints="results/checkpoints/{object}/stage3",
-        seed=config["seed"],
+        options=settings("object.nerf.width_px", "object.hold_out_every"),
         script=script("nerf/refine_depth.py"),
         code=code("nerf/refine_depth.py"),
     message:
         "{wildcards.object}: stage 3, feedback"
     shell:
-        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --previous {input.previous}"
-        " --rendered {input.rendered} --stage {output.stage} --report {output.report}"
-        " --checkpoints {params.checkpoints}/{params.code} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --workspace {input.workspace} --masks {input.masks} --rendered {input.rendered}"
+        " --stage {output.stage} --report {output.report} {params.options} &> {log}"

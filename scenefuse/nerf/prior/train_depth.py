@@ -1,66 +1,44 @@
-"""Stage 1 of an object: self-supervised depth and pose networks, and a depth map with a confidence for every photo."""
+"""Stage 1 of an object: a self-supervised depth network, and depth of every photo that photos and views confirm."""
 
 import time
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import atomic_directory, quantity, setting, write_json
-from scenefuse.nerf.prior.consistency import consistency_between_views, residuals_at_points
-from scenefuse.nerf.prior.crops import Crops, crop_to_object
+from scenefuse.mvs.photo_refinement import RefinementSettings
+from scenefuse.nerf.prior.alignment import align_maps, residual_at_checks
+from scenefuse.nerf.prior.confirmed import MAP_AGREEMENT, confirm, write_prior
 from scenefuse.nerf.prior.first_depth import NetworkInputs, network_inputs
-from scenefuse.nerf.prior.inputs import DepthPhotos, depth_photos
-from scenefuse.nerf.prior.maps import (
-    Content,
-    align_maps,
-    map_quantities,
-    print_quality,
-    residual_at_checks,
-    tolerance_of,
-    write_maps,
-)
-from scenefuse.nerf.prior.networks import depth_from_disparity, parameters
-from scenefuse.nerf.prior.pose_network import pose_quantities
-from scenefuse.nerf.prior.training import (
-    Networks,
-    Recipe,
-    Supervision,
-    loss_quantities,
-    new_networks,
-    predict,
-    prepare_torch,
-    save_networks,
-    train_networks,
-)
+from scenefuse.nerf.prior.inputs import DepthPhotos, crop_to_object, depth_photos
+from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, parameters
+from scenefuse.nerf.prior.training import Recipe, loss_quantities, predict, prepare_torch, train_network
 from scenefuse.photos.views import load_views
 
-# The first part of the training compares photos at half size, where wrong depths still find their way.
-COARSE_SHARE = 0.3
+# Other photos that each photo is compared with.
+SOURCES = 6
+# Depth hypotheses of the plane sweep that feeds the network.
+SWEEP_PLANES = 48
+
+Content = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class DepthTrainingSettings:
     """How stage 1 trains."""
 
-    crop_px: int = setting(144, unit="px", least=32)
-    """The networks see photos cut to the object, about this many pixels squared. More gives finer depth in more time
-    and memory."""
     epochs: int = setting(15, least=0)
     """Epochs of training, each over all photos."""
-    width_px: int = 320
-    """Width at which photos are read and depth maps are written, pixels."""
-    sources: int = 6
-    """Other photos each photo is compared with."""
-    sweep_planes: int = 48
-    """Depth hypotheses of the plane sweep that feeds the network; 0 leaves it out."""
-    batch_photos: int = 24
-    """Photos per step."""
-    warmup_epochs: int = 2
-    """Epochs of linear rise of the learning rate before the cosine."""
+    crop_px: int = 144
+    """The network sees photos cut to the object, about this many pixels squared."""
+    refinement: RefinementSettings = RefinementSettings()
+    """Of its depths by photos."""
+    map_agreement: float = MAP_AGREEMENT
+    """Two depths of one place agree within this share of the object's diagonal."""
 
 
 def train_depth(
@@ -71,23 +49,25 @@ def train_depth(
     report: Path,
     checkpoints: Path,
     settings: DepthTrainingSettings,
+    width_px: int,
     hold_out_every: int,
     seed: int,
 ) -> None:
-    """Train the depth and pose networks on one object's photos and write a depth map for each photo.
+    """Train the depth network on one object's photos and write a depth map for each photo.
 
-    The networks and losses are those of Monodepth2 (method N10), trained from scratch. The depth network corrects a
-    first disparity made of sparse points and a plane sweep, and the pose network learns beside it from detached depth.
-    Depth maps are along z, in object units, aligned to the sparse points of their photo by a robust scale and shift
-    (N1), 0 off the object.
+    Network and losses are those of Monodepth2 (method N10), trained from scratch. The network corrects a first
+    disparity made of sparse points and a plane sweep. Depth maps are along z, in object units, aligned to the sparse
+    points of their photo by a robust scale and shift (N1), moved to where photos match (N13), 0 off the object.
 
     Args:
-        workspace: undistorted COLMAP workspace of the object, with poses of SfM or those found without it (N11).
+        workspace: undistorted COLMAP workspace of the object.
         masks: folder of masks named like the photos, .png.
-        stage: output folder: depth_maps/{photo}.bin, confidence_maps/{photo}.bin (0..1) and networks.pt.
-        report: output JSON: residuals at sparse points, losses, consistency, errors of the pose network, seconds.
+        stage: output folder: depth_maps/{photo}.bin and confidence_maps/{photo}.bin (0..1).
+        report: output JSON: residuals at sparse points, losses, shares of the depths that photos moved, contradicted,
+            confirmed, seconds.
         checkpoints: folder for training states; a killed run resumes from it.
         settings: of the training.
+        width_px: width of the depth maps, that of the NeRF's photos.
         hold_out_every: every n-th photo is not trained on; 0 holds out none.
         seed: of weights, batches and sources.
 
@@ -97,43 +77,37 @@ def train_depth(
     """
     start = time.monotonic()
     device = prepare_torch(seed)
-    crops, photos, inputs = prepare_inputs(workspace, masks, settings, hold_out_every, device)
+    views = load_views(workspace, masks, width_px, hold_out_every)
+    crops = crop_to_object(views, settings.crop_px)
+    photos = depth_photos(crops.views, SOURCES, device)
+    inputs = network_inputs(photos, SWEEP_PLANES)
     print(f"{len(photos.points)} photos, depth {photos.near:.4g} to {photos.far:.4g}, inputs ready", flush=True)
-    networks = new_networks(inputs.channels.shape[1], photos)
-    supervision = Supervision(inputs.channels, inputs.first)
-    recipe = Recipe(settings.epochs, settings.warmup_epochs, settings.batch_photos, COARSE_SHARE)
-    checkpoint = checkpoints / key_of("stage 1", recipe, seed, photos, supervision) / "state.pt"
-    losses = train_networks(networks, photos, supervision, recipe, checkpoint, seed)
-    raw = predict(networks.depth, photos, supervision)
-    depth = align_maps(raw, photos, seed)
-    consistency = consistency_between_views(depth, photos, tolerance_of(photos))
+    network = DepthNetwork(inputs.channels.shape[1]).to(device)
+    recipe = Recipe(settings.epochs)
+    checkpoint = checkpoints / key_of("stage 1", recipe, seed, photos, inputs) / "state.pt"
+    losses = train_network(network, photos, inputs, recipe, checkpoint, seed)
+    raw = predict(network, photos, inputs.channels, inputs.first)
+    aligned = align_maps(raw, photos, seed)
+    depths = np.zeros(views.masks.shape, np.float32)
+    for index, place in enumerate(depths):
+        height, width = views.sizes[index]
+        place[:height, :width] = crops.paste(index, aligned[index, 0].cpu().numpy())
+    prior, confirmed = confirm(views, depths, settings.refinement, settings.map_agreement)
     content: Content = {
-        "workspace": quantity(workspace.name, ""),
-        **_input_quantities(crops, photos, inputs, networks),
+        **_input_quantities(photos, inputs, network),
         "residual_before_alignment": quantity(residual_at_checks(raw, photos), "1"),
-        "residual_per_photo": quantity(_residual_per_photo(depth, photos, crops.views.names), "1"),
-        **map_quantities(depth, consistency, photos),
+        "residual_after_alignment": quantity(residual_at_checks(aligned, photos), "1"),
+        **confirmed,
         **loss_quantities(losses),
-        **pose_quantities(networks.pose, photos, crops.views.object_from_cam),
     }
     with atomic_directory(stage) as folder:
-        write_maps(folder, crops, depth * photos.masks, consistency.confidence)
-        save_networks(folder / "networks.pt", networks, asdict(settings))
+        write_prior(folder, views, prior)
     write_json(report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
     checkpoint.unlink(missing_ok=True)
-    print_quality(content)
+    _print_quality(content)
 
 
-def prepare_inputs(
-    workspace: Path, masks: Path, settings: DepthTrainingSettings, hold_out_every: int, device: torch.device
-) -> tuple[Crops, DepthPhotos, NetworkInputs]:
-    """Photos cut to the object, the same as tensors, and what the depth network is given; for stages 1 and 3."""
-    crops = crop_to_object(load_views(workspace, masks, settings.width_px, hold_out_every), settings.crop_px)
-    photos = depth_photos(crops.views, settings.sources, device)
-    return crops, photos, network_inputs(photos, settings.sweep_planes)
-
-
-def _input_quantities(crops: Crops, photos: DepthPhotos, inputs: NetworkInputs, networks: Networks) -> Content:
+def _input_quantities(photos: DepthPhotos, inputs: NetworkInputs, network: DepthNetwork) -> Content:
     """What the training had to work with, and how good depth was before it."""
 
     def residual(disparity: Tensor) -> float | None:
@@ -142,18 +116,18 @@ def _input_quantities(crops: Crops, photos: DepthPhotos, inputs: NetworkInputs, 
     return {
         "photos": quantity(len(photos.points), "1"),
         "photos_held_out": quantity(int((~photos.trained).sum()), "1"),
-        "width_px": quantity(crops.masks.shape[2], "px"),
         "crop_px": quantity([photos.images.shape[3], photos.images.shape[2]], "px"),
         "nearest_depth": quantity(photos.near, "object units"),
         "farthest_depth": quantity(photos.far, "object units"),
         "diagonal": quantity(photos.diagonal, "object units"),
-        "parameters": quantity(parameters(networks.depth, networks.pose), "1"),
+        "parameters": quantity(parameters(network), "1"),
         "device": quantity(str(photos.images.device), ""),
         "residual_between_points": quantity(residual(inputs.between_points), "1"),
         "residual_before_training": quantity(residual(inputs.first), "1"),
     }
 
 
-def _residual_per_photo(depth: Tensor, photos: DepthPhotos, names: list[str]) -> dict[str, float]:
-    residuals = residuals_at_points(depth, photos.points)
-    return {name: float(np.median(r)) for name, r in zip(names, residuals) if len(r)}
+def _print_quality(content: Content) -> None:
+    residual, share = content["residual_after_alignment"]["value"], content["confirmed_share"]["value"]
+    known = "no SfM points to check" if residual is None else f"median residual at SfM points {residual:.2%}"
+    print(f"depth maps written: {known}, {share:.0%} of the object confirmed by other views", flush=True)

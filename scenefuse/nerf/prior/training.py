@@ -1,4 +1,4 @@
-"""Training the depth and pose networks on the photos of one object; a killed training resumes where it stopped."""
+"""Training the depth network on the photos of one object; a killed training resumes where it stopped."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,15 +8,15 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from scenefuse.core.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, require_finite
 from scenefuse.core.machine import use_threads
-from scenefuse.core.stage import StageError, quantity, threads
+from scenefuse.core.stage import quantity, threads
+from scenefuse.nerf.prior.first_depth import NetworkInputs
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity
-from scenefuse.nerf.prior.pose_network import PoseNetwork, pose_error, small_photos
 from scenefuse.nerf.prior.self_supervision import (
     masked_mean,
     minimum_reprojection,
@@ -32,31 +32,15 @@ MAX_GRADIENT = 1.0
 SOURCES_PER_STEP = 3
 # Weight of equation (5) as in Monodepth2; the other losses have 1.
 SMOOTHNESS_WEIGHT = 1e-3
-# Relative depth errors count in full from here, and no more beyond.
-SMALL_ERROR, LARGE_ERROR = 0.005, 0.1
+# Relative depth errors are squared below the first of these, and count no more beyond the second.
+SQUARED_ERROR, MAX_ERROR = 0.005, 0.1
+# The first part of the training compares photos at half size, where wrong depths still find their way.
+COARSE_SHARE = 0.3
 # Share of a half-size pixel that is object, for it to count.
-SHARE_OF_PIXEL = 0.75
+MIN_OBJECT_SHARE = 0.75
 PRINT_EVERY = 10
 # Photos that go through the network at once when nothing is trained.
 PHOTOS_AT_ONCE = 8
-
-
-@dataclass(frozen=True)
-class Networks:
-    """The two networks that are trained together."""
-
-    depth: DepthNetwork
-    pose: PoseNetwork
-
-    def state(self) -> dict[str, Any]:
-        """Weights of both."""
-        return {"depth": self.depth.state_dict(), "pose": self.pose.state_dict()}
-
-    def load(self, state: dict[str, Any]) -> None:
-        """Take the weights of `state`."""
-        self.depth.load_state_dict(state["depth"])
-        self.pose.load_state_dict(state["pose"])
-
 
 # The losses of (B,) chosen photos at a step, by name; the generator draws what is random.
 Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
@@ -64,45 +48,23 @@ Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
 
 @dataclass(frozen=True)
 class Recipe:
-    """How long the networks are trained; the stages fill it from their own settings.
+    """How long networks are trained.
 
     Attributes:
         epochs: each shows every photo once.
         warmup_epochs: epochs of linear rise of the learning rate before the cosine.
         batch_photos: target photos per step.
-        coarse_share: share of the steps, the first ones, that compare photos at half size.
         even: whether an epoch's batches are as large as each other, not all but the last one full.
     """
 
     epochs: int
-    warmup_epochs: int
-    batch_photos: int
-    coarse_share: float
+    warmup_epochs: int = 2
+    batch_photos: int = 24
     even: bool = True
 
     def steps(self, photos: DepthPhotos) -> int:
         """Steps of the whole training."""
         return self.epochs * -(-int(photos.trained.sum()) // self.batch_photos)
-
-
-@dataclass(frozen=True)
-class Supervision:
-    """The tensors a training run works on.
-
-    Attributes:
-        inputs: (V, C, H, W) network inputs.
-        first: (V, 1, H, W) first disparity.
-        target: (V, 1, H, W) depth to learn, or None.
-        target_weight: (V, 1, H, W) weight of each target pixel, 0 where there is none; None without a target.
-        large_error: relative errors against the target count no more beyond: only an outlier can be so far off, where
-            the depth is nearly right from the beginning.
-    """
-
-    inputs: Tensor
-    first: Tensor
-    target: Tensor | None = None
-    target_weight: Tensor | None = None
-    large_error: float = LARGE_ERROR
 
 
 def prepare_torch(seed: int) -> torch.device:
@@ -112,16 +74,10 @@ def prepare_torch(seed: int) -> torch.device:
     return torch.device("cuda" if torch.cuda.is_available() else "cpu")
 
 
-def new_networks(channels: int, photos: DepthPhotos) -> Networks:
-    """Untrained networks on the photos' device; the pose network counts in typical distances to the object."""
-    device = photos.images.device
-    return Networks(DepthNetwork(channels).to(device), PoseNetwork((photos.near * photos.far) ** 0.5).to(device))
-
-
-def train_networks(
-    networks: Networks, photos: DepthPhotos, supervision: Supervision, recipe: Recipe, checkpoint: Path, seed: int
+def train_network(
+    network: DepthNetwork, photos: DepthPhotos, inputs: NetworkInputs, recipe: Recipe, checkpoint: Path, seed: int
 ) -> list[dict[str, float]]:
-    """Train both networks in place on photos of known poses and return one row of mean losses per epoch.
+    """Train the depth network in place on photos of known poses and return one row of mean losses per epoch.
 
     Batches and sources depend on the seed and the step only, so a resumed run equals an uninterrupted one.
 
@@ -130,33 +86,49 @@ def train_networks(
     """
     points, weights = _padded(photos)
     scales = [PhotoScale(photos, shrink) for shrink in (2, 1)]
-    coarse = recipe.coarse_share * recipe.steps(photos)
+    coarse = COARSE_SHARE * recipe.steps(photos)
 
     def losses(chosen: Tensor, step: int, generator: torch.Generator) -> dict[str, Tensor]:
         scale = scales[0] if step < coarse else scales[1]
-        parts = _losses(networks, photos, supervision, scale, chosen, generator)
-        parts["anchor"] = _anchor(parts.pop("depth"), points[chosen], weights[chosen])
-        return parts
+        disparity = network(inputs.channels[chosen], inputs.first[chosen])
+        depth = depth_from_disparity(disparity, photos.near, photos.far)
+        available = photos.sources.shape[1]
+        columns = torch.randperm(available, generator=generator)[: min(SOURCES_PER_STEP, available)].sort().values
+        sources = photos.sources[chosen][:, columns]
+        moves = photos.source_from_target(chosen[:, None], sources)
+        error, counts = reprojection_error(scale, chosen, sources, depth, moves, scale.unmoved[chosen][:, columns])
+        return {
+            "photometric": masked_mean(error, counts),
+            "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
+            "anchor": _anchor(depth, points[chosen], weights[chosen]),
+        }
 
-    return optimise(networks, photos, losses, recipe, checkpoint, seed)
+    return optimise({"depth": network}, photos, losses, recipe, checkpoint, seed)
 
 
 def optimise(
-    networks: Networks, photos: DepthPhotos, losses_of: Objective, recipe: Recipe, checkpoint: Path, seed: int
+    networks: dict[str, nn.Module],
+    photos: DepthPhotos,
+    losses_of: Objective,
+    recipe: Recipe,
+    checkpoint: Path,
+    seed: int,
 ) -> list[dict[str, float]]:
-    """Minimise an objective by Adam, with warm-up and cosine; arguments, result and errors as of `train_networks`."""
+    """Minimise an objective by Adam, with warm-up and cosine; arguments, result and errors as of `train_network`."""
     batches = _batches(np.flatnonzero(photos.trained), recipe, seed)
     steps, warmup = len(batches), len(batches) * recipe.warmup_epochs / max(recipe.epochs, 1)
-    parameters = [*networks.depth.parameters(), *networks.pose.parameters()]
+    parameters = [weight for network in networks.values() for weight in network.parameters()]
     optimizer = torch.optim.Adam(parameters, lr=LEARNING_RATE)
     losses: list[dict[str, float]] = []
 
     def state() -> dict[str, Any]:
-        return networks.state() | {"optimizer": optimizer.state_dict(), "losses": losses}
+        weights = {name: network.state_dict() for name, network in networks.items()}
+        return weights | {"optimizer": optimizer.state_dict(), "losses": losses}
 
     saved = load_checkpoint(checkpoint, like=state())
     if saved is not None:
-        networks.load(saved)
+        for name, network in networks.items():
+            network.load_state_dict(saved[name])
         optimizer.load_state_dict(saved["optimizer"])
         losses.extend(saved["losses"])
         print(f"resuming at step {len(losses)} from {checkpoint}", flush=True)
@@ -169,8 +141,9 @@ def optimise(
             losses.append({name: float(value.detach()) for name, value in parts.items()})
             require_finite(losses[-1])  # the gradient of sampling at a NaN would end the process without a word
             optimizer.zero_grad(set_to_none=True)
-            _total(parts).backward()
-            for network in (networks.depth, networks.pose):
+            weight = {"smoothness": SMOOTHNESS_WEIGHT}
+            torch.stack([weight.get(name, 1.0) * loss for name, loss in parts.items()]).sum().backward()
+            for network in networks.values():
                 torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT)
             optimizer.step()
             if (step + 1) % PRINT_EVERY == 0:
@@ -180,9 +153,9 @@ def optimise(
 
 
 @torch.no_grad()
-def predict(network: DepthNetwork, photos: DepthPhotos, supervision: Supervision) -> Tensor:
-    """(V, 1, H, W) depth of all photos, held-out ones too."""
-    parts = zip(supervision.inputs.split(PHOTOS_AT_ONCE), supervision.first.split(PHOTOS_AT_ONCE))
+def predict(network: DepthNetwork, photos: DepthPhotos, channels: Tensor, first: Tensor) -> Tensor:
+    """(V, 1, H, W) depth of all photos, held-out ones too, from input channels and first disparities."""
+    parts = zip(channels.split(PHOTOS_AT_ONCE), first.split(PHOTOS_AT_ONCE))
     return depth_from_disparity(torch.cat([network(x, d) for x, d in parts]), photos.near, photos.far)
 
 
@@ -195,36 +168,13 @@ def loss_quantities(losses: list[dict[str, float]]) -> dict[str, Any]:
     }
 
 
-def save_networks(path: Path, networks: Networks, settings: dict[str, Any]) -> None:
-    """What stage 3 continues from."""
-    torch.save(networks.state() | {"settings": settings}, path)
-
-
-def load_networks(path: Path) -> dict[str, Any]:
-    """What `save_networks` wrote: `depth` and `pose` for `Networks.load`, and `settings`.
-
-    Raises:
-        StageError: the file is missing or holds something else.
-    """
-    if not path.is_file():
-        raise StageError(f"{path} does not exist; run stage 1 first")
-    try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
-    except Exception as error:  # a truncated file raises any of half a dozen
-        why = " ".join(str(error).split())[:200]
-        raise StageError(f"{path} cannot be read ({why}); delete it and run stage 1 again") from None
-    if not {"depth", "pose", "settings"} <= set(state):
-        raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
-    return state
-
-
 class PhotoScale:
     """The photos at one size, and the error of every pair of photos as they are (for the auto-mask)."""
 
     def __init__(self, photos: DepthPhotos, shrink: int) -> None:
         self.shrink = shrink
         self.images = self.pool(photos.images)
-        self.masks = (self.pool(photos.masks) > SHARE_OF_PIXEL).to(photos.masks.dtype)
+        self.masks = (self.pool(photos.masks) > MIN_OBJECT_SHARE).to(photos.masks.dtype)
         self.intrinsics = photos.intrinsics.clone()
         self.intrinsics[:, :2] /= shrink
         self.unmoved = torch.cat([photometric_error(self.images, self.images[of]) for of in photos.sources.T], 1)
@@ -232,43 +182,6 @@ class PhotoScale:
     def pool(self, maps: Tensor) -> Tensor:
         """Maps at this size."""
         return functional.avg_pool2d(maps, self.shrink) if self.shrink > 1 else maps
-
-
-def _losses(
-    networks: Networks,
-    photos: DepthPhotos,
-    supervision: Supervision,
-    scale: PhotoScale,
-    chosen: Tensor,
-    generator: torch.Generator,
-) -> dict[str, Tensor]:
-    """All losses of (B,) chosen photos but the one at SfM points, and their (B, 1, H, W) depth."""
-    disparity = networks.depth(supervision.inputs[chosen], supervision.first[chosen])
-    depth = depth_from_disparity(disparity, photos.near, photos.far)
-    available = photos.sources.shape[1]
-    columns = torch.randperm(available, generator=generator)[: min(SOURCES_PER_STEP, available)].sort().values
-    sources = photos.sources[chosen][:, columns]
-    moves = photos.source_from_target(chosen[:, None], sources)
-    unmoved = scale.unmoved[chosen][:, columns]
-    photometric, counts = reprojection_error(scale, chosen, sources, depth, moves, unmoved)
-    small, one = small_photos(photos), sources[:, :1]
-    found = networks.pose(small[chosen], small[one[:, 0]])[:, None]
-    error, seen = reprojection_error(scale, chosen, one, depth.detach(), found, None)
-    return {
-        "photometric": masked_mean(photometric, counts),
-        "smoothness": smoothness(disparity, photos.images[chosen], photos.masks[chosen]),
-        "target": error_against_target(depth, supervision, chosen, photos.near),
-        "pose": masked_mean(error, seen) + pose_error(found[:, 0], moves[:, 0], networks.pose.unit),
-        "depth": depth,
-    }
-
-
-def _total(parts: dict[str, Tensor]) -> Tensor:
-    """The loss that is minimised."""
-    total = parts["photometric"] + SMOOTHNESS_WEIGHT * parts["smoothness"]
-    for name in ("anchor", "target", "pose"):
-        total = total + parts[name] if name in parts else total
-    return total
 
 
 def reprojection_error(
@@ -290,25 +203,16 @@ def reprojection_error(
     return smallest, counts & (scale.masks[chosen] > 0)
 
 
-def error_against_target(depth: Tensor, supervision: Supervision, chosen: Tensor, near: float) -> Tensor:
-    """Huber loss on the relative depth error against the target maps; zero without them."""
-    if supervision.target is None or supervision.target_weight is None:
-        return depth.new_zeros(())
-    relative = depth / supervision.target[chosen].clamp_min(near) - 1.0
-    weight = supervision.target_weight[chosen]
-    return (_huber(relative, supervision.large_error) * weight).sum() / weight.sum().clamp_min(1.0)
-
-
 def _anchor(depth: Tensor, points: Tensor, weights: Tensor) -> Tensor:
     """Huber loss on the relative depth error at SfM points."""
     relative = sample(depth, points[..., :2])[:, 0] / points[..., 2] - 1.0
-    return (_huber(relative) * weights).sum() / weights.sum().clamp_min(1.0)
+    return (huber(relative, MAX_ERROR) * weights).sum() / weights.sum().clamp_min(1.0)
 
 
-def _huber(relative: Tensor, large: float = LARGE_ERROR) -> Tensor:
-    """Absolute error, rounded below SMALL_ERROR and flat above `large`."""
-    size = relative.abs().clamp_max(large)
-    return torch.where(size < SMALL_ERROR, size**2 / (2 * SMALL_ERROR), size - SMALL_ERROR / 2)
+def huber(relative: Tensor, largest: float) -> Tensor:
+    """Absolute error, squared below SQUARED_ERROR and flat above `largest`."""
+    size = relative.abs().clamp_max(largest)
+    return torch.where(size < SQUARED_ERROR, size**2 / (2 * SQUARED_ERROR), size - SQUARED_ERROR / 2)
 
 
 def _padded(photos: DepthPhotos) -> tuple[Tensor, Tensor]:

@@ -1,8 +1,7 @@
-"""The pose network of the paper: relative pose from two photos, its loss, and its errors for the report.
+"""The paper's networks: depth and pose, trained together; and errors of the motions found, for the report."""
 
-It is trained beside the depth network, from detached depth, and nothing else uses what it finds (method N10).
-"""
-
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scenefuse.core.stage import quantity
+from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Array, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.networks import convolutions
+from scenefuse.nerf.prior.networks import DepthNetwork, convolutions
 
 
 class PoseNetwork(nn.Module):
@@ -54,14 +53,45 @@ def small_photos(photos: DepthPhotos) -> Tensor:
     return functional.avg_pool2d(photos.images, 2) if min(photos.images.shape[2:]) > 64 else photos.images
 
 
-def pose_error(found: Tensor, known: Tensor, unit: float) -> Tensor:
-    """How far (B, 4, 4) relative poses are from SfM's: a scalar.
+@dataclass(frozen=True)
+class Networks:
+    """The two networks that are trained together."""
 
-    Photometric error alone is flat between views as far apart as an orbit's photos, and teaches the network nothing.
+    depth: DepthNetwork
+    pose: PoseNetwork
+
+    def parts(self) -> dict[str, nn.Module]:
+        """Both by name."""
+        return {"depth": self.depth, "pose": self.pose}
+
+    def load(self, state: dict[str, Any]) -> None:
+        """Take the weights of `state`."""
+        for name, network in self.parts().items():
+            network.load_state_dict(state[name])
+
+
+def save_networks(path: Path, networks: Networks, settings: dict[str, Any]) -> None:
+    """What stage 3 continues from."""
+    weights = {name: network.state_dict() for name, network in networks.parts().items()}
+    torch.save(weights | {"settings": settings}, path)
+
+
+def load_networks(path: Path) -> dict[str, Any]:
+    """What `save_networks` wrote: `depth` and `pose` for `Networks.load`, and `settings`.
+
+    Raises:
+        StageError: the file is missing or holds something else.
     """
-    rotation = (found[:, :3, :3] - known[:, :3, :3]).abs().sum((1, 2))
-    translation = (found[:, :3, 3] - known[:, :3, 3]).abs().sum(1) / unit
-    return (rotation + translation).mean()
+    if not path.is_file():
+        raise StageError(f"{path} does not exist; run stage 1 first")
+    try:
+        state = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a truncated file raises any of half a dozen
+        why = " ".join(str(error).split())[:200]
+        raise StageError(f"{path} cannot be read ({why}); delete it and run stage 1 again") from None
+    if not {"depth", "pose", "settings"} <= set(state):
+        raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
+    return state
 
 
 @torch.no_grad()

@@ -1,0 +1,135 @@
+"""What the paper adds to a NeRF's training: the order of depths, and longer steps of the hash grid at edges."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from scenefuse.nerf.encoding import encode
+from scenefuse.nerf.field import Field
+from scenefuse.nerf.losses import SOLID
+from scenefuse.nerf.rays import PhotoTensors, dilate
+from scenefuse.nerf.training import Nerf, Rendered
+
+# The paper gives no weight of its loss of relative depth.
+RANK_WEIGHT = 0.02
+# Pixels of a pair lie apart by this share of the photo's width (method N3), and their depths by this, in nerf units.
+MIN_APART, RANK_MARGIN = 0.02, 0.02
+# Rows of the fine levels that show nothing but edges take steps 1 + this times as long (method N9).
+EDGE_RATE = 1.0
+# Steps between looks at which rows show edges.
+EDGES_EVERY = 4
+# Half-width of the zone around mask edges and depth jumps that counts as an edge.
+EDGE_PX = 3
+# A neighbour's depth that differs by more than this share is a jump, no slanted surface.
+DEPTH_JUMP = 0.03
+TINY = 1e-12
+
+
+class OrderAndEdges:
+    """The paper's relative depth and adaptive grid, for a training's `additions`.
+
+    The order that is learned is that of the prior's depths. Adam divides every row's gradient by its own usual size,
+    and with it any factor that a row's gradients share; a factor on Adam's steps stays.
+
+    Args:
+        nerf: that is trained.
+        photos: that it is trained on, with their prior.
+        images: photos of a batch.
+        rank_weight: weight of the order's loss.
+        edge_rate: see EDGE_RATE.
+    """
+
+    def __init__(
+        self,
+        nerf: Nerf,
+        photos: PhotoTensors,
+        images: int,
+        rank_weight: float = RANK_WEIGHT,
+        edge_rate: float = EDGE_RATE,
+    ) -> None:
+        device = nerf.field.table.device
+        self.weights: Mapping[str, float] = {"rank": rank_weight}
+        # (T, 2) opacity that each row of the table has shown at edges, and in all.
+        self.state = torch.zeros(len(nerf.field.table), 2, device=device)
+        self.images, self.apart_px, self.rate = images, MIN_APART * photos.images.shape[2], edge_rate
+        border = dilate(photos.masks, 1) & ~dilate(photos.masks, -1)
+        self.edges = dilate(border | depth_jumps(photos.depths), EDGE_PX).float().to(device)
+
+    def losses(self, rendered: Rendered, nerf: Nerf) -> dict[str, Tensor]:
+        """The loss of order; every few steps, edges are counted as well."""
+        rays, ray, seen = rendered.rays, rendered.drawn.ray, rendered.seen
+        if rendered.step % EDGES_EVERY == 0:
+            self._count(rendered, nerf.field)
+        nothing = torch.zeros_like(rays.length)
+        distance, opacity = (nothing.index_put((ray,), part) for part in (seen.distance, seen.opacity))
+        known, uv = rays.prior.distance, rendered.batch.uv
+        return {"rank": rank_loss(distance, opacity, known, rays.confidence, uv, self.images, self.apart_px)}
+
+    def descend(self, nerf: Nerf, optimizer: torch.optim.Optimizer) -> None:
+        """The optimiser's step, longer where edges are."""
+        table = nerf.field.table
+        before = table.detach().clone()
+        optimizer.step()
+        with torch.no_grad():
+            table.copy_(before + self.factor(nerf.field) * (table - before))
+
+    def factor(self, field: Field) -> Tensor:
+        """(T, 1) how much longer the step of each row is: 1 on the coarse half of the levels."""
+        factor = 1 + self.rate * self.state[:, :1] / self.state[:, 1:].clamp(min=TINY)
+        factor[: int(field.grid.offset[field.settings.levels // 2])] = 1.0
+        return factor
+
+    def _count(self, rendered: Rendered, field: Field) -> None:
+        """Count the samples of a step."""
+        rays, drawn, batch = rendered.rays, rendered.drawn, rendered.batch
+        x = rays.origin[drawn.ray, None] + drawn.t[..., None] * rays.direction[drawn.ray, None]
+        opacity = (1 - torch.exp(-rendered.sigma.detach() * drawn.delta)).view(-1)
+        across, down = batch.uv.long().unbind(1)
+        edge = self.edges[batch.view, down, across][drawn.ray]
+        self.see(field, x.view(-1, 3), opacity, edge.repeat_interleave(drawn.t.shape[1]))
+
+    def see(self, field: Field, x: Tensor, opacity: Tensor, edge: Tensor) -> None:
+        """Count N samples at positions (N, 3): their opacities (N,), and how much of an edge, 0..1, each is (N,)."""
+        table = torch.zeros_like(field.table, requires_grad=True)
+        features = encode(x.clamp(0.0, 1.0 - 1e-6), table, field.grid, torch.ones_like(field.level_weight))
+        seen = torch.stack([opacity * edge, opacity], dim=1).repeat(1, field.settings.levels)
+        self.state += torch.autograd.grad(features, table, seen)[0]
+
+
+def rank_loss(
+    distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor, uv: Tensor, images: int, apart_px: float
+) -> Tensor:
+    """The paper's relative depth: order of two pixels' depths as the prior has it (method N3).
+
+    The ranking hinge of SparseNeRF (Wang et al. 2023), in units of its margin.
+
+    Args:
+        distance: (R,) expected depth along the ray, `images` equal groups of rays one after the other.
+        opacity: (R,); both pixels of a pair have to be solid.
+        prior: (R,) prior depth along the ray.
+        weight: (R,) confidence of the prior, 0 where there is none (also outside the mask).
+        uv: (R, 2) pixels.
+        images: number of groups; pairs never cross them.
+        apart_px: least distance between two pixels of a pair.
+    """
+    groups = [a.view(images, -1) for a in (distance, opacity.detach(), prior, weight)]
+    half = groups[0].shape[1] // 2
+    (d, d2), (o, o2), (p, p2), (w, w2) = ((a[:, -2 * half : -half], a[:, -half:]) for a in groups)
+    grouped = uv.view(images, -1, 2)
+    apart = (grouped[:, -2 * half : -half] - grouped[:, -half:]).norm(dim=-1) >= apart_px
+    sign = torch.sign(p2 - p)
+    valid = apart & (w > 0) & (w2 > 0) & (o > SOLID) & (o2 > SOLID) & ((p2 - p).abs() > RANK_MARGIN)
+    hinge = torch.relu(RANK_MARGIN - sign * (d2 - d)) / RANK_MARGIN
+    return (hinge * torch.minimum(w, w2) * valid).sum() / valid.sum().clamp(min=1)
+
+
+def depth_jumps(depths: Tensor) -> Tensor:
+    """Pixels (V, H, W) where the depth jumps from one to the next; never those without depth."""
+    jump = torch.zeros_like(depths, dtype=torch.bool)
+    for axis in (1, 2):
+        a, b = depths.narrow(axis, 0, depths.shape[axis] - 1), depths.narrow(axis, 1, depths.shape[axis] - 1)
+        found = (a > 0) & (b > 0) & ((a - b).abs() > DEPTH_JUMP * torch.minimum(a, b))
+        jump.narrow(axis, 0, depths.shape[axis] - 1).logical_or_(found)
+        jump.narrow(axis, 1, depths.shape[axis] - 1).logical_or_(found)
+    return jump

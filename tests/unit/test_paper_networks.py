@@ -1,0 +1,81 @@
+"""The paper's pose network and its fusion of two sets of depth maps, by hand and on a planted plane."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from support.textured_plane import plane_views
+
+from scenefuse.core.stage import StageError, value
+from scenefuse.nerf.prior.inputs import depth_photos
+from scenefuse.paper.fused_depth import consistency_between_views, fuse_by_inverse_variance
+from scenefuse.paper.networks import PoseNetwork, load_networks, pose_quantities, rigid
+
+
+def test_rigid_turns_about_an_axis():
+    quarter = rigid(torch.tensor([[0.0, 0.0, math.pi / 2]]), torch.tensor([[1.0, 2.0, 3.0]]))[0]
+    assert torch.allclose(quarter @ torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([1.0, 3.0, 3.0, 1.0]), atol=1e-6)
+
+
+def test_one_motion_for_all_pairs_is_told_from_motions_that_were_found():
+    views = plane_views(6)[0]
+    photos = depth_photos(views, 3, torch.device("cpu"))
+    network = PoseNetwork(3.0)
+    with torch.no_grad():
+        network.last.weight.zero_()
+        network.last.bias.copy_(torch.tensor([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+    def measured(poses):
+        found = pose_quantities(network, photos, poses)
+        names = ("pose_network_rotation_error_deg", "rotation_error_of_one_motion_for_all_deg")
+        return value(found, "pose_network_rotation_varies_deg"), *(value(found, name) for name in names)
+
+    varies, error, best = measured(views.object_from_cam)
+    assert varies == pytest.approx(0, abs=1e-3) and 0 < best < error
+    straight = views.object_from_cam.copy()
+    straight[:, :3, :3] = np.eye(3)
+    assert measured(straight) == pytest.approx((0, np.degrees(0.3), 0), abs=1e-3)
+
+
+def test_inverse_variance_by_hand():
+    def pixels(*values: float) -> torch.Tensor:
+        return torch.tensor(values).view(1, 1, 1, -1)
+
+    inf = math.inf
+    depth, variance, blended = fuse_by_inverse_variance(
+        pixels(10.0, 10.0, 10.0, 10.0, 0.0),
+        pixels(11.0, 20.0, 20.0, 20.0, 5.0),
+        pixels(1.0, 0.01, inf, 1.0, inf),
+        pixels(3.0, 1.0, 1.0, 1.0, 0.5),
+        0.0,
+    )
+    # (10 / 1 + 11 / 3) / (1 + 1 / 3) = 10.25; far apart: the four times better one; alone; far apart and equal: none
+    assert depth.flatten().tolist() == pytest.approx([10.25, 10.0, 20.0, 0.0, 5.0])
+    assert variance.flatten()[:3].tolist() == pytest.approx([0.75, 0.01, 1.0])
+    assert blended.flatten().tolist() == [True, False, False, False, False]
+
+
+def test_true_depth_agrees_between_views_and_wrong_depth_does_not():
+    views, truth = plane_views(held_out=0)
+    photos = depth_photos(views, 4, torch.device("cpu"))
+    depth = torch.tensor(truth, dtype=torch.float32)[:, None]
+    right = consistency_between_views(depth, photos)
+    inner = torch.nn.functional.max_pool2d(1 - photos.masks, 5, 1, 2) == 0
+    assert right.confidence[inner].mean() > 0.9
+    wrong = depth.clone()
+    wrong[2] *= 1.15
+    assert consistency_between_views(wrong, photos).confidence[2][inner[2]].mean() < 0.1
+    assert (right.confidence[photos.masks == 0] == 0).all()
+
+
+def test_missing_networks_are_one_sentence(tmp_path):
+    networks = tmp_path / "networks.pt"
+    with pytest.raises(StageError, match="run stage 1 first"):
+        load_networks(networks)
+    torch.save({"weights": torch.zeros(1)}, networks)
+    with pytest.raises(StageError, match="holds no networks of stage 1"):
+        load_networks(networks)
+    networks.write_bytes(networks.read_bytes()[:200])
+    with pytest.raises(StageError, match="networks.pt cannot be read .* run stage 1 again"):
+        load_networks(networks)
