@@ -13,7 +13,8 @@ def snakemake():
     def call(
         directory: Path, *words: str, config: Path = ROOT / "tests/data/tiny.yaml"
     ) -> subprocess.CompletedProcess[str]:
-        where = ["--snakefile", ROOT / "Snakefile", "--directory", directory, "--configfile", config]
+        # One core: tests run beside each other.
+        where = ["--snakefile", ROOT / "Snakefile", "--directory", directory, "--configfile", config, "--cores", "1"]
         return run_snakemake(ROOT, *where, *words)
 
     return call

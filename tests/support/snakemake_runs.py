@@ -14,10 +14,8 @@ PLANS = {"-n", "--dry-run", "--summary", "--touch", "--unlock", "--cleanup-metad
 
 
 def run_snakemake(cwd: Path, *words: object) -> subprocess.CompletedProcess[str]:
-    """The finished process, with all its output in `stdout`; one core, as tests run beside each other."""
+    """The finished process, with all its output in `stdout`."""
     arguments = [str(word) for word in words]
-    if not {"--cores", *PLANS} & set(arguments):
-        arguments += ["--cores", "1"]
     if PLANS & set(arguments):
         return _forked(cwd, arguments)
     env = os.environ | {"COLUMNS": "200", "PYTHONPATH": str(ROOT)}
