@@ -16,7 +16,8 @@ from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
 from scenefuse.crop.one_photo import MOST_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.geometry.components import MIN_PART, parts
-from scenefuse.marks.fiducials import Labels, ScenePoints, locate, read_points
+from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
+from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -165,7 +166,7 @@ def _located(
     if inputs.sparse is None:
         return *points_in(inputs.fiducials, inputs.georeference_json), None
     marked = read_points(inputs.fiducials)
-    if isinstance(marked, Labels):
+    if isinstance(marked, Clicks) and marked.kind == "labels":
         found = locate_clicks(marked, inputs.sparse, scene)
         return found.names, found.inside, found
     frame = _frame_of_cloud(inputs.georeference_json)

@@ -12,8 +12,8 @@ from scenefuse.cloud.tiles.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud
-from scenefuse.marks.fiducials import Labels
-from scenefuse.marks.labels import PhotoClicks, clicks_per_photo
+from scenefuse.marks.clicks import Clicks
+from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
 
 # A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
@@ -80,7 +80,7 @@ class SceneClicks:
         return found
 
 
-def locate_clicks(labels: Labels, sparse: Path, scene: TiledCloud) -> SceneClicks:
+def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClicks:
     """Where labelled pixels of scene photos are in the scene: on the nearest points of the dense cloud there (C5).
 
     Args:

@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.transforms import Array
+from scenefuse.marks.clicks import Click
 from scenefuse.sfm.adjustment import Freedom, adjustment_options
 
 # In its standard deviations: error of a photo's position at which it loses half its weight (Cauchy).
@@ -49,13 +50,13 @@ class SurveyedPoints:
         x_in_local: (P, 3) metres; NaN where a height is unknown.
         sd_m: (P, 2) standard deviations, horizontal (of each axis) and vertical.
         start: (P, 3) where the model's photos see them.
-        clicks: P lists of photo and (2,) pixel.
+        clicks: P lists of clicks, in pixels of the model's photos.
     """
 
     x_in_local: Array
     sd_m: Array
     start: Array
-    clicks: list[list[tuple[str, Array]]]
+    clicks: list[list[Click]]
 
 
 def adjust_to_survey(
@@ -116,10 +117,10 @@ def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int)
     place, (horizontal, vertical) = points.x_in_local[row], FAR_M / points.sd_m[row]
     track = pycolmap.Track()
     by_name = {model.images[i].name: i for i in model.reg_image_ids()}
-    for photo, pixel in points.clicks[row]:
-        observed = model.images[by_name[photo]].points2D
-        observed.append(pycolmap.Point2D(pixel))
-        track.add_element(by_name[photo], len(observed) - 1)
+    for click in points.clicks[row]:
+        observed = model.images[by_name[click.photo]].points2D
+        observed.append(pycolmap.Point2D(click.pixel))
+        track.add_element(by_name[click.photo], len(observed) - 1)
     known = np.where(np.isfinite(place), place, points.start[row])
     still = [_add_camera(model, DOWN, known, (horizontal, horizontal))]
     if np.isfinite(place[2]):

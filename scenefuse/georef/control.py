@@ -13,8 +13,9 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.georef.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
-from scenefuse.marks.fiducials import intersect, model_pixel
-from scenefuse.marks.lengths import CLICK_LIMIT
+from scenefuse.marks.clicks import Click
+from scenefuse.marks.lengths import MAX_CLICK_MISS
+from scenefuse.marks.triangulation import intersect, model_pixel
 from scenefuse.photos.photos import Photo
 
 # Fewest control points that fix a model.
@@ -96,12 +97,13 @@ def sight(
     sightings, notes = [], []
     for point in control.points:
         seen, lost = [], []
-        for photo, pixel in ((composed(name), pixel) for name, pixel in point.clicks):
+        for click in point.clicks:
+            photo = composed(click.photo)
             if photo not in sizes:
                 raise unknown_photo(control.path, point.name, photo, sizes)
             if photo in images:
-                own = images[photo]
-                seen.append((own.name, model_pixel(control.path, point.name, photo, pixel, own, sizes)))
+                x_px, y_px = model_pixel(control.path, click, images[photo], sizes).tolist()
+                seen.append(Click(point.name, images[photo].name, x_px, y_px))
             else:
                 lost.append(photo)
         notes += [f"{point.name}: {photo} could not be registered, its click is left out" for photo in lost]
@@ -115,10 +117,10 @@ def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple
     """A point by the largest set of its clicks that agree, and a line for every other click."""
     nowhere = Sighting(point, np.full(3, np.nan), np.zeros(0))
     if len(point.clicks) < 2:
-        where = f"in {point.clicks[0][0]} only" if point.clicks else "in no registered photo"
+        where = f"in {point.clicks[0].photo} only" if point.clicks else "in no registered photo"
         return replace(nowhere, problem=f"it is clicked {where}; click it in two or more"), []
-    seen, pixels = [images[photo] for photo, _ in point.clicks], np.array([pixel for _, pixel in point.clicks])
-    limit = np.array([CLICK_LIMIT * max(i.camera.width, i.camera.height) for i in seen if i.camera is not None])
+    seen, pixels = [images[click.photo] for click in point.clicks], np.array([click.pixel for click in point.clicks])
+    limit = np.array([MAX_CLICK_MISS * max(i.camera.width, i.camera.height) for i in seen if i.camera is not None])
     everyone = tuple(range(len(seen)))
     found: dict[tuple[int, ...], Array] = {}
     for chosen in [everyone, *combinations(everyone, 2)]:
@@ -134,15 +136,16 @@ def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple
     if len(best) != 1:
         position, _ = intersect(seen, pixels)
         off = [np.inf] * len(seen) if position is None else off_px(position, seen, pixels)
-        miss = ", ".join(f"{photo} {px:.0f} px" for (photo, _), px in zip(point.clicks, off))
+        miss = ", ".join(f"{click.photo} {px:.0f} px" for click, px in zip(point.clicks, off))
         return replace(nowhere, problem=f"its clicks contradict each other ({miss}); correct them"), []
     agree = best[0]
     position, _ = intersect([seen[k] for k in agree], pixels[list(agree)])
     assert position is not None
     off = off_px(position, seen, pixels)
     dropped = [
-        f"{point.name}: the click in {photo} is {off[k]:.0f} px off where {most} others show the point, and is left out"
-        for k, (photo, _) in enumerate(point.clicks)
+        f"{point.name}: the click in {click.photo} is {off[k]:.0f} px off where {most} others show the point, and is"
+        " left out"
+        for k, click in enumerate(point.clicks)
         if k not in agree
     ]
     return Sighting(replace(point, clicks=[point.clicks[k] for k in agree]), position, off[list(agree)]), dropped
@@ -174,8 +177,8 @@ def seen_at(sightings: list[Sighting], model: pycolmap.Reconstruction) -> tuple[
     places, rms_px = np.full((len(sightings), 3), np.nan), np.full(len(sightings), np.nan)
     for row, sighting in enumerate(sightings):
         if not sighting.problem:
-            seen = [images[photo] for photo, _ in sighting.point.clicks]
-            position, residual = intersect(seen, np.array([pixel for _, pixel in sighting.point.clicks]))
+            seen = [images[click.photo] for click in sighting.point.clicks]
+            position, residual = intersect(seen, np.array([click.pixel for click in sighting.point.clicks]))
             if position is not None:
                 places[row], rms_px[row] = position, residual
     return places, rms_px
@@ -184,5 +187,5 @@ def seen_at(sightings: list[Sighting], model: pycolmap.Reconstruction) -> tuple[
 def describe_misses(sighting: Sighting, local_from_model: Sim3, target: Array) -> str:
     """How far a point (3,) is from its coordinates, and where it was clicked."""
     miss = float(np.sqrt(np.nansum((local_from_model.apply(sighting.x_in_model) - target) ** 2)))
-    photos = ", ".join(photo for photo, _ in sighting.point.clicks)
+    photos = ", ".join(click.photo for click in sighting.point.clicks)
     return f"by its clicks in {photos} it lies {miss:.2f} m from its coordinates; correct these or the clicks"

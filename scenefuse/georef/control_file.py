@@ -11,6 +11,7 @@ from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import comma_advice, composed, read_lines
 from scenefuse.core.transforms import Array
+from scenefuse.marks.clicks import Click
 from scenefuse.marks.lengths import read_ends
 from scenefuse.photos.photo_files import SUFFIXES
 
@@ -34,14 +35,14 @@ class SurveyedPoint:
         position: (3,) WGS84 latitude (deg), longitude (deg), height (m; NaN where unknown).
         sd_m: standard deviations of the coordinates, horizontal (of each axis) and vertical.
         check: whether it is only measured, never used.
-        clicks: photo and (2,) pixel of each click, in pixels of the photo as people see it.
+        clicks: on it, one in each photo.
     """
 
     name: str
     position: Array
     sd_m: tuple[float, float]
     check: bool
-    clicks: list[tuple[str, Array]]
+    clicks: list[Click]
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,7 @@ def _point(name: str, rows: list[Row], position: Array, path: Path) -> SurveyedP
     twice = next((photo for photo in photos if photos.count(photo) > 1), None)
     if twice is not None:
         raise StageError(f"{path}: point {name} is clicked more than once in {twice}; keep one line of it")
-    clicks = [(photo, pixel) for _, _, photo, pixel in rows]
+    clicks = [Click(name, photo, *pixel.tolist()) for _, _, photo, pixel in rows]
     return SurveyedPoint(name, position, rows[0][1], name.upper().startswith(CHECK), clicks)
 
 
@@ -147,13 +148,12 @@ def check_survey_files(names: list[str], control: Path | None = None, lengths: P
     Raises:
         StageError: what `read_control` and `read_ends` say; a click in a photo that does not exist.
     """
-    clicked: list[tuple[Path, str, str]] = []
+    clicked: list[tuple[Path, Click]] = []
     if control is not None:
-        clicked += [(control, point.name, photo) for point in read_control(control).points for photo, _ in point.clicks]
+        clicked += [(control, click) for point in read_control(control).points for click in point.clicks]
     if lengths is not None:
-        ends = read_ends(lengths)[2]
-        clicked += [(lengths, point, photo) for point, photo in zip(ends.points, ends.photos)]
+        clicked += [(lengths, click) for click in read_ends(lengths).rows]
     known = set(map(composed, names))
-    for path, point, photo in clicked:
-        if composed(photo) not in known:
-            raise unknown_photo(path, point, photo, names)
+    for path, click in clicked:
+        if composed(click.photo) not in known:
+            raise unknown_photo(path, click.name, click.photo, names)

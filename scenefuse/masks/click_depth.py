@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.pixels import held
 from scenefuse.photos.workspace import View, Workspace
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Hull, Mask, silhouette
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.grabcut import (
     Trimap,
     cleaned,

@@ -21,7 +21,7 @@ from scenefuse.core.stage import (
     write_json,
 )
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.marks.fiducials import read_points
+from scenefuse.marks.clicks import read_points
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.contact_sheet import draw_contact_sheet
 from scenefuse.masks.prompted import Prompted, masks_from_prompts

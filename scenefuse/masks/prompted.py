@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.marks.fiducials import Clicks, Labels, ScenePoints, marked_size, triangulate_consistent
-from scenefuse.marks.labels import PhotoClicks, clicks_per_photo
+from scenefuse.marks.clicks import Clicks, ScenePoints
+from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
+from scenefuse.marks.triangulation import marked_size, triangulate_consistent
 from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.grabcut_passes import ask_grabcut
 from scenefuse.masks.parts import Ask, prompted_parts
@@ -56,7 +57,7 @@ class Prompted:
 
 
 def masks_from_prompts(
-    marked: Clicks | ScenePoints | Labels,
+    marked: Clicks | ScenePoints,
     sparse: Path,
     sizes: Mapping[str, tuple[int, int]],
     photos: Workspace,
@@ -80,7 +81,7 @@ def masks_from_prompts(
     Raises:
         StageError: the prompts are wrong or too few, or lead to no mask.
     """
-    if isinstance(marked, Labels):
+    if isinstance(marked, Clicks) and marked.kind == "labels":
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
         ask: Ask = (
             partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)

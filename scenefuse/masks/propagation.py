@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
-from scenefuse.marks.labels import ENOUGH, PhotoClicks
+from scenefuse.marks.photo_clicks import SUFFICIENT_CLICKS, PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.parts import LEAST_KNOWN, Ask, agrees, own_colors, prompted_parts, with_parts
 from scenefuse.masks.pixels import distance_to, held, pixel_of
@@ -219,7 +219,7 @@ def best_mask(
     inside, outside = (clicks.on, known.inside), (clicks.off, known.outside)
     found = _candidates(ask(view, inside, outside, box, None), view.pixels, inside, outside, tolerance_px)
     best = max(found, key=lambda one: one.score)
-    if not len(known.inside) and len(clicks.on) >= ENOUGH and best.quality < CERTAIN:
+    if not len(known.inside) and len(clicks.on) >= SUFFICIENT_CLICKS and best.quality < CERTAIN:
         best = max((one for one in found if one.score > best.score - AS_GOOD), key=lambda one: one.mask.sum())
     if space is not None and box is None:
         more = ask(view, inside, outside, None, space.box)

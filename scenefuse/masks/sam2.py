@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError, sha256
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
 from scenefuse.masks.target import Target, far_apart

@@ -10,7 +10,7 @@ from scipy.spatial import QhullError, cKDTree
 
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.box import in_hull
 from scenefuse.masks.pixels import distance_to, pixel_of, share_in
 from scenefuse.photos.workspace import Workspace

@@ -2,13 +2,11 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
 from scenefuse.core.stage import StageError
+from scenefuse.marks.clicks import Click, Kind, length_label
 
-Kind = Literal["labels", "points", "lengths"]
-"""Labels say inside, outside or box; points have names and are clicked in several photos, so are ends of lengths."""
 ENDS = ("a", "b")
 """Of a length that is new."""
 Sizes = Mapping[str, tuple[int, int]]
@@ -17,22 +15,6 @@ Sizes = Mapping[str, tuple[int, int]]
 SMALLEST_BOX_PX = 4
 LEAST_POINTS = 4
 """Points that bound an object in the scene."""
-
-
-@dataclass(frozen=True)
-class Click:
-    """One row of a table.
-
-    Attributes:
-        label: inside, outside or box; or the name of a point; or name, metres and end of a length, tabs between them.
-        photo: name of the photo.
-        x, y: pixels of the original photo, as people see it.
-    """
-
-    label: str
-    photo: str
-    x: float
-    y: float
 
 
 Rows = tuple[Click, ...]
@@ -77,8 +59,8 @@ def with_label(rows: Rows, label: str, photo: str, x: float, y: float, sizes: Si
     """
     click = _checked(label, photo, x, y, sizes)
     for other in rows:
-        if other.label != "box" and (other.photo, other.x, other.y) == (photo, click.x, click.y):
-            raise StageError(f"({click.x:g}, {click.y:g}) in {photo} is already marked {other.label}")
+        if other.label != "box" and (other.photo, other.x_px, other.y_px) == (photo, click.x_px, click.y_px):
+            raise StageError(f"({click.x_px:g}, {click.y_px:g}) in {photo} is already marked {other.label}")
     return (*rows, click)
 
 
@@ -143,20 +125,9 @@ def with_length(rows: Rows, text: str) -> tuple[Rows, tuple[str, str]]:
     return tuple(changed), (length_label(name, metres, ends[0]), length_label(name, metres, ends[1]))
 
 
-def length_label(name: str, metres: float, end: str) -> str:
-    """The label of an end: the first cells of its line in the table."""
-    return f"{name}\t{metres:.10g}\t{end}"
-
-
-def spoken(label: str) -> str:
-    """A label for a person: the end of a length as `bar, 1.5 m: a`."""
-    name, *length = label.split("\t")
-    return f"{name}, {length[0]} m: {length[1]}" if length else name
-
-
 def without_nearest(rows: Rows, photo: str, x: float, y: float, within_px: float) -> Rows:
     """The rows without the click of a photo that is nearest to a pixel; with a corner goes its whole box."""
-    near = [(abs(r.x - x) ** 2 + abs(r.y - y) ** 2, k) for k, r in enumerate(rows) if r.photo == photo]
+    near = [((r.x_px - x) ** 2 + (r.y_px - y) ** 2, k) for k, r in enumerate(rows) if r.photo == photo]
     if not near or min(near)[0] > within_px**2:
         return rows
     gone = rows[min(near)[1]]
@@ -200,15 +171,15 @@ def problems(rows: Rows, kind: Kind, sizes: Sizes, least_inside: int = 1) -> lis
             " Its clicks do not count."
         )
     for row in rows:
-        width, height = sizes.get(row.photo, (row.x, row.y))
-        if not (0 <= row.x <= width and 0 <= row.y <= height):
-            found.append(f"{row.label} at ({row.x:g}, {row.y:g}) lies outside {row.photo}: remove it.")
+        width, height = sizes.get(row.photo, (row.x_px, row.y_px))
+        if not (0 <= row.x_px <= width and 0 <= row.y_px <= height):
+            found.append(f"{row.name} at ({row.x_px:g}, {row.y_px:g}) lies outside {row.photo}: remove it.")
     if kind == "labels":
         return found + _label_problems(rows, least_inside)
     found += [
-        f"{spoken(label)} is marked in one photo: click it in another one, too."
-        for label, count in Counter(row.label for row in rows).items()
-        if count < 2
+        f"{row.name} is marked in one photo: click it in another one, too."
+        for row in rows
+        if sum(other.label == row.label for other in rows) < 2
     ]
     return found + (_point_problems(rows) if kind == "points" else _length_problems(rows))
 

@@ -13,12 +13,8 @@ from pathlib import Path
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import composed, read_cells, read_text
-from scenefuse.marks.fiducials import CLICK_COLUMNS, LABEL_COLUMNS, Clicks, Labels, read_points
-from scenefuse.marks.lengths import COLUMNS, read_end_clicks
-from scenefuse.pick.clicks import Click, History, Kind, Rows, difference, length_label, merged
-
-HEADERS: dict[Kind, list[str]] = {"labels": LABEL_COLUMNS, "points": CLICK_COLUMNS, "lengths": COLUMNS}
-
+from scenefuse.marks.clicks import HEADERS, Click, Kind, ScenePoints, read_length_clicks, read_points
+from scenefuse.pick.clicks import History, Rows, difference, merged
 
 _BASE = "# unsaved clicks, laid over the file of SHA-256 "
 
@@ -244,20 +240,15 @@ def _read(path: Path, kind: Kind) -> tuple[Kind, Rows]:
         NotClicked: points by their coordinates.
         StageError: it cannot be read.
     """
-    if kind == "lengths":
-        clicks = read_end_clicks(path)
-        return kind, tuple(Click(length_label(c.length, c.metres, c.end), c.photo, c.x_px, c.y_px) for c in clicks)
-    marked = read_points(path)
-    if not isinstance(marked, Labels | Clicks):
+    marked = read_length_clicks(path) if kind == "lengths" else read_points(path)
+    if isinstance(marked, ScenePoints):
         raise NotClicked(f"{path} holds points by their coordinates, which are not clicked; edit it as text")
-    names = marked.labels if isinstance(marked, Labels) else marked.points
-    rows = tuple(Click(n, p, *xy) for n, p, xy in zip(names, marked.photos, marked.pixels.tolist()))
-    return "labels" if isinstance(marked, Labels) else "points", rows
+    return marked.kind, marked.rows
 
 
 def _line(click: Click) -> str:
     line = io.StringIO()
-    cells = [*click.label.split("\t"), click.photo, f"{click.x:.10g}", f"{click.y:.10g}"]
+    cells = [*click.label.split("\t"), click.photo, f"{click.x_px:.10g}", f"{click.y_px:.10g}"]
     csv.writer(line, delimiter="\t", lineterminator="").writerow(cells)
     return line.getvalue()
 

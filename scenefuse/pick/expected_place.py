@@ -8,9 +8,10 @@ import numpy as np
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.marks.fiducials import Clicks, triangulate_consistent
+from scenefuse.marks.clicks import Click, Clicks
+from scenefuse.marks.triangulation import triangulate_consistent
 from scenefuse.photos.workspace import posed_images, ray_through, read_model
-from scenefuse.pick.clicks import Click, Sizes
+from scenefuse.pick.clicks import Sizes
 
 DEPTHS = 200
 """Samples of a ray, from near to far."""
@@ -70,18 +71,17 @@ class Cameras:
         for click in known:
             at = self._projected(position, click.photo)
             if at is not None:
-                found[click.photo] = float(np.hypot(*(at - [click.x, click.y])))
+                found[click.photo] = float(np.hypot(*(at - click.pixel)))
         return found
 
     def _position(self, clicks: list[Click]) -> Array | None:
         """(3,) of a point in the model's frame, from two or more photos."""
         if len(clicks) < 2:
             return None
-        marked = Clicks(
-            Path(), ["point"] * len(clicks), [c.photo for c in clicks], np.array([[c.x, c.y] for c in clicks])
-        )
         try:
-            _, found, _, _ = triangulate_consistent(marked, self._model, np.inf, self._sizes)
+            _, found, _, _ = triangulate_consistent(
+                Clicks(Path(), "points", tuple(clicks)), self._model, np.inf, self._sizes
+            )
         except StageError:
             return None
         return found[0] if len(found) else None
@@ -90,7 +90,7 @@ class Cameras:
         """(N, 2) pixels of a photo on the ray through a click in another one (Hartley and Zisserman, 9.1)."""
         image = self._images[click.photo]
         camera = self._model.cameras[image.camera_id]
-        pixel = np.array([click.x, click.y]) * [camera.width, camera.height] / np.array(self._sizes[click.photo])
+        pixel = click.pixel * [camera.width, camera.height] / np.array(self._sizes[click.photo])
         ray = np.array([*ray_through(camera, pixel), 1.0])
         if not np.isfinite(ray).all():
             return np.zeros((0, 2))

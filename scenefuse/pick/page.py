@@ -8,7 +8,8 @@ from typing import Any
 from nicegui import ui
 
 from scenefuse.core.stage import StageError
-from scenefuse.pick.clicks import Kind, Rows, with_box, with_end, with_label, with_length, with_point, without_nearest
+from scenefuse.marks.clicks import Kind
+from scenefuse.pick.clicks import Rows, with_box, with_end, with_label, with_length, with_point, without_nearest
 from scenefuse.pick.document import Document, FileChanged
 from scenefuse.pick.overlays import CARRIED, CLICKED, overlay
 from scenefuse.pick.photo_map import PhotoMap

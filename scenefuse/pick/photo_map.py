@@ -10,7 +10,7 @@ from nicegui import ui
 from nicegui.elements.leaflet.leaflet_layer import Layer
 
 from scenefuse.core.transforms import Array
-from scenefuse.pick.clicks import Click, spoken
+from scenefuse.marks.clicks import Click
 from scenefuse.pick.photo_tiles import Picture
 
 MAGNIFIED = 4
@@ -151,12 +151,12 @@ class PhotoMap:
             else:
                 self._dot(click, COLOURS[click.label], "")
         if len(corners) == 2:
-            ends = [self._place(c.x, c.y) for c in corners]
+            ends = [self._place(c.x_px, c.y_px) for c in corners]
             self._add("rectangle", [ends, {"color": COLOURS["box"], "weight": 2, "fill": False, "interactive": False}])
 
     def draw_point(self, click: Click, active: bool) -> None:
         """Draw a named point."""
-        self._dot(click, ACTIVE if active else POINT, spoken(click.label))
+        self._dot(click, ACTIVE if active else POINT, click.name)
 
     def draw_expected(self, pixels: Array, name: str) -> None:
         """Draw where a point is to be expected: a cross-hair for one pixel, a line for more."""
@@ -174,7 +174,7 @@ class PhotoMap:
 
     def _dot(self, click: Click, colour: str, text: str) -> None:
         options = {"radius": 6, "color": "#ffffff", "weight": 2, "fillColor": colour, "fillOpacity": 1}
-        self._add("circleMarker", [self._place(click.x, click.y), options | {"interactive": False}])
+        self._add("circleMarker", [self._place(click.x_px, click.y_px), options | {"interactive": False}])
         if text:
             layer = self._over[-1]
             layer.run_method(

@@ -16,7 +16,7 @@ from scenefuse.pick.clicks import Rows
 from scenefuse.pick.photo_tiles import Picture, at_most, read_upright
 
 if TYPE_CHECKING:
-    from scenefuse.marks.labels import PhotoClicks
+    from scenefuse.marks.photo_clicks import PhotoClicks
 
 Mask = NDArray[np.bool_]
 KEPT = 24
@@ -200,13 +200,13 @@ class Segmenter:
 
 def _clicks_of(picture: Picture, rows: Rows, width: int, height: int) -> "PhotoClicks":
     """The clicks of one photo, in pixels of a copy of it of another size."""
-    from scenefuse.marks.labels import PhotoClicks
+    from scenefuse.marks.photo_clicks import PhotoClicks
 
     own = [row for row in rows if row.photo == picture.name]
     scale, edge = np.array([width / picture.width, height / picture.height]), np.array([width, height]) - 1e-3
     points = [row for row in own if row.label != "box"]
     at, box = (
-        np.clip(np.array([(row.x, row.y) for row in part]).reshape(-1, 2) * scale, 0, edge)
+        np.clip(np.array([(row.x_px, row.y_px) for row in part]).reshape(-1, 2) * scale, 0, edge)
         for part in (points, [row for row in own if row.label == "box"])
     )
     inside = np.array([row.label == "inside" for row in points], dtype=bool)

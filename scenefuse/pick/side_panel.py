@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING
 
 from nicegui import ui
 
-from scenefuse.pick.clicks import problems, spoken
+from scenefuse.marks.clicks import label_name
+from scenefuse.pick.clicks import problems
 from scenefuse.pick.next_run import as_text, command, planned_rules
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ class SidePanel:
             plural = "photo" if len(rows) == 1 else "photos"
             look = "unelevated color=amber-6 text-color=black" if name == self._page.point else "flat color=grey-9"
             button = ui.button(
-                f"{spoken(name)} · {len(rows)} {plural}{worst}", on_click=lambda name=name: self._page.take_point(name)
+                f"{label_name(name)} · {len(rows)} {plural}{worst}",
+                on_click=lambda name=name: self._page.take_point(name),
             )
             button.props(f"dense {look} align=left padding='1px 8px'").classes("w-full")
             if name == self._page.point:

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scenefuse.core.stage import StageError, read_json
+from scenefuse.marks.clicks import Kind
 from scenefuse.marks.project import Project
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies
-from scenefuse.pick.clicks import Kind, Sizes
+from scenefuse.pick.clicks import Sizes
 from scenefuse.pick.photo_tiles import Picture
 
 OF_OBJECT: dict[Kind, str] = {

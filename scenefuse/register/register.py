@@ -16,7 +16,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import MIN_POINTS, around_marks, crop_marked
 from scenefuse.geometry.icp import ScaleRange
-from scenefuse.marks.fiducials import ScenePoints, read_points
+from scenefuse.marks.clicks import ScenePoints, read_points
 from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg

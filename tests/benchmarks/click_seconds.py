@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from scenefuse.core.stage import run
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import one_photo
 from scenefuse.masks.sam2 import Sam2Onnx, ask_sam2
 from scenefuse.masks.segmentation import MaskSettings

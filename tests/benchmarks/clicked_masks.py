@@ -19,7 +19,7 @@ from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.core.transforms import Array
 from scenefuse.demo.prompts import PromptSettings, clicks_on, random_misses
 from scenefuse.geometry.visual_hull import Mask, mask_iou
-from scenefuse.marks.fiducials import Labels
+from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.masks import prompted
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
@@ -162,7 +162,7 @@ def _trial(
     if middle is not None:
         miss = random_misses(1, how.least_miss_px, how.most_miss_px, rng)[0]
         pixels[how.inside - 1] = np.clip(middle + miss, 1.0, np.array(true.shape[::-1]) - 1.0)
-    marked = Labels(Path(name), labels, [name] * len(pixels), pixels)
+    marked = Clicks(Path(name), "labels", tuple(Click(label, name, *pixel) for label, pixel in zip(labels, pixels)))
     row: dict[str, Any] = {"photo": name, "trial": trial}
     try:
         found = prompted.masks_from_prompts(

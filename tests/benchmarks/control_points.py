@@ -33,6 +33,7 @@ from scenefuse.georef.control_file import ControlFile, SurveyedPoint
 from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
+from scenefuse.marks.clicks import Click
 from scenefuse.metrics.evaluate_scene import within
 from scenefuse.metrics.truth import HIDDEN, cast_together, read_mesh, sample_surface
 from scenefuse.photos.geodesy import LocalFrame
@@ -186,9 +187,10 @@ def _clicked(
     error = np.zeros(3) if check else rng.normal(0, [SURVEY_NOISE_M[0], *SURVEY_NOISE_M])
     photos = rng.choice(np.flatnonzero(seen), CLICKS, replace=False)
     noise_px = 0.0 if check else CLICK_NOISE_PX
-    clicks = [(cameras.names[k], pixels[k] + rng.normal(0, noise_px, 2)) for k in sorted(photos)]
+    name = f"{'CHK-' if check else ''}{number}"
+    clicks = [Click(name, cameras.names[k], *(pixels[k] + rng.normal(0, noise_px, 2))) for k in sorted(photos)]
     position = origin.inverse((x_in_truth + error)[None])[0]
-    return SurveyedPoint(f"{'CHK-' if check else ''}{number}", position, SURVEY_NOISE_M, check, clicks)
+    return SurveyedPoint(name, position, SURVEY_NOISE_M, check, clicks)
 
 
 def _with_positions(

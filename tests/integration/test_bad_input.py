@@ -124,7 +124,8 @@ def test_known_lengths_in_unknown_photos_of_an_object_stop_before_anything_runs(
     (project.path / "bar.tsv").write_text("\n".join(["length\tmetres\tend\tphoto\tx_px\ty_px", *rows]) + "\n")
     output = refused("-n", "results/objects/shed/sparse.json")
     assert (
-        "object 'shed': bar.tsv: point bar a is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)" in output
+        "object 'shed': bar.tsv: point bar, 1.5 m: a is clicked in 7.jpg, which is none of the 3 photos (0.jpg, ...)"
+        in output
     )
 
 

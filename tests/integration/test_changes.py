@@ -6,7 +6,7 @@ import shutil
 import pytest
 from support.user_project import CLICKS, Project, planned
 
-from scenefuse.pick.clicks import Click
+from scenefuse.marks.clicks import Click
 from scenefuse.pick.document import Document
 
 CROP, MASKS = "results/objects/shed/registration/full/crop.json", "results/objects/shed/masks.json"

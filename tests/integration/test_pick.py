@@ -212,7 +212,7 @@ def test_named_points_are_marked_in_the_scene_s_photos(page, yard):
     page.until_text("chimney · 2 photos")
     page.path = yard.path / "clicks.tsv"
     marked = page.save()
-    assert marked.points == ["chimney"] * 2 and len(set(marked.photos)) == 2
+    assert marked.labels == ["chimney"] * 2 and len(set(marked.photos)) == 2
     assert np.abs(marked.pixels - (30, 20)).max() < 0.5
 
 
@@ -311,8 +311,8 @@ def test_a_known_length_is_clicked_in_two_photos_end_after_end(page, yard):
     page.until_text("results/scenes/yard/residuals.tsv")
     page.key("s")
     page.until_text("rows saved in")
-    metres, ends, clicks = read_ends(yard.path / "yard_lengths.tsv")
-    assert metres == {"bar": 1.5} and ends == {"bar": ["a", "b"]}
+    clicks = read_ends(yard.path / "yard_lengths.tsv")
+    assert clicks.labels == ["bar\t1.5\ta", "bar\t1.5\tb"] * 2
     assert np.abs(clicks.pixels - [(20, 20), (40, 20)] * 2).max() < 0.5 and len(set(clicks.photos)) == 2
 
 

@@ -40,5 +40,5 @@ def test_planning_imports_nothing_heavy(tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, env=env)
     assert done.returncode == 0, done.stdout[-3000:]
     imported = set(re.findall(r"^import time: .*\| +(\S+)$", done.stderr, re.MULTILINE))
-    assert "scenefuse.marks.fiducials" in imported
+    assert "scenefuse.marks.clicks" in imported
     assert imported & {"torch", "open3d", "pycolmap", "pyproj", "cv2", "numba", "scipy"} == set()

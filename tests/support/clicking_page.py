@@ -8,7 +8,7 @@ import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from scenefuse.marks.fiducials import read_points
+from scenefuse.marks.clicks import read_points
 from scenefuse.pick.photo_tiles import Picture
 
 ROOT = Path(__file__).resolve().parents[2]

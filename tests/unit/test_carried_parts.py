@@ -8,7 +8,7 @@ import pytest
 from support.photographed_plane import BLANK, photographs
 
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.marks.labels import PhotoClicks
+from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.parts import with_parts
 from scenefuse.masks.propagation import best_mask, carry
 from scenefuse.masks.space import Left

@@ -12,8 +12,9 @@ from support.photographed_plane import photographs
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
-from scenefuse.marks.fiducials import Labels, locate, read_points
-from scenefuse.marks.labels import PhotoClicks, clicks_per_photo
+from scenefuse.marks.clicks import read_points
+from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
+from scenefuse.marks.triangulation import locate
 from scenefuse.masks.click_depth import with_depth
 from scenefuse.masks.grabcut import along_edges, grow_seeds
 from scenefuse.masks.grabcut_passes import ask_grabcut
@@ -750,9 +751,9 @@ def test_a_click_in_a_photo_that_is_not_used_is_left_out_where_others_say_what_t
         ([("box", "f00.png", 5, 5)], r"a box in f00\.png needs two lines, two opposite corners; there are 1"),
         (
             [("inside", "f00.png", 5, 5), ("outside", "f00.png", 5, 5)],
-            r"\(5, 5\) in f00\.png is clicked more than once",
+            r"\(5, 5\) in f00\.png is given more than once",
         ),
-        ([("inside", "f00.png", 5, 5)] * 2, "is clicked more than once"),
+        ([("inside", "f00.png", 5, 5)] * 2, "is given more than once"),
         ([("Inside", "f00.png", 5, 5)], "line 2: the label is inside, outside, box, not 'Inside'"),
         ([("inside", "f00.png", 5, "x")], "line 2: expected label photo x_px y_px"),
         ([], "holds no points below its header"),
@@ -764,7 +765,7 @@ def test_bad_clicks_are_named(tmp_path, model, photos, rows, sentence):
 
 
 def test_labels_are_not_fiducials(tmp_path):
-    assert isinstance(read(tmp_path, [("inside", "f00.png", 5, 5)]), Labels)
+    assert read(tmp_path, [("inside", "f00.png", 5, 5)]).kind == "labels"
     with pytest.raises(StageError, match="holds labels; mark points here"):
         locate(tmp_path / "prompts.tsv", tmp_path, 5)
 

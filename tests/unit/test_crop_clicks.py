@@ -13,7 +13,7 @@ from scenefuse.core.transforms import look_at
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
 from scenefuse.crop.one_photo import SceneClicks
-from scenefuse.marks.fiducials import read_points
+from scenefuse.marks.clicks import read_points
 from scenefuse.photos.workspace import View, write_model
 
 SIZE = np.array([6.0, 4.0, 3.0])
@@ -153,7 +153,7 @@ def test_a_click_on_the_sky_is_left_out_and_named_and_too_few_are_an_error(crop)
 def test_a_click_in_a_scene_photo_without_a_camera_is_left_out_and_named(crop, monkeypatch):
     def with_lost(path):
         marked = read_points(path)
-        return replace(marked, photos=[*marked.photos[:-1], "drone 3.jpg"])
+        return replace(marked, rows=(*marked.rows[:-1], replace(marked.rows[-1], photo="drone 3.jpg")))
 
     monkeypatch.setattr("scenefuse.crop.crop_scene.read_points", with_lost)
     note = value(crop(inside(*CORNERS, (1, -2, 1.5)))[1], "notes")[0]

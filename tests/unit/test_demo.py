@@ -15,7 +15,7 @@ from scenefuse.demo import capture, clicks, prompts, textures
 from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
 from scenefuse.demo.cameras import Cameras, pinhole, read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
-from scenefuse.marks.fiducials import Labels, read_points
+from scenefuse.marks.clicks import read_points
 from scenefuse.photos.geodesy import LocalFrame
 
 FLIGHT = capture.FlightSettings(
@@ -184,8 +184,11 @@ def test_an_object_is_clicked_in_the_photo_that_shows_most_of_it_some_pixels_off
     for seed in range(5):
         prompts.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=seed)
         marked = read_points(tmp_path / "prompts.tsv")
-        assert isinstance(marked, Labels)
-        assert marked.labels == ["inside"] * 3 + ["box"] * 2 and set(marked.photos) == {"b.jpg"}
+        assert (
+            marked.kind == "labels"
+            and marked.labels == ["inside"] * 3 + ["box"] * 2
+            and set(marked.photos) == {"b.jpg"}
+        )
         off = np.linalg.norm(marked.pixels[3:] - [[40, 30], [120, 90]], axis=1)
         assert (off > 2.9).all() and (off < 10.1).all()
         apart = np.linalg.norm(marked.pixels[:3, None] - marked.pixels[:3], axis=2)

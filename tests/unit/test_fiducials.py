@@ -1,4 +1,5 @@
 import unicodedata
+from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -7,8 +8,8 @@ from PIL import Image
 
 from scenefuse.core.stage import StageError
 from scenefuse.marks.check_marks import check_marks
-from scenefuse.marks.fiducials import Clicks, ScenePoints, locate, read_points, triangulate, triangulate_consistent
-from scenefuse.marks.lengths import read_end_clicks
+from scenefuse.marks.clicks import Click, Clicks, ScenePoints, read_length_clicks, read_points
+from scenefuse.marks.triangulation import locate, triangulate, triangulate_consistent
 
 LABELS = "label\tphoto\tx_px\ty_px\n"
 POINTS = {"roof": [0.3, -0.2, 0.1], "door": [-0.4, 0.1, 0.3]}
@@ -32,14 +33,10 @@ def model():
 def clicked(model, tmp_path, points=POINTS, photos=("1.jpg", "2.jpg", "3.jpg"), shift=(0.0, 0.0), scale=1.0):
     """Clicks where the model sees the points; `shift` moves the first click."""
     images = {image.name: image for image in model.images.values()}
-    names, files, pixels = [], [], []
-    for name, position in points.items():
-        for photo in photos:
-            names.append(name)
-            files.append(photo)
-            pixels.append(images[photo].project_point(np.array(position)) * scale)
-    pixels[0] = pixels[0] + shift
-    return Clicks(tmp_path / "fiducials.tsv", names, files, np.array(pixels))
+    marks = [(name, photo, np.array(place)) for name, place in points.items() for photo in photos]
+    rows = [Click(name, photo, *(images[photo].project_point(place) * scale)) for name, photo, place in marks]
+    rows[0] = replace(rows[0], x_px=rows[0].x_px + shift[0], y_px=rows[0].y_px + shift[1])
+    return Clicks(tmp_path / "fiducials.tsv", "points", tuple(rows))
 
 
 def test_clicks_are_triangulated_through_the_distortion(model, tmp_path):
@@ -65,19 +62,16 @@ def test_clicks_in_larger_originals_are_scaled(model, tmp_path):
 
 
 def with_click(clicks, index, photo=None, pixel=None):
-    photos, pixels = list(clicks.photos), clicks.pixels.copy()
-    if photo is not None:
-        photos[index] = photo
-    if pixel is not None:
-        pixels[index] = pixel
-    return Clicks(clicks.path, clicks.points, photos, pixels)
+    x_px, y_px = clicks.pixels[index] if pixel is None else pixel
+    changed = replace(clicks.rows[index], photo=photo or clicks.photos[index], x_px=x_px, y_px=y_px)
+    return replace(clicks, rows=(*clicks.rows[:index], changed, *clicks.rows[index + 1 :]))
 
 
 def test_error_sentences_name_the_point(model, tmp_path):
     clicks = clicked(model, tmp_path)
     with pytest.raises(StageError, match=r"point door is clicked in 9\.jpg, which is not among the 3 registered"):
         triangulate(with_click(clicks, 3, photo="9.jpg"), model, 5.0, {f"{i}.jpg": (640, 480) for i in (1, 2, 3)})
-    with pytest.raises(StageError, match=r"point roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
+    with pytest.raises(StageError, match=r"the click on roof at \(700, 10\) lies outside 2\.jpg, which has 640 x 480"):
         triangulate(with_click(clicks, 1, pixel=[700, 10]), model, 5.0)
     with pytest.raises(StageError, match=r"point door miss each other by .* px\): 1\.jpg .*, 2\.jpg .*, 3\.jpg"):
         triangulate(with_click(clicks, 3, pixel=clicks.pixels[3] + [0, 60]), model, 5.0)
@@ -114,7 +108,7 @@ def test_a_click_in_a_photo_that_was_not_registered_is_left_out(model, tmp_path)
 
 
 def test_parallel_rays(model, tmp_path):
-    clicks = Clicks(tmp_path / "f.tsv", ["p", "p"], ["1.jpg", "1.jpg"], np.array([[300.0, 200.0]] * 2))
+    clicks = Clicks(tmp_path / "f.tsv", "points", (Click("p", "1.jpg", 300.0, 200.0),) * 2)
     with pytest.raises(StageError, match="the rays to point p .* are parallel"):
         triangulate(clicks, model, 5.0)
 
@@ -123,7 +117,7 @@ def test_both_kinds_of_file(tmp_path):
     path = tmp_path / "f.tsv"
     path.write_text("point\tphoto\tx_px\ty_px\nroof\ta.jpg\t10\t20.5\n\nroof\tb.jpg\t1\t2\n")
     clicks = read_points(path)
-    assert isinstance(clicks, Clicks) and clicks.photos == ["a.jpg", "b.jpg"]
+    assert clicks.kind == "points" and clicks.photos == ["a.jpg", "b.jpg"]
     np.testing.assert_array_equal(clicks.pixels, [[10, 20.5], [1, 2]])
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\nb\t4\t5\t6e1\n")
     points = read_points(path)
@@ -169,7 +163,7 @@ def test_scene_points_as_other_programs_write_them(tmp_path, text, names):
         ("1 2 3 4 5\n", "has to begin with"),
         ("x y z\n", "holds no points below its header"),
         ("point\tx\ty\tz\n", "holds no points below its header"),
-        ("point\tx\ty\tz\na\t1\t2\n", "line 2: expected point x y z separated by tabs, got 'a 1 2'"),
+        ("point\tx\ty\tz\na\t1\t2\n", "line 2: expected x y z, perhaps behind a name, got 'a 1 2'"),
         ("point\tx\ty\tz\na\t1\t2\tnan\n", "line 2"),
         ("point\tphoto\tx_px\ty_px\na\tp.jpg\t1\ttwo\n", "line 2"),
         ("point\tphoto\tx_px\ty_px\na\tp.jpg\t1\t2\na\tp.jpg\t3\t4\n", "a in p.jpg is given more than once"),
@@ -206,7 +200,7 @@ def test_a_decimal_comma_is_named(tmp_path):
         read_points(path)
     path.write_text("length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1,5\ta\t1.jpg\t3\t4\n")
     with pytest.raises(StageError, match=r"line 2: .*; 1,5 has a decimal comma, write 1\.5$"):
-        read_end_clicks(path)
+        read_length_clicks(path)
 
 
 def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
@@ -215,7 +209,7 @@ def test_umlauts_in_two_spellings_are_one_photo(model, tmp_path):
         image.name = unicodedata.normalize("NFD", f"Gebäude {image.name}")
     sizes = {image.name: (640, 480) for image in model.images.values()}
     plain = clicked(model, tmp_path, photos=tuple(sizes))
-    clicks = Clicks(plain.path, plain.points, [unicodedata.normalize("NFC", p) for p in plain.photos], plain.pixels)
+    clicks = replace(plain, rows=tuple(replace(c, photo=unicodedata.normalize("NFC", c.photo)) for c in plain.rows))
     assert clicks.photos != plain.photos
     for known in (None, sizes):
         np.testing.assert_allclose(triangulate(clicks, model, 5.0, known)[1], list(POINTS.values()), atol=1e-7)
@@ -231,7 +225,8 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
     check_marks(path, photos)
     check_marks(path)
     with pytest.raises(
-        StageError, match=r"the click outside is in 4\.jpg, which is none of the 3 photos \(1\.jpg, \.\.\.\)"
+        StageError,
+        match=r"the click outside at \(1, 2\) is in 4\.jpg, which is none of the 3 photos \(1\.jpg, \.\.\.\)",
     ):
         check_marks(path, dict(list(photos.items())[:3]))
     with pytest.raises(
@@ -240,7 +235,7 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
         check_marks(path, photos, list(photos)[::2])
     path.write_text(LABELS + "inside\t3.jpg\t29\t39\nbox\t4.jpg\t1\t2\nbox\t4.jpg\t35\t12\n")
     with pytest.raises(
-        StageError, match=r"box at \(35, 12\) lies outside 4\.jpg, which has 30 x 40 pixels; correct it"
+        StageError, match=r"box at \(35, 12\) lies outside 4\.jpg, which has 30 x 40 pixels; correct the click"
     ):
         check_marks(path, photos)
     photos["3.jpg"].write_bytes(b"cut")
@@ -249,7 +244,7 @@ def test_clicks_in_photos_that_will_not_be_there_are_named_before_anything_runs(
     path.write_text("point\tx\ty\tz\na\t1\t2\t3\n")
     check_marks(path, photos)
     path.write_text("point\tphoto\tx_px\ty_px\na\t9.jpg\t1\t2\n")
-    with pytest.raises(StageError, match=r"a is in 9\.jpg"):
+    with pytest.raises(StageError, match=r"the click on a at \(1, 2\) is in 9\.jpg"):
         check_marks(path, photos)
 
 

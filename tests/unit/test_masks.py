@@ -16,7 +16,8 @@ import torch
 
 from scenefuse.core.stage import StageError, read_json, sha256, value, write_json
 from scenefuse.geometry.visual_hull import carve, mask_iou, silhouette
-from scenefuse.marks.fiducials import marked_size, read_points
+from scenefuse.marks.clicks import read_points
+from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.box import find_ground, upright_box
@@ -347,13 +348,14 @@ def test_clicks_that_miss_by_little_beside_the_object_still_span_it_and_a_wrong_
 def test_of_points_in_several_photos_the_exact_ones_prompt_sam2(capture, monkeypatch):
     sloppy_clicks(capture, 0.0)
     marked = read_points(capture / "sloppy.tsv")
-    pixels = marked.pixels.copy()
-    pixels[np.array(marked.points) == "top"] += np.random.default_rng(0).normal(0, 1.0, (4, 2))
+    pixels = marked.pixels
+    pixels[np.array(marked.labels) == "top"] += np.random.default_rng(0).normal(0, 1.0, (4, 2))
+    rows = tuple(dataclasses.replace(c, x_px=x, y_px=y) for c, (x, y) in zip(marked.rows, pixels))
     targets = []
     monkeypatch.setattr("scenefuse.masks.prompted.segment_by_sam2", lambda network, target, *_: targets.append(target))
     photos, settings = read_workspace(capture / "undistorted"), dataclasses.replace(SETTINGS, max_click_residual_px=0.2)
     prompted = masks_from_prompts(
-        dataclasses.replace(marked, pixels=pixels), capture / "undistorted/sparse", {}, photos,
+        dataclasses.replace(marked, rows=rows), capture / "undistorted/sparse", {}, photos,
         np.array([0, 0, 1.0]), "network", settings, 0,
     )  # fmt: skip
     assert targets[0].inexact.tolist() == [list(MARKS).index("top")] and len(targets[0].spanning) == len(MARKS)

@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 import pytest
 
+from scenefuse.marks.clicks import Click
 from scenefuse.photos.workspace import View, write_model
-from scenefuse.pick.clicks import Click
 from scenefuse.pick.expected_place import Cameras
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.workflow_masks import OVERLAY_PX, CarriedMasks
@@ -48,7 +48,7 @@ def seen(model, k, by=(0.0, 0.0)):
 
 def test_one_click_gives_a_line_through_the_true_pixel(model, cameras):
     expected = cameras.expected([seen(model, 1)], "2.jpg")
-    true = np.array([seen(model, 2).x, seen(model, 2).y])
+    true = np.array([seen(model, 2).x_px, seen(model, 2).y_px])
     steps = np.linspace(0, 1, 20)[:, None, None]
     line = (expected.pixels[:-1] * (1 - steps) + expected.pixels[1:] * steps).reshape(-1, 2)
     assert expected.from_photos == 1 and len(expected.pixels) > 20
@@ -58,14 +58,14 @@ def test_one_click_gives_a_line_through_the_true_pixel(model, cameras):
 def test_two_clicks_give_the_true_pixel(model, cameras):
     expected = cameras.expected([seen(model, 1), seen(model, 3)], "2.jpg")
     assert expected.from_photos == 2
-    assert np.allclose(expected.pixels, [[seen(model, 2).x, seen(model, 2).y]], atol=1e-3)
+    assert np.allclose(expected.pixels, [[seen(model, 2).x_px, seen(model, 2).y_px]], atol=1e-3)
 
 
 def test_the_photo_s_own_click_says_nothing_about_itself(model, cameras):
     assert cameras.expected([seen(model, 2)], "2.jpg") is None
     wrong = seen(model, 2, by=(50, 0))
     expected = cameras.expected([seen(model, 1), wrong, seen(model, 3)], "2.jpg")
-    assert np.allclose(expected.pixels, [[seen(model, 2).x, seen(model, 2).y]], atol=1e-3)
+    assert np.allclose(expected.pixels, [[seen(model, 2).x_px, seen(model, 2).y_px]], atol=1e-3)
 
 
 def test_residuals_are_in_pixels_of_the_originals(model, cameras):

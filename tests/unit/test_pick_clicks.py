@@ -3,13 +3,12 @@
 import pytest
 
 from scenefuse.core.stage import StageError
+from scenefuse.marks.clicks import Click, label_name
 from scenefuse.pick.clicks import (
-    Click,
     History,
     difference,
     merged,
     problems,
-    spoken,
     with_box,
     with_end,
     with_label,
@@ -149,7 +148,7 @@ def test_a_length_that_is_there_keeps_its_clicks_and_ends_and_gets_the_new_metre
     rows = (Click("bar\t1.5\tleft", "a.jpg", 1, 2), Click("door\t2\ta", "a.jpg", 3, 4))
     changed, ends = with_length(rows, "bar 1.6")
     assert changed == (Click("bar\t1.6\tleft", "a.jpg", 1, 2), rows[1])
-    assert ends == ("bar\t1.6\tleft", "bar\t1.6\ta") and spoken(ends[0]) == "bar, 1.6 m: left"
+    assert ends == ("bar\t1.6\tleft", "bar\t1.6\ta") and label_name(ends[0]) == "bar, 1.6 m: left"
     moved = with_end(changed, ends[0], "a.jpg", 7, 8, SIZES)
     assert moved == (Click("bar\t1.6\tleft", "a.jpg", 7, 8), rows[1])
 

@@ -5,9 +5,9 @@ import unicodedata
 import pytest
 
 from scenefuse.core.stage import StageError
-from scenefuse.marks.fiducials import read_points
+from scenefuse.marks.clicks import Click, read_points
 from scenefuse.marks.lengths import read_ends
-from scenefuse.pick.clicks import Click, with_end, with_length
+from scenefuse.pick.clicks import with_end, with_length
 from scenefuse.pick.document import Document, FileChanged
 
 HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
@@ -46,9 +46,11 @@ def test_known_lengths_are_read_back_by_the_page_and_by_the_workflow_one_end_or_
     draft = Document(path, "lengths")
     assert draft.unsaved and draft.rows == again.rows
     draft.save()
-    metres, ends, clicks = read_ends(path)
-    assert metres == {"north door": 2.05} and ends == {"north door": ["a", "b"]}
-    assert clicks.pixels.tolist() == [[3, 4], [5, 6]]
+    clicks = read_ends(path)
+    assert clicks.labels == ["north door\t2.05\ta", "north door\t2.05\tb"] and clicks.pixels.tolist() == [
+        [3, 4],
+        [5, 6],
+    ]
 
 
 def test_a_file_from_a_spreadsheet_is_edited_with_the_names_that_the_photos_have(path):

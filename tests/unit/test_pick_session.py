@@ -9,8 +9,8 @@ from support.user_project import HEADER, Project
 
 from scenefuse.core.stage import StageError, write_json
 from scenefuse.geometry.visual_hull import mask_iou
+from scenefuse.marks.clicks import Click, label_name
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
-from scenefuse.pick.clicks import Click, spoken
 from scenefuse.pick.next_run import as_text, command
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.segmenter import Segmenter
@@ -100,7 +100,7 @@ def test_known_lengths_are_clicked_in_the_scene_s_photos(yard):
     yard.scenes = "scene\tphotos\tlengths\nyard\tflight\tbars.tsv\n"
     board = opened(yard).boards[2]
     assert board.document.kind == "lengths" and board.source.listed and not board.document.trouble
-    assert [spoken(row.label) for row in board.document.rows] == ["bar, 1.5 m: left", "bar, 1.5 m: right"]
+    assert [label_name(row.label) for row in board.document.rows] == ["bar, 1.5 m: left", "bar, 1.5 m: right"]
     assert board.source.pictures.keys() == opened(yard).boards[1].source.pictures.keys()
 
 

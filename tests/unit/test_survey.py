@@ -280,7 +280,7 @@ def test_points_without_names_are_told_by_their_coordinates(tmp_path):
     path = tmp_path / "gcp_list.txt"
     path.write_text("WGS84 UTM 32N\n# a comment\n466000 5246000 NaN 10 20 a.jpg\n466000 5246000 NaN 30 40 b.jpg\n")
     (point,) = read_control(path).points
-    assert [photo for photo, _ in point.clicks] == ["a.jpg", "b.jpg"] and np.isnan(point.position[2])
+    assert [click.photo for click in point.clicks] == ["a.jpg", "b.jpg"] and np.isnan(point.position[2])
     assert point.sd_m == (0.02, 0.03) and not point.check
 
 
@@ -293,8 +293,8 @@ def test_columns_of_control_points_are_separated_in_any_way(tmp_path, mark, phot
     ]
     (tmp_path / "gcp_list.txt").write_text("EPSG:32632\n" + "".join(mark.join(row) + "\n" for row in cells))
     (point,) = read_control(tmp_path / "gcp_list.txt").points
-    assert point.name == "p1" and [name for name, _ in point.clicks] == [photo, "b.jpg"]
-    np.testing.assert_array_equal(point.clicks[0][1], [10.5, 20])
+    assert point.name == "p1" and [click.photo for click in point.clicks] == [photo, "b.jpg"]
+    np.testing.assert_array_equal(point.clicks[0].pixel, [10.5, 20])
 
 
 def a_photo(folder, name, xmp=b"", orientation=1):

@@ -1,4 +1,4 @@
-"""Clicks that say what is the object in single photos: inside, outside, or the corners of a box."""
+"""The labelled clicks of single photos, in pixels of the undistorted photo."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array
-from scenefuse.marks.fiducials import Labels
+from scenefuse.marks.clicks import Click, Clicks
+from scenefuse.marks.triangulation import model_pixel
 from scenefuse.photos.workspace import View, posed_images, ray_through, read_model
 
 if TYPE_CHECKING:
     import pycolmap
 
-ENOUGH = 3
-"""Clicks inside that make a mask by themselves: fewer may be on one part of the object only."""
+# Clicks inside that make a mask by themselves: fewer may be on one part of the object only.
+SUFFICIENT_CLICKS = 3
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,7 @@ class PhotoClicks:
     @property
     def enough(self) -> bool:
         """Whether they say what the object is without any other photo: a box, or three inside."""
-        return int(self.inside.sum()) >= ENOUGH or self.box is not None
+        return int(self.inside.sum()) >= SUFFICIENT_CLICKS or self.box is not None
 
     def only(self, keep: NDArray[np.bool_]) -> PhotoClicks:
         """The clicks of the rows (N,) to keep, and the box."""
@@ -80,20 +81,20 @@ class PhotoClicks:
 
 
 def clicks_per_photo(
-    labels: Labels, sparse: Path, views: list[View], sizes: Mapping[str, tuple[int, int]] | None
+    labels: Clicks, sparse: Path, views: list[View], sizes: Mapping[str, tuple[int, int]] | None
 ) -> tuple[dict[int, PhotoClicks], list[str]]:
     """The clicks of each clicked photo, by its row in `views`, in pixels of the undistorted photo.
 
     Args:
-        labels: the file, in pixels of the original photos.
+        labels: the table, of labels, in pixels of the original photos.
         sparse: COLMAP model of the photos before undistortion.
         views: undistorted photos.
         sizes: photo name -> (width, height) of the photos clicked in, of all photos, also those without a camera; None
             where these are not known, and photos have the size of their cameras.
 
     Returns:
-        The clicks, and a sentence for each that is left out since its photo is not used or has no camera, or none there
-        once its lens distortion is removed.
+        The clicks, and a sentence for each that is left out since its photo is not used or has no camera, or since its
+        place is cut away when the photo is undistorted.
 
     Raises:
         StageError: a click outside its photo, a box that is not two corners, no click inside and no box in a photo with
@@ -103,20 +104,19 @@ def clicks_per_photo(
     rows = {composed(view.name): k for k, view in enumerate(views)}
     listed = None if sizes is None else {composed(name): size for name, size in sizes.items()}
     left_out: list[str] = []
-    found: dict[int, list[tuple[str, Array, Array]]] = {}
-    advice = f"; click in one of the {len(images)} photos with a camera ({', '.join(sorted(images)[:3])}, ...)"
-    why = ", or is none of the photos" if listed is None else ""
-    for label, photo, pixel in zip(labels.labels, map(composed, labels.photos), labels.pixels):
-        click = f"the click {label} at ({pixel[0]:g}, {pixel[1]:g})"
+    found: dict[int, list[tuple[Click, Array]]] = {}
+    for click in labels.rows:
+        photo = composed(click.photo)
         if photo in images and photo in rows:
-            view, size = views[rows[photo]], (listed or {}).get(photo)
-            undistorted = _undistorted(f"{labels.path}: {click}", label, pixel, images[photo], view, size)
+            view = views[rows[photo]]
+            undistorted = _undistorted(labels.path, click, images[photo], view, listed)
             beyond = ((undistorted < 0) | (undistorted > [view.width, view.height])).any()
             if not np.isfinite(undistorted).all() or (listed is not None and beyond):
                 left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
             else:
-                found.setdefault(rows[photo], []).append((label, undistorted, pixel))
+                found.setdefault(rows[photo], []).append((click, undistorted))
         elif listed is None or photo in listed:
+            why = ", or is none of the photos" if listed is None else ""
             left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
         else:
             left_out.append(
@@ -126,38 +126,39 @@ def clicks_per_photo(
     clicked = {k: _of_photo(labels.path, views[k].name, clicks) for k, clicks in sorted(found.items())}
     if not any(clicks.prompt for clicks in clicked.values()):
         if left_out:
-            raise StageError(f"{labels.path} has no other click inside: {'; '.join(left_out)}{advice}")
+            raise StageError(
+                f"{labels.path} has no other click inside: {'; '.join(left_out)}; click in one of the {len(images)}"
+                f" photos with a camera ({', '.join(sorted(images)[:3])}, ...)"
+            )
         raise StageError(f"{labels.path} holds only clicks outside the object; add a few inside it, or a box around it")
     return clicked, left_out
 
 
 def _undistorted(
-    click: str, label: str, pixel: Array, image: pycolmap.Image, view: View, size: tuple[int, int] | None
+    path: Path, click: Click, image: pycolmap.Image, view: View, sizes: Mapping[str, tuple[int, int]] | None
 ) -> Array:
     """A click (2,) in pixels of the undistorted photo, perhaps beyond its edge, NaN beyond what the lens shows;
     a corner of a box is moved into it. StageError where it lies outside the original."""
     camera = image.camera
     assert camera is not None
-    width, height = size or (camera.width, camera.height)
-    if not (0 <= pixel[0] <= width and 0 <= pixel[1] <= height):
-        raise StageError(f"{click} lies outside {image.name}, which has {width} x {height} pixels; correct the click")
-    ray = ray_through(camera, pixel * [camera.width / width, camera.height / height])
-    undistorted: Array = (view.intrinsics @ [*ray, 1.0])[:2]
-    if label != "box":
+    pixel = model_pixel(path, click, image, sizes)
+    undistorted: Array = (view.intrinsics @ [*ray_through(camera, pixel), 1.0])[:2]
+    if click.label != "box":
         return undistorted
     whole = np.array([view.width, view.height])
-    return np.clip(np.where(np.isfinite(undistorted), undistorted, pixel * whole / [width, height]), 0, whole - 1e-3)
+    same_share = pixel * whole / [camera.width, camera.height]
+    return np.clip(np.where(np.isfinite(undistorted), undistorted, same_share), 0, whole - 1e-3)
 
 
-def _of_photo(path: Path, photo: str, clicks: list[tuple[str, Array, Array]]) -> PhotoClicks:
-    """The clicks of one photo: label, pixel undistorted and as clicked. Its two box corners are sorted."""
-    corners = np.array([pixel for label, pixel, _ in clicks if label == "box"]).reshape(-1, 2)
+def _of_photo(path: Path, photo: str, clicks: list[tuple[Click, Array]]) -> PhotoClicks:
+    """The clicks of one photo with their undistorted pixels. Its two box corners are sorted."""
+    corners = np.array([pixel for click, pixel in clicks if click.label == "box"]).reshape(-1, 2)
     if len(corners) not in (0, 2) or (len(corners) and (np.ptp(corners, axis=0) < 2).any()):
         raise StageError(f"{path}: a box in {photo} needs two lines, two opposite corners; there are {len(corners)}")
-    others = [one for one in clicks if one[0] != "box"]
+    others = [(click, pixel) for click, pixel in clicks if click.label != "box"]
     return PhotoClicks(
-        np.array([pixel for _, pixel, _ in others]).reshape(-1, 2),
-        np.array([label == "inside" for label, _, _ in others], dtype=bool),
+        np.array([pixel for _, pixel in others]).reshape(-1, 2),
+        np.array([click.label == "inside" for click, _ in others], dtype=bool),
         np.stack([corners.min(0), corners.max(0)]) if len(corners) else None,
-        original=np.array([pixel for *_, pixel in others]).reshape(-1, 2),
+        original=np.array([click.pixel for click, _ in others]).reshape(-1, 2),
     )

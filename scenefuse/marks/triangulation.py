@@ -1,0 +1,186 @@
+"""Clicked points in the frame of a COLMAP model, through its cameras and their distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+
+from scenefuse.core.stage import StageError
+from scenefuse.core.tables import composed
+from scenefuse.core.transforms import Array
+from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, read_points
+from scenefuse.photos.workspace import ray_through, read_model
+
+Sizes = Mapping[str, tuple[int, int]]
+
+
+def locate(
+    path: Path, model: Path, max_residual_px: float, sizes: Sizes | None = None
+) -> tuple[list[str], Array, Array]:
+    """Marked points of either kind in the frame of a COLMAP model (scene points are taken to be in it already).
+
+    Returns:
+        Names, (P, 3) positions, (P,) residuals in pixels, which are 0 for points given by coordinates.
+    """
+    marked = read_points(path)
+    if isinstance(marked, ScenePoints):
+        return marked.points, marked.positions, np.zeros(len(marked.points))
+    if marked.kind == "labels":
+        raise StageError(f"{path} holds labels; mark points here ('point photo x_px y_px')")
+    return triangulate(marked, read_model(model), max_residual_px, sizes)
+
+
+def triangulate(
+    clicks: Clicks, model: pycolmap.Reconstruction, max_residual_px: float, sizes: Sizes | None = None
+) -> tuple[list[str], Array, Array]:
+    """Positions of clicked points: linear triangulation (Hartley and Zisserman, 12.2), then Gauss-Newton on the
+    reprojection error.
+
+    Args:
+        clicks: two or more photos per point.
+        model: of the photos that were clicked in (not of undistorted ones).
+        max_residual_px: a point with a larger RMS reprojection error is an error, in pixels of the model's photos.
+        sizes: photo name -> (width, height) of the photos clicked in, where the model was made from smaller copies; of
+            all photos, also those that could not be registered.
+
+    Returns:
+        Labels of the points in order of appearance, (P, 3) positions, (P,) RMS reprojection errors in pixels.
+
+    Raises:
+        StageError: as `triangulate_consistent`, and rays that are parallel or miss each other: all points at once.
+    """
+    labels, positions, residuals, left_out = triangulate_consistent(clicks, model, max_residual_px, sizes)
+    if len(labels) < len(set(clicks.labels)):
+        raise StageError(f"{clicks.path}: {'; '.join(left_out)}; correct these clicks, or delete them")
+    for sentence in left_out:
+        print(f"left out of {clicks.path}: {sentence}", flush=True)
+    return labels, positions, residuals
+
+
+def triangulate_consistent(
+    clicks: Clicks, model: pycolmap.Reconstruction, max_residual_px: float, sizes: Sizes | None = None
+) -> tuple[list[str], Array, Array, list[str]]:
+    """As `triangulate`, but what cannot be used is left out and named in the fourth result: points whose clicks
+    contradict each other, clicks in photos without a camera, and points that have fewer than two others.
+
+    Raises:
+        StageError: a photo that is none of `sizes`, a click outside its photo, a point that is clicked once only. Each
+            message names the point.
+    """
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = None if sizes is None else {composed(name): size for name, size in sizes.items()}
+    positions, residuals, labels = [], [], []
+    registered, left_out = _registered(clicks, images, sizes)
+    for label, own in registered.items():
+        seen, photos = [images[composed(click.photo)] for click in own], [click.photo for click in own]
+        pixels = np.array([model_pixel(clicks.path, click, image, sizes) for click, image in zip(own, seen)])
+        position, residual = intersect(seen, pixels)
+        if position is None:
+            left_out.append(
+                f"the rays to point {own[0].name} from {', '.join(photos)} are parallel, meet behind a camera, or lie"
+                " beyond what the lens shows"
+            )
+        elif residual > max_residual_px:
+            off = np.linalg.norm(np.array([image.project_point(position) for image in seen]) - pixels, axis=1)
+            where = ", ".join(f"{photo} {px:.1f} px" for photo, px in zip(photos, off))
+            left_out.append(
+                f"the clicks on point {own[0].name} miss each other by {residual:.1f} px"
+                f" (limit {max_residual_px:.3g} px): {where}"
+            )
+        else:
+            labels.append(label)
+            positions.append(position)
+            residuals.append(residual)
+    return labels, np.array(positions).reshape(-1, 3), np.array(residuals), left_out
+
+
+def marked_size(clicks: Clicks, model: pycolmap.Reconstruction, sizes: Sizes | None = None) -> float:
+    """How large what is clicked is in the photos: median diagonal of the box of a photo's clicks, in pixels of the
+    model's photos; 0 where no photo with a camera has two. Arguments as of `triangulate`."""
+    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
+    sizes = {} if sizes is None else {composed(name): size for name, size in sizes.items()}
+    photos, spans = np.array([composed(photo) for photo in clicks.photos]), []
+    for name in sorted(set(photos) & set(images)):
+        camera = images[name].camera
+        assert camera is not None
+        scale = camera.width / sizes.get(name, (camera.width, camera.height))[0]
+        if (photos == name).sum() > 1:
+            spans.append(scale * float(np.linalg.norm(np.ptp(clicks.pixels[photos == name], axis=0))))
+    return float(np.median(spans)) if spans else 0.0
+
+
+def _registered(
+    clicks: Clicks, images: Mapping[str, pycolmap.Image], sizes: Sizes | None
+) -> tuple[dict[str, list[Click]], list[str]]:
+    """The clicks in registered photos by label, two or more of each; and what is left out since a photo has no
+    camera."""
+    found: dict[str, list[Click]] = {}
+    lost: dict[str, list[str]] = {}
+    for click in clicks.rows:
+        photo, own = composed(click.photo), found.setdefault(click.label, [])
+        if photo in images:
+            own.append(click)
+        elif sizes is None or photo in sizes:
+            lost.setdefault(click.label, []).append(click.photo)
+        else:
+            raise StageError(
+                f"{clicks.path}: point {click.name} is clicked in {click.photo}, which is not among the {len(images)}"
+                f" registered photos; click in one of them ({', '.join(sorted(images)[:3])}, ...)"
+            )
+    left_out, unsure = [], "" if sizes else ", or is none of the photos"
+    names = {click.label: click.name for click in clicks.rows}
+    for label, own in found.items():
+        count = f"the number of registered photos in which point {names[label]} is clicked is {len(own)}"
+        unregistered = f"{', '.join(lost.get(label, []))} could not be registered{unsure}"
+        if len(own) < 2 and label not in lost:
+            raise StageError(f"{clicks.path}: {count}; two or more are needed, click it in another one")
+        if len(own) < 2:
+            left_out.append(f"{count} ({unregistered}), two or more are needed")
+        elif label in lost:
+            left_out.append(f"{unregistered}: its click on point {names[label]}")
+    return {label: own for label, own in found.items() if len(own) > 1}, left_out
+
+
+def model_pixel(path: Path, click: Click, image: pycolmap.Image, sizes: Sizes | None) -> Array:
+    """A click (2,) in pixels of the model's photo; StageError when it lies outside. `sizes` by `composed` names."""
+    assert image.camera is not None
+    own = (image.camera.width, image.camera.height)
+    clicked = own if sizes is None else sizes.get(composed(click.photo), own)
+    check_inside(path, click, clicked)
+    return click.pixel * np.array(own) / np.array(clicked)
+
+
+def intersect(images: list[pycolmap.Image], pixels: Array) -> tuple[Array | None, float]:
+    """Point that images see at (N, 2) pixels and its RMS reprojection error; None where the rays do not meet, or one
+    lies beyond what the lens shows."""
+    poses = np.array([image.cam_from_world().matrix() for image in images])
+    cameras = [image.camera for image in images if image.camera is not None]
+    normalised = np.array([ray_through(camera, pixel) for camera, pixel in zip(cameras, pixels)])
+    if not np.isfinite(normalised).all():
+        return None, np.inf
+    rows = normalised[:, :, None] * poses[:, 2:3, :] - poses[:, :2, :]
+    system = rows.reshape(-1, 4)
+    homogeneous = np.linalg.svd(system)[2][3]
+    if abs(homogeneous[3]) < 1e-9 * np.linalg.norm(homogeneous[:3]):
+        return None, np.inf
+    position = homogeneous[:3] / homogeneous[3]
+    for _ in range(10):
+        in_cam = poses[:, :, :3] @ position + poses[:, :, 3]
+        if (in_cam[:, 2] <= 0).any():
+            return None, np.inf
+        error = in_cam[:, :2] / in_cam[:, 2:] - normalised
+        # d(x/z, y/z) = (row_xy - (xy / z) row_z) / z
+        slope = (poses[:, :2, :3] - (in_cam[:, :2] / in_cam[:, 2:])[:, :, None] * poses[:, 2:3, :3]) / in_cam[
+            :, 2:, None
+        ]
+        step, _, rank, _ = np.linalg.lstsq(slope.reshape(-1, 3), -error.reshape(-1), rcond=1e-6)
+        if rank < 3:
+            return None, np.inf
+        position = position + step
+    reprojected = [image.project_point(position) for image in images]
+    if any(p is None for p in reprojected):
+        return None, np.inf
+    return position, float(np.sqrt(((np.array(reprojected) - pixels) ** 2).sum(1).mean()))
