@@ -32,6 +32,7 @@ OPERATORS = {
     ast.Mult: operator.mul,
     ast.Div: operator.truediv,
     ast.Pow: operator.pow,
+    ast.LShift: operator.lshift,
     ast.USub: operator.neg,
 }
 FUNCTIONS = {

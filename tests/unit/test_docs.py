@@ -105,15 +105,15 @@ def test_a_number_follows_its_constant_and_a_constant_that_is_gone_is_an_error(m
     monkeypatch.setattr(documents, "ROOT", tmp_path)
     (tmp_path / "masks").mkdir()
     (tmp_path / "masks/space.py").write_text(
-        "SHARE = 0.3\nPHOTOS: int = 4\nBOTH = 2 * PHOTOS, 1e-6\nA, B = 1, np.radians(180)\n"
+        "SHARE = 0.3\nPHOTOS: int = 4\nBOTH = 2 * PHOTOS, 1e-6\nROWS = 1 << 16\nA, B = 1, np.radians(180)\n"
         "class S:\n    rays: int = setting(20_000, 'x')\n"
     )
     text = "9<!-- masks.space.SHARE --> 9<!-- masks.space.SHARE % --> % two<!-- masks.space.PHOTOS -->"
     assert documents.with_numbers(text).replace("<!-- masks.space.", "[").replace(" -->", "]") == (
         "0.3[SHARE] 30[SHARE %] % four[PHOTOS]"
     )
-    text = " ".join(f"1<!-- masks.space.{name} -->" for name in ("BOTH[0]", "BOTH[1]", "S.rays", "B"))
-    assert re.findall(r"(\S+)<!", documents.with_numbers(text)) == ["8", "1e-6", "20,000", "3.14159"]
+    text = " ".join(f"1<!-- masks.space.{name} -->" for name in ("BOTH[0]", "BOTH[1]", "S.rays", "B", "ROWS"))
+    assert re.findall(r"(\S+)<!", documents.with_numbers(text)) == ["8", "1e-6", "20,000", "3.14159", "65,536"]
     example = "`1<!-- masks.gone.SHARE -->`"
     assert documents.with_numbers(example) == example
     for gone in ("masks.space.GONE", "masks.gone.SHARE", "masks.space.S.gone"):
