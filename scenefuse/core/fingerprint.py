@@ -35,6 +35,8 @@ IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?
 REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
 MOST_REMEMBERED = 5000
 LIBRARY = Path(__file__).resolve().parents[1]
+# Files in the assets/ folder beside a module that imports this are part of its code.
+ASSETS_READER = "importlib.resources"
 OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered
 # A file of a user up to this size is read whole; of a larger one only size and date are looked at.
 LARGEST_READ_BYTES = 200_000
@@ -104,13 +106,15 @@ def _state(path: Path) -> str:
 @functools.cache
 def _module(path: Path, root: Path) -> _Module:
     source = path.read_text(encoding="utf-8")
+    names = set(imported_names(source, path, root))
+    assets = sorted((path.parent / "assets").rglob("*")) if ASSETS_READER in names else []
     known, key = _remembered(), hashlib.sha256(OWN_SOURCE + source.encode()).hexdigest()
     if key not in known:
         known[key] = _digest(_normalised(source, path))
-    names = set(imported_names(source, path, root))
     files: frozenset[Path] = frozenset().union(*(_files(name, root) for name in names))
     packages = {name.split(".")[0] for name in names if _home(name.split(".")[0], root) is None}
-    return _Module(known[key], files, frozenset(packages - sys.stdlib_module_names))
+    code = _digest("".join([known[key], *(f" {file.name} {_state(file)}" for file in assets)]))
+    return _Module(code, files, frozenset(packages - sys.stdlib_module_names))
 
 
 def _normalised(source: str, path: Path) -> str:

@@ -15,10 +15,9 @@ from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, upright
-from scenefuse.report.render import orbit_camera, point_radii, render
+from scenefuse.report.render import luminance, orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
-from scenefuse.report.view.view_file import View, write_view
-from scenefuse.report.view.view_points import REMOVED, merge, thin, within
+from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
 
 SCENE_COLOR, ADDED_COLOR, UNCONFIRMED_COLOR = (205, 208, 212), (240, 120, 25), (150, 60, 170)
 CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
@@ -311,7 +310,7 @@ def _most_changed(clouds: Discs, framed: Array) -> float:
 
 def _brightness(cloud: Cloud) -> Array:
     """(N,) brightness 0 to 1 of the points' colours; 1 where there are none."""
-    return np.ones(len(cloud)) if cloud.colors is None else cloud.colors @ np.array([0.299, 0.587, 0.114]) / 255.0
+    return np.ones(len(cloud)) if cloud.colors is None else luminance(cloud.colors) / 255
 
 
 def _draw_box(axes: Any, corners_px: Array, label: str) -> None:

@@ -1,84 +1,147 @@
-"""A page in one file: style, script and pictures in it, no network, readable on paper."""
+"""A page in one file: style, script, pictures and 3D views in it, no network, readable on paper.
+
+Markup, style and script are files in assets/; K3D-jupyter's front end draws the views.
+"""
 
 import base64
+import importlib.resources
 import io
+import json
+import zlib
 from html import escape
+from importlib import metadata
 from pathlib import Path
+from string import Template
+from typing import Any
 
-from PIL import Image as Picture
+import numpy as np
+from matplotlib import colormaps
+from matplotlib.colors import to_hex
+from PIL import Image
 
 from scenefuse.core.stage import StageError
-from scenefuse.report.view.view_page import view_library
-from scenefuse.report.view.view_script import VIEW_SCRIPT, VIEW_STYLE
+from scenefuse.report.view import LEVELS, REMOVED, UNKNOWN, Shown, View, encode
 
-STYLE = """
-:root { --ink: #1d2329; --soft: #5b6670; --line: #dfe3e7; --accent: #c7560b; }
-* { box-sizing: border-box; }
-body { margin: 0 auto; max-width: 1180px; padding: 28px 20px 60px; background: #fff; color: var(--ink);
-  font: 15px/1.5 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-h1 { font-size: 26px; margin: 0 0 4px; } h2 { font-size: 20px; margin: 40px 0 8px; border-top: 1px solid var(--line);
-  padding-top: 22px; } h3 { font-size: 16px; margin: 24px 0 6px; }
-p, figcaption { color: var(--soft); margin: 4px 0 10px; max-width: 88ch; } a { color: var(--accent); }
-nav a { display: inline-block; margin-right: 14px; } figure { margin: 14px 0 22px; break-inside: avoid; }
-img { max-width: 100%; height: auto; display: block; }
-.badge { display: inline-block; font-size: 13px; padding: 1px 9px; border-radius: 9px; margin-left: 8px;
-  border: 1px solid; vertical-align: 2px; font-weight: 500; } .ok { color: #1c6b35; } .no { color: #9c2b1f; }
-.wide { overflow-x: auto; border: 1px solid var(--line); border-radius: 6px; }
-table { border-collapse: collapse; font-size: 12.5px; width: 100%; font-variant-numeric: tabular-nums; }
-th, td { padding: 4px 7px; text-align: right; border-bottom: 1px solid var(--line); vertical-align: top; }
-td.text { max-width: 46ch; } tr:last-child td { border-bottom: 0; }
-th { font-weight: 600; color: var(--soft); vertical-align: bottom; line-height: 1.25; } .text { text-align: left; }
-.slider { position: relative; max-width: 840px; border: 1px solid var(--line); --cut: 50%; }
-.slider figure { margin: 0; } .slider .after { position: absolute; inset: 0; clip-path: inset(0 0 0 var(--cut)); }
-.slider::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--cut); width: 2px;
-  background: var(--accent); }
-.slider figcaption { position: absolute; top: 8px; margin: 0; padding: 1px 8px; background: #fffc; color: var(--ink); }
-.slider .before figcaption { left: 8px; } .slider .after figcaption { right: 8px; }
-.range { width: 100%; max-width: 840px; display: block; margin: 6px 0 0; accent-color: var(--accent); }
-pre { font-size: 12.5px; line-height: 1.4; background: #f7f8f9; border: 1px solid var(--line); border-radius: 6px;
-  padding: 12px 14px; overflow-x: auto; }
-@media print { body { max-width: none; padding: 0; font-size: 11px; } nav, .range { display: none; }
-  .slider { display: flex; gap: 6px; border: 0; } .slider::after { display: none; } table { font-size: 8.5px; }
-  .slider .after { position: relative; clip-path: none; } .slider figure { position: relative; flex: 1; }
-  .wide { overflow: visible; border: 0; } th, td { padding: 2px 4px; } h2 { break-after: avoid; }
-  pre { font-size: 8px; white-space: pre-wrap; } }
-"""
-SCRIPT = """
-for (const range of document.querySelectorAll(".range")) {
-  const slider = range.previousElementSibling;
-  const move = (percent) => {
-    range.value = percent;
-    slider.style.setProperty("--cut", percent + "%");
-  };
-  range.addEventListener("input", () => move(range.value));
-  slider.addEventListener("pointermove", (event) => {
-    if (event.pointerType === "touch" && !event.isPrimary) return;
-    const box = slider.getBoundingClientRect();
-    move(Math.min(100, Math.max(0, ((event.clientX - box.left) / box.width) * 100)));
-  });
+ASSETS = importlib.resources.files("scenefuse.report") / "assets"
+# Of the scene, then of its objects in turn.
+SOURCE_COLORS = ("#c4c9ce", "#f07819", "#2f7fbf", "#3d9a5f", "#a45fb0", "#c9a227", "#4bb3b8", "#d1647f")
+REMOVED_COLOR, UNKNOWN_COLOR = "#b3261e", "#dfe2e5"
+# Colours that every kind of colour vision tells apart (after Okabe and Ito 2008), and labels of the field `evidence`.
+EVIDENCE = {
+    0: ("#a9b1b9", "not checked"),
+    1: ("#0f8a66", "measured: three photos confirm it, and its surroundings"),
+    2: ("#d55e00", "not measured: of the NeRF, or a given cloud"),
+    3: ("#b869a0", "not measured: of the scene's stereo"),
+    UNKNOWN: (UNKNOWN_COLOR, "not in the completed scene"),
 }
-"""
+Mode = dict[str, Any]
+
+
+def asset(name: str) -> str:
+    """The text of a file in assets/."""
+    return (ASSETS / name).read_text(encoding="utf-8")
 
 
 def document(title: str, body: list[str], has_views: bool) -> str:
-    """An HTML page of these parts; with the library that draws 3D views, if it has some."""
-    style, script = (STYLE + VIEW_STYLE, SCRIPT + VIEW_SCRIPT) if has_views else (STYLE, SCRIPT)
-    content = "\n".join([*body, *([view_library()] if has_views else [])])
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{escape(title)}</title>\n'
-        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n<style>{style}</style>\n</head>\n'
-        f"<body>\n{content}\n<script>{script}</script>\n</body>\n</html>\n"
-    )
+    """An HTML page of these parts; with what draws 3D views, if it has some."""
+    names = ("page", "view") if has_views else ("page",)
+    style, script = ("".join(asset(f"{name}.{kind}") for name in names) for kind in ("css", "js"))
+    content = "\n".join([*body, *([_view_library()] if has_views else [])])
+    return Template(asset("page.html")).substitute(title=escape(title), style=style, body=content, script=script)
 
 
 def embedded(path: Path, alt: str) -> str:
     """An <img> that holds the picture, as WebP: a third of the PNG's size; StageError where it is none."""
     buffer = io.BytesIO()
     try:
-        with Picture.open(path) as opened:
+        with Image.open(path) as opened:
             size = opened.size
             opened.convert("RGB").save(buffer, format="WEBP", quality=85, method=4)
     except OSError as error:
         raise StageError(f"{path} is not a readable picture ({error}); draw the figures again") from None
     data = base64.b64encode(buffer.getvalue()).decode()
     return f'<img src="data:image/webp;base64,{data}" width="{size[0]}" height="{size[1]}" alt="{escape(alt)}">'
+
+
+def figure(path: Path, caption: str) -> str:
+    """A picture with its caption."""
+    return f"<figure>{embedded(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def view_section(key: str, name: str, view: View) -> str:
+    """One 3D view: stage, buttons, legend, and its points.
+
+    Args:
+        key: tells the views of a page apart.
+        name: of what it shows, for labels.
+        view: the points; few enough for a page.
+    """
+    about, planes = encode(view)
+    about["modes"] = modes = _modes(view, about.get("deviation"))
+    return Template(asset("view.html")).substitute(
+        name=escape(name),
+        # An object by itself has no before and after.
+        one_cloud="" if (view.cloud.fields["shown"] != Shown.BOTH).any() else " hidden",
+        whens=_choice(f"when-{key}", {"before": "Before", "after": "After"}, "after"),
+        colours=_choice(f"colour-{key}", {mode["name"]: mode["button"] for mode in modes}, modes[0]["name"]),
+        # A closing tag inside JSON would end the script element.
+        about=json.dumps(about).replace("</", "<\\/"),
+        points=base64.b64encode(planes).decode(),
+    )
+
+
+def _view_library() -> str:
+    """K3D-jupyter's front end with its licences, packed, for a page that has views."""
+    import k3d
+
+    package = Path(k3d.__file__).parent
+    source = (package / "static/standalone.js").read_bytes()
+    packed = base64.b64encode(zlib.compress(source, 9)).decode()
+    licence = metadata.distribution("k3d").read_text("licenses/LICENSE.txt") or "MIT licence"
+    notices = (package / "static/standalone.js.LICENSE.txt").read_text(encoding="utf-8")
+    credit = f"K3D-jupyter {k3d.__version__}\n{licence.strip()}\nIn it:\n{notices.strip()}"
+    return f'<!-- {credit.replace("--", "- -")} -->\n<script type="text/plain" id="k3d">{packed}</script>'
+
+
+def _choice(group: str, options: dict[str, str], chosen: str) -> str:
+    """Radio buttons that look like one row of buttons."""
+    return "".join(
+        f'<label><input type="radio" name="{escape(group)}" value="{escape(option)}"'
+        f"{' checked' if option == chosen else ''}><span>{escape(text)}</span></label>"
+        for option, text in options.items()
+    )
+
+
+def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
+    """The ways to colour the points that the view's fields allow; the first one is chosen."""
+    modes: list[Mode] = []
+    other = {"color": UNKNOWN_COLOR, "label": "unknown"}
+    if view.cloud.colors is not None:
+        brighter = "" if view.brighter == 1 else f", {view.brighter:.1f} x as bright"
+        modes.append({"name": "photo", "button": "Colours", "label": f"The points' own colours{brighter}"})
+    codes = sorted(set(view.sources) - {REMOVED})
+    sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
+    sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")
+    modes.append({"name": "source", "button": "Source", "other": other, "entries": _entries(view, "source", sources)})
+    evidence = view.cloud.fields.get("evidence", np.zeros(0))
+    if ((evidence > 0) & (evidence != UNKNOWN)).any():
+        found = _entries(view, "evidence", EVIDENCE)
+        modes.append({"name": "evidence", "button": "Class", "other": other, "entries": found})
+    if deviations is not None:
+        ramp = [to_hex(color) for color in colormaps["viridis"](np.linspace(0, 1, LEVELS))]
+        low, high = (f"{end:.2g} {view.unit}" for end in deviations)
+        entries = [{"code": k + 1, "color": color} for k, color in enumerate(ramp)]
+        ends: Mode = {"ramp": ramp[::3], "low": low, "high": high}
+        modes.append({"name": "deviation", "button": "Std. deviation", "other": other, "entries": entries} | ends)
+    return modes
+
+
+def _entries(view: View, field: str, meanings: dict[int, tuple[str, str]]) -> list[Mode]:
+    """The values of a field that occur, with colour, label, and the pictures in which they are seen."""
+    found = []
+    for code, (color, label) in meanings.items():
+        shown = set(view.cloud.fields["shown"][view.cloud.fields[field] == code].tolist())
+        when = [name for name, absent in (("before", Shown.AFTER), ("after", Shown.BEFORE)) if shown - {absent}]
+        if when:
+            found.append({"code": code, "color": color, "label": label, "when": when})
+    return found

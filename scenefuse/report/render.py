@@ -136,6 +136,11 @@ def point_radii(
     return (factor * np.clip(spacing, middle / 20, middle * limit)).astype(np.float32)
 
 
+def luminance(colors: ArrayLike) -> Array:
+    """(N,) brightness 0 to 255 of colours (N, 3), by ITU-R BT.601."""
+    return np.asarray(colors) @ np.array([0.299, 0.587, 0.114])
+
+
 def render(
     cloud: Cloud,
     camera: Camera,

@@ -14,6 +14,7 @@ from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
 from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.write import after_fusion
 from scenefuse.report.object_sheet import inner
+from scenefuse.report.render import luminance
 from scenefuse.report.values import find, flatten, load, number, unit_of
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
@@ -129,7 +130,7 @@ def how_much_brighter(cloud: Cloud) -> float:
     """The factor by which a cloud's colours are shown brighter; 1 where they are bright enough, or it has none."""
     if cloud.colors is None or not len(cloud):
         return 1.0
-    upper = float(np.percentile(cloud.colors @ np.array([0.299, 0.587, 0.114]), 90))
+    upper = float(np.percentile(luminance(cloud.colors), 90))
     return 1.0 if upper >= DARK else round(min(BRIGHT / max(upper, 1.0), MOST_BRIGHTER), 1)
 
 

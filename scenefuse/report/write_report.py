@@ -8,11 +8,9 @@ from pathlib import Path
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.paper.paper_section import paper_section
 from scenefuse.report.collected import ALONE
-from scenefuse.report.page import document, embedded
+from scenefuse.report.page import document, embedded, figure, view_section
 from scenefuse.report.values import number
-from scenefuse.report.view.view_file import View, read_view
-from scenefuse.report.view.view_page import view_section
-from scenefuse.report.view.view_points import thin
+from scenefuse.report.view import View, read_view, thin
 
 PAGE_POINTS = 700_000
 """Of all 3D views together: about 8 MB. With more views than fit, each gets fewer points."""
@@ -137,7 +135,7 @@ def _scene_section(folder: Path, scenes: list[dict[str, str]], view: View | None
         )
     if view is not None:
         parts.append(view_section(f"scene-{folder.name}", f"scene {folder.name}", view))
-    return "\n".join([*parts, _picture(path, "From above and obliquely: cameras red, objects boxed.")])
+    return "\n".join([*parts, figure(path, "From above and obliquely: cameras red, objects boxed.")])
 
 
 def _object_section(folder: Path, registration: list[dict[str, str]], view: View | None) -> str:
@@ -167,7 +165,7 @@ def _object_section(folder: Path, registration: list[dict[str, str]], view: View
             '<input class="range" type="range" min="0" max="100" value="50" aria-label="before and after">'
         )
     figures = [(figure_folder / f"{name}.png", caption) for name, caption in _OBJECT_FIGURES.items()]
-    parts += [_picture(path, caption) for path, caption in figures if path.is_file()]
+    parts += [figure(path, caption) for path, caption in figures if path.is_file()]
     return "\n".join(parts)
 
 
@@ -213,7 +211,3 @@ def _read_table(path: Path) -> list[dict[str, str]]:
         return []
     with open(path, newline="", encoding="utf-8") as file:
         return [{k: v or "" for k, v in row.items() if k} for row in csv.DictReader(file, delimiter="\t")]
-
-
-def _picture(path: Path, caption: str) -> str:
-    return f"<figure>{embedded(path, caption)}<figcaption>{escape(caption)}</figcaption></figure>"

@@ -8,11 +8,9 @@ import numpy as np
 
 from scenefuse.core.stage import atomic_file, value
 from scenefuse.core.transforms import Array, Sim3, rotation_between
-from scenefuse.report.page import document, embedded
+from scenefuse.report.page import document, figure, view_section
 from scenefuse.report.values import flatten, number
-from scenefuse.report.view.view_file import View
-from scenefuse.report.view.view_page import view_section
-from scenefuse.report.view.view_points import REMOVED, merge, thin, within
+from scenefuse.report.view import REMOVED, View, merge, thin, within
 from scenefuse.two_clouds.complete import Completed
 
 VIEW_POINTS = 300_000
@@ -63,7 +61,7 @@ def write_page(
         parts += [_changes(done, scene_points), view_section("scene", title, view_of(names[0], done, up, unit))]
     if picture.is_file():
         caption = "From above, from the front and from the side: scene grey, object orange; below in their own colours."
-        parts.append(f"<figure>{embedded(picture, caption)}<figcaption>{caption}</figcaption></figure>")
+        parts.append(figure(picture, caption))
     parts += [f"<p>Note: {escape(note)}.</p>" for note in value(content, "notes")]
     parts.append(_table(content))
     if "scene_from_object" in content:

@@ -115,6 +115,7 @@ def test_a_wheel_holds_the_library_and_the_workflow_and_not_the_tables_of_the_de
     with zipfile.ZipFile(wheel) as archive:
         held = set(archive.namelist())
     assert wheel.name.startswith(f"scenefuse-{VERSION}-py3-none-any")
+    assert {path.relative_to(ROOT).as_posix() for path in ROOT.glob("scenefuse/*/assets/*")} <= held
     for folder in ("scripts", "workflow", "profiles", "envs"):
         files = [path for path in (ROOT / folder).rglob("*") if path.is_file() and "__pycache__" not in path.parts]
         assert {f"scenefuse/shipped/{path.relative_to(ROOT).as_posix()}" for path in files} <= held

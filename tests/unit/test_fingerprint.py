@@ -59,6 +59,16 @@ def test_edits_that_change_the_code(project, edit):
     assert before == project(**START)
 
 
+def test_assets_count_with_the_module_that_reads_them_and_with_no_other(project, tmp_path):
+    reader = START | {"lib__b": "from importlib import resources\ndef g():\n    return 1\n"}
+    others, readers = project(**START), project(**reader)
+    (tmp_path / "lib/assets").mkdir()
+    for text in ("body {}", "p {}"):
+        (tmp_path / "lib/assets/page.css").write_text(text)
+        assert project(**START) == others
+        assert readers != (readers := project(**reader))
+
+
 def test_an_upgraded_package_changes_what_imports_it_and_nothing_else(project, monkeypatch):
     versions = {"numpy": "2.0", "opencv-python-headless": "5.0", "torch": "2.0+cpu", "scipy": "1.0"}
     monkeypatch.setattr("importlib.metadata.version", versions.__getitem__)

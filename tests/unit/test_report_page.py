@@ -10,9 +10,8 @@ from support.browser import chromium, click, touch
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.report.figures import VIEW_POINTS
-from scenefuse.report.view.view_file import View, write_view
-from scenefuse.report.view.view_points import merge, thin
-from scenefuse.report.view.view_scene import VIEW_POINTS as SCENE_POINTS
+from scenefuse.report.view import View, merge, thin, write_view
+from scenefuse.report.view_scene import VIEW_POINTS as SCENE_POINTS
 from scenefuse.report.write_report import write_report
 
 SECTION = "[aria-label='3D view of house']"

@@ -8,8 +8,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import StageError
-from scenefuse.report.view.view_file import View, encode, read_view, write_view
-from scenefuse.report.view.view_points import AFTER, BEFORE, BOTH, REMOVED, UNKNOWN, merge, thin, within
+from scenefuse.report.view import REMOVED, UNKNOWN, Shown, View, encode, merge, read_view, thin, within, write_view
 
 
 def square(count, seed=0, height=0.0, color=(90, 160, 70), **fields):
@@ -39,10 +38,10 @@ def test_points_are_told_apart_by_where_they_are_shown():
     before, added = square(100), square(30, 1, 0.5)
     view = merge(before, completed(before, np.arange(100) < 80, added))
     shown, source = view.fields["shown"], view.fields["source"]
-    assert [int((shown == code).sum()) for code in (BOTH, BEFORE, AFTER)] == [80, 20, 30]
-    assert (source[shown == BEFORE] == REMOVED).all()
-    assert (source[shown == BOTH] == 0).all() and (source[shown == AFTER] == 1).all()
-    np.testing.assert_array_equal(view.points[shown == BEFORE], before.points[80:])
+    assert [int((shown == code).sum()) for code in (Shown.BOTH, Shown.BEFORE, Shown.AFTER)] == [80, 20, 30]
+    assert (source[shown == Shown.BEFORE] == REMOVED).all()
+    assert (source[shown == Shown.BOTH] == 0).all() and (source[shown == Shown.AFTER] == 1).all()
+    np.testing.assert_array_equal(view.points[shown == Shown.BEFORE], before.points[80:])
 
 
 def test_a_recoloured_point_shows_both_its_colours_and_was_not_removed():
@@ -51,8 +50,8 @@ def test_a_recoloured_point_shows_both_its_colours_and_was_not_removed():
     after.colors[:10] = 7
     view = merge(before, after)
     shown = view.fields["shown"]
-    assert [int((shown == code).sum()) for code in (BOTH, BEFORE, AFTER)] == [40, 10, 10]
-    assert (view.colors[shown == AFTER] == 7).all() and (view.colors[shown == BEFORE] != 7).all()
+    assert [int((shown == code).sum()) for code in (Shown.BOTH, Shown.BEFORE, Shown.AFTER)] == [40, 10, 10]
+    assert (view.colors[shown == Shown.AFTER] == 7).all() and (view.colors[shown == Shown.BEFORE] != 7).all()
     assert (view.fields["source"] == 0).all()
 
 
@@ -66,7 +65,7 @@ def test_fields_of_the_completed_cloud_are_kept_and_unknown_where_only_the_scene
         {"evidence": np.ones(30, dtype=np.uint8), "deviation": np.full(30, 0.02, dtype=np.float32)},
     )
     view = merge(before, after)
-    gone = view.fields["shown"] == BEFORE
+    gone = view.fields["shown"] == Shown.BEFORE
     assert gone.sum() == 10
     assert (view.fields["evidence"][gone] == UNKNOWN).all() and (view.fields["evidence"][~gone] == 1).all()
     assert np.isnan(view.fields["deviation"][gone]).all()
@@ -76,7 +75,7 @@ def test_fields_of_the_completed_cloud_are_kept_and_unknown_where_only_the_scene
 def test_points_that_moved_by_rounding_alone_are_the_same():
     before = square(200)
     after = Cloud(before.points + 1e-14, before.normals, before.colors)
-    assert (merge(before, after).fields["shown"] == BOTH).all()
+    assert (merge(before, after).fields["shown"] == Shown.BOTH).all()
 
 
 def test_thinning_a_million_points_keeps_the_budget_and_the_even_spacing():
@@ -84,7 +83,7 @@ def test_thinning_a_million_points_keeps_the_budget_and_the_even_spacing():
     view = merge(before, completed(before, np.arange(700_000) >= 100_000, added))
     thinned = thin(view, 60_000)
     assert 50_000 < len(thinned) <= 60_000
-    for code in (BOTH, BEFORE, AFTER):
+    for code in (Shown.BOTH, Shown.BEFORE, Shown.AFTER):
         part = thinned.points[thinned.fields["shown"] == code]
         assert len(part) > 5000, code
         # Every point is a measured one, and no two are much closer than the rest.
@@ -182,5 +181,5 @@ def test_a_written_view_is_read_as_it_was(tmp_path):
 def test_a_damaged_view_is_named(tmp_path):
     write_view(tmp_path, view_of(merge(square(30), square(30, 2))))
     (tmp_path / "view.json").write_text("{}")
-    with pytest.raises(StageError, match=r"view.json lacks 'sources'; delete it"):
+    with pytest.raises(StageError, match=r"view.json is damaged .*'sources'.*; delete it"):
         read_view(tmp_path)

@@ -14,11 +14,10 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.photos.maps import write_depth
 from scenefuse.photos.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, draw_scene
+from scenefuse.report.page import view_section
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
-from scenefuse.report.view.view_file import read_view
-from scenefuse.report.view.view_page import view_section
-from scenefuse.report.view.view_points import AFTER, BOTH
-from scenefuse.report.view.view_scene import view_scene
+from scenefuse.report.view import Shown, read_view
+from scenefuse.report.view_scene import view_scene
 
 GREEN, RED, BLUE = (0, 200, 0), (220, 0, 0), (0, 0, 220)
 
@@ -291,10 +290,10 @@ def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path
     draw(capture, fine, tmp_path / "figures")
     view = read_view(tmp_path / "figures")
     shown, source = view.cloud.fields["shown"], view.cloud.fields["source"]
-    assert set(shown) == {BOTH, AFTER}
-    np.testing.assert_array_equal(source == 1, shown == AFTER)
-    assert (view.cloud.points[shown == AFTER][:, 2] <= 0.5 + 1e-9).all()
-    assert view.after_points - view.before_points == (shown == AFTER).sum()
+    assert set(shown) == {Shown.BOTH, Shown.AFTER}
+    np.testing.assert_array_equal(source == 1, shown == Shown.AFTER)
+    assert (view.cloud.points[shown == Shown.AFTER][:, 2] <= 0.5 + 1e-9).all()
+    assert view.after_points - view.before_points == (shown == Shown.AFTER).sum()
     assert (view.unit, view.sources[1]) == ("m", "added from box")
     np.testing.assert_allclose([view.low, view.high], [[-1, -0.5, 0], [1, 0.5, 1]], atol=0.05)
 
@@ -331,7 +330,7 @@ def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(ca
 
 
 def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_object(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenefuse.report.view.view_scene.MOST_READ", 2000)
+    monkeypatch.setattr("scenefuse.report.view_scene.MOST_READ", 2000)
     scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
     about = {"sources": quantity({"0": "scene", "1": "box"}, ""), "scene_points": quantity(len(scene), "points")}
     write_json(tmp_path / "completed.json", about)
@@ -341,9 +340,11 @@ def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_
     view = read_view(tmp_path / "view")
     shown, source = view.cloud.fields["shown"], view.cloud.fields["source"]
     # The same points of the scene before and after, so that none seems to come or go.
-    assert (source == 1).sum() == (shown == AFTER).sum() == len(fused) - len(scene)
+    assert (source == 1).sum() == (shown == Shown.AFTER).sum() == len(fused) - len(scene)
     every = -(-len(scene) // 2000)
-    assert set(shown) == {BOTH, AFTER} and (shown == BOTH).sum() == pytest.approx(len(scene) / every, rel=0.1)
+    assert set(shown) == {Shown.BOTH, Shown.AFTER} and (shown == Shown.BOTH).sum() == pytest.approx(
+        len(scene) / every, rel=0.1
+    )
     assert (view.before_points, view.after_points) == (len(scene), len(fused))
 
 

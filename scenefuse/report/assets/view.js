@@ -1,49 +1,3 @@
-"""Style and script of the 3D views of the report page. K3D-jupyter's own front end draws; this feeds and steers it.
-
-K3D draws every point as a disc of a size in the scene's unit, with the depth of a ball, so that neighbours share the
-pixels between them. Picking follows the same rule, here, because K3D's own would fetch a worker from a server.
-"""
-
-VIEW_STYLE = """
-.view { border: 1px solid var(--line); border-radius: 6px; margin: 14px 0 22px; overflow: hidden; background: #fff; }
-.view-stage { position: relative; isolation: isolate; height: clamp(300px, 62vh, 640px); background: #f7f8f9;
-  border-bottom: 1px solid var(--line); cursor: grab; }
-.view-stage:active { cursor: grabbing; } .view-stage.measuring { cursor: crosshair; }
-.view-stage:focus-visible { outline: 3px solid var(--accent); outline-offset: -3px; }
-.view-canvas { position: absolute; z-index: 0; inset: 0; touch-action: none; }
-.view-stage svg.marks { position: absolute; z-index: 1; inset: 0; width: 100%; height: 100%; pointer-events: none; }
-.marks line { stroke: #fff; stroke-width: 5; } .marks line + line { stroke: var(--ink); stroke-width: 2; }
-.marks circle { fill: var(--accent); stroke: #fff; stroke-width: 2; }
-.marks text { font: 600 14px system-ui, sans-serif; fill: var(--ink); stroke: #fff; stroke-width: 4;
-  paint-order: stroke; text-anchor: middle; }
-.view-note { margin: 0; padding: 6px 10px 0; max-width: none; font-size: 12.5px; }
-.view[data-state=failed] > :not(.view-note) { display: none; }
-.view[data-state=failed] .view-note { padding: 10px; font-size: 15px; }
-.view-tools { display: flex; flex-wrap: wrap; gap: 8px 16px; align-items: center; padding: 8px 10px;
-  border-bottom: 1px solid var(--line); }
-.view-tools fieldset:not([hidden]) { display: flex; flex-wrap: wrap; border: 0; margin: 0; padding: 0;
-  align-items: center; }
-.view-tools legend { float: left; padding: 0 8px 0 0; color: var(--soft); font-size: 13px; }
-.view-tools label span, .view-tools button { display: inline-block; min-height: 34px; padding: 5px 12px;
-  border: 1px solid #c3cad1; background: #fff; font: inherit; font-size: 13.5px; color: var(--ink); cursor: pointer; }
-.view-tools label span { margin-left: -1px; } .view-tools button { border-radius: 6px; }
-.view-tools label:first-of-type span { border-radius: 6px 0 0 6px; margin-left: 0; }
-.view-tools label:last-of-type span { border-radius: 0 6px 6px 0; }
-.view-tools input { position: absolute; opacity: 0; width: 1px; height: 1px; }
-.view-tools input:checked + span, .view-tools button[aria-pressed=true] { background: var(--ink); color: #fff;
-  border-color: var(--ink); }
-.view-tools input:focus-visible + span, .view-tools button:focus-visible { outline: 3px solid var(--accent);
-  outline-offset: 1px; position: relative; z-index: 1; }
-.view-legend { display: flex; flex-wrap: wrap; gap: 4px 16px; align-items: center; padding: 2px 10px 6px;
-  min-height: 34px; font-size: 13px; color: var(--soft); }
-.view-legend i { display: inline-block; width: 12px; height: 12px; border-radius: 50%; margin-right: 6px;
-  vertical-align: -1px; border: 1px solid #0003; }
-.view-legend .ramp { width: 140px; height: 12px; border-radius: 6px; margin: 0 6px; }
-.view-legend .count { margin-left: auto; } .view:fullscreen { display: flex; flex-direction: column; }
-.view:fullscreen .view-stage { flex: 1; height: auto; }
-@media print { .view { display: none; } }
-"""
-VIEW_SCRIPT = """
 const inflate = async (text) => {
   const packed = atob(text), bytes = new Uint8Array(packed.length);
   for (let i = 0; i < bytes.length; i++) bytes[i] = packed.charCodeAt(i);
@@ -403,4 +357,3 @@ const near = new IntersectionObserver((entries) => {
   for (const entry of entries) if (entry.isIntersecting) views.get(entry.target).start();
 }, { rootMargin: "300px" });
 views.forEach((_view, section) => near.observe(section));
-"""

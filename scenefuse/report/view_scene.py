@@ -10,8 +10,7 @@ from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.report.view.view_file import View, write_view
-from scenefuse.report.view.view_points import REMOVED, merge, thin, within
+from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
 
 VIEW_POINTS = 250_000
 """Of a scene's view; see the note at that of an object."""

@@ -1,1 +1,0 @@
-"""The interactive view: what its page shows, and how it is drawn."""
