@@ -17,8 +17,6 @@ from scenefuse.core.stage import setting
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.demo.bodies import Kind
 from scenefuse.demo.capture import FlightSettings, OrbitSettings
-from scenefuse.demo.clicks import ClickSettings
-from scenefuse.demo.prompts import PromptSettings
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings
@@ -122,9 +120,6 @@ SECTIONS: dict[str, list[Any]] = {
     "demo": [DemoSettings()],
     "demo.flight": [FlightSettings()],
     "demo.orbit": [OrbitSettings()],
-    "demo.fiducials": [ClickSettings(least_miss_px=0, most_miss_px=2)],
-    "demo.prompts": [ClickSettings(photos=4, separation_deg=25)],
-    "demo.clicks": [PromptSettings(inside=3, box=True)],
     "scene": [ChunkSettings()],
     "scene.features": [FeatureSettings()],
     "scene.matches": [MatchSettings()],

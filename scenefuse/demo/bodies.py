@@ -1,6 +1,7 @@
 """The demo's camera bodies, and what each makes of the light that reaches it: blur, vignetting, exposure, noise, tone.
 
-Lens distortion and principal point are geometry: the renderer casts its rays through them (`scenefuse.demo.cameras`).
+Lens distortion and principal point are geometry: the renderer casts its rays through them
+(`scenefuse.metrics.true_cameras`).
 All that is done here happens in linear light, before the tone curve and the rounding to 8 bits.
 """
 
@@ -14,13 +15,13 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
 from scenefuse.demo import textures
-from scenefuse.demo.cameras import Cameras
+from scenefuse.metrics.true_cameras import Cameras
 
 Kind = Literal["real", "ideal"]
-# Defocus of a blurred photo, the standard deviation of a Gaussian in pixels: from, to.
+# Range of the defocus of a blurred photo, the standard deviation of a Gaussian.
 DEFOCUS_PX = (0.3, 0.8)
-# Longest path of a blurred photo during its exposure, pixels.
-MOTION_PX = 2.5
+# Longest path of a blurred photo during its exposure.
+MAX_MOTION_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,7 @@ def draw_exposure(body: Body, rng: np.random.Generator) -> Exposure:
     """One photo's exposure, white balance and blur."""
     spread = body.exposure_sd * rng.normal() + body.balance_sd * rng.normal(size=3) * [1, 0, 1]
     blurred, angle = rng.random() < body.blurred, rng.uniform(0, np.pi)
-    defocus, path = rng.uniform(*DEFOCUS_PX), rng.uniform(0, MOTION_PX) * np.array([np.cos(angle), np.sin(angle)])
+    defocus, path = rng.uniform(*DEFOCUS_PX), rng.uniform(0, MAX_MOTION_PX) * np.array([np.cos(angle), np.sin(angle)])
     return Exposure(np.array(body.gains) * np.exp(spread), defocus * blurred, path * blurred)
 
 

@@ -15,8 +15,8 @@ from scenefuse.core.stage import StageError, atomic_directory, quantity, setting
 from scenefuse.core.transforms import look_at
 from scenefuse.demo import bodies, textures
 from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
-from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
+from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ class FlightSettings:
     """Rows of a photo."""
     focal_px: float = setting(700, unit="px", least=0)
     """Focal length."""
-    supersampling: int = setting(2, least=0)
+    supersampling: int = 2
     """Samples along each side of a pixel."""
-    gps_noise_horizontal: float = setting(0.5, unit="m", least=0)
-    """Standard deviation of the EXIF position, east and north."""
-    gps_noise_vertical: float = setting(1.0, unit="m", least=0)
-    """Standard deviation of the EXIF height."""
+    gps_noise_horizontal: float = 0.5
+    """Standard deviation of the EXIF position, east and north, metres."""
+    gps_noise_vertical: float = 1.0
+    """Standard deviation of the EXIF height, metres."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class OrbitSettings:
     """Number of photos, shared out among the rings."""
     elevations_deg: tuple[float, ...] = setting((5, 34), unit="deg")
     """One ring of photos for each: how high the camera stands above the object's middle."""
-    fill: float = setting(0.65, least=0)
+    fill: float = 0.65
     """Share of the photo's height that the object fills."""
     width_px: int = setting(640, unit="px", least=0)
     """Columns of a photo."""
@@ -61,7 +61,7 @@ class OrbitSettings:
     """Rows of a photo."""
     focal_px: float = setting(560, unit="px", least=0)
     """Focal length."""
-    supersampling: int = setting(2, least=0)
+    supersampling: int = 2
     """Samples along each side of a pixel."""
 
 
@@ -225,7 +225,7 @@ def _distance(settings: OrbitSettings, tall: float, wide: float, elevation: floa
 
 def _check(count: int, width: int, height: int) -> None:
     if count <= 0:
-        raise StageError("the demo is asked for 0 photos; set at least one photo in its settings")
+        raise StageError("a capture without photos; set at least one photo in the demo's settings")
     if width < 16 or height < 16:
         raise StageError(f"the demo's photos would be {width} x {height} pixels; use at least 16 x 16")
 

@@ -1,30 +1,51 @@
-"""Points clicked in photos of the demo, as a person would: corners and tips that are visible, some pixels off."""
+"""Clicks in photos of the demo, as a person would make them, some pixels off.
+
+Landmarks, corners and tips that are visible, in several photos; or spots spread over an object, in one photo.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from scenefuse.core.stage import StageError, atomic_file, setting
-from scenefuse.demo.cameras import read_cameras, visible
+from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.demo.world import build_world
+from scenefuse.metrics.true_cameras import read_cameras, visible
+from scenefuse.photos.pictures import read_mask
 
-# A point counts as hidden when something lies this far before it, in metres.
+# A point counts as hidden when something lies this far before it.
 HIDDEN_M = 0.06
+# Nobody aims at the last pixel of a part: spots are this deep inside, as a share of the deepest one's depth.
+MIN_DEPTH_SHARE = 0.2
 
 
 @dataclass(frozen=True)
 class ClickSettings:
     """Points clicked in several photos."""
 
-    photos: int = setting(6, least=0)
+    photos: int = 6
     """Photos used at most."""
-    separation_deg: float = setting(12, unit="deg", least=0)
+    separation_deg: float = 12.0
     """Smallest angle at the object between the views of two photos used."""
-    least_miss_px: float = setting(3, unit="px", least=0)
+    least_miss_px: float = 3.0
     """How far a click is off the point that it was meant for, at least."""
-    most_miss_px: float = setting(10, unit="px", least=0)
+    most_miss_px: float = 10.0
+    """The same, at most."""
+
+
+@dataclass(frozen=True)
+class PromptSettings:
+    """Clicks on an object in one of its photos."""
+
+    inside: int = 3
+    """Clicks inside the object."""
+    box: bool = True
+    """Whether two more are the corners of a box around it."""
+    least_miss_px: float = 3.0
+    """How far a click is off the spot that it was meant for, at least."""
+    most_miss_px: float = 10.0
     """The same, at most."""
 
 
@@ -66,6 +87,57 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
     with atomic_file(clicks) as temporary:
         temporary.write_text("\n".join(lines) + "\n")
     print(f"{name}: {len(names)} points in {len(used)} photos", flush=True)
+
+
+def click_object(*, truth: Path, clicks: Path, settings: PromptSettings, seed: int) -> None:
+    """Click an object of the demo in the photo that shows most of it: a table of labels (label, photo, x_px, y_px).
+
+    Args:
+        truth: the object's truth folder, with masks/{photo without suffix}.png.
+        clicks: output table, .tsv.
+        settings: how it is clicked.
+        seed: of the misses.
+
+    Raises:
+        StageError: no mask shows the object.
+    """
+    files = sorted((truth / "masks").glob("*.png"))
+    masks = {file.stem: read_mask(file) for file in files}
+    if not any(mask.any() for mask in masks.values()):
+        raise StageError(f"no mask in {truth}/masks shows the object; render the capture again")
+    photo = max(masks, key=lambda name: np.count_nonzero(masks[name]))
+    labels, pixels = clicks_on(masks[photo], settings, np.random.default_rng([seed, 4]))
+    rows = [f"{label}\t{photo}.jpg\t{x:.1f}\t{y:.1f}" for label, (x, y) in zip(labels, pixels)]
+    lines = ["label\tphoto\tx_px\ty_px", *rows]
+    with atomic_file(clicks) as temporary:
+        temporary.write_text("\n".join(lines) + "\n")
+    print(f"{len(pixels)} clicks in {photo}.jpg", flush=True)
+
+
+def clicks_on(
+    mask: NDArray[np.bool_], settings: PromptSettings, rng: np.random.Generator
+) -> tuple[list[str], NDArray[np.float64]]:
+    """Labels and pixels (N, 2) of clicks on a mask (H, W): spots far apart, each off by a miss in a random direction.
+
+    Args:
+        mask: what the photo shows of the object, not empty.
+        settings: how it is clicked.
+        rng: of the first spot and of the misses.
+    """
+    depth = ndimage.distance_transform_edt(np.pad(mask, 1))[1:-1, 1:-1]
+    aimed = np.argwhere(depth > MIN_DEPTH_SHARE * depth.max())[:, ::-1] + 0.5
+    spots = [aimed[rng.integers(len(aimed))]]
+    gaps = np.full(len(aimed), np.inf)
+    while len(spots) < settings.inside:
+        gaps = np.minimum(gaps, np.linalg.norm(aimed - spots[-1], axis=1))
+        spots.append(aimed[gaps.argmax()])
+    labels = ["inside"] * len(spots)
+    if settings.box:
+        rows, columns = np.nonzero(mask)
+        spots += [np.array([columns.min(), rows.min()]), np.array([columns.max(), rows.max()]) + 1.0]
+        labels += ["box"] * 2
+    found = np.array(spots) + random_misses(len(spots), settings.least_miss_px, settings.most_miss_px, rng)
+    return labels, np.clip(found, 1.0, np.array(mask.shape[::-1]) - 1.0)
 
 
 def random_misses(count: int, least: float, most: float, seed: int | np.random.Generator) -> NDArray[np.float64]:

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scenefuse.demo import textures as t
 from scenefuse.demo.meshes import Part, blob, box, grid, hexahedron, join, lathe, rotation, sheet, tube
+from scenefuse.demo.textures import Material
 
 
 @dataclass(frozen=True)
@@ -29,13 +29,13 @@ def house() -> Model:
     """A house of 10 x 7 m: gable roof with overhang, chimney, dormer, porch, a stack of logs."""
     ridge, rise = 6.6, 0.93
     parts = [
-        box((-5.08, -3.58, -0.6), (5.08, 3.58, 0.55), t.STONE),
-        box((-5, -3.5, 0.5), (5, 3.5, 1.95), t.BRICK),
-        box((-5, -3.5, 1.95), (5, 3.5, 3.4), t.PLASTER),
+        box((-5.08, -3.58, -0.6), (5.08, 3.58, 0.55), Material.STONE),
+        box((-5, -3.5, 0.5), (5, 3.5, 1.95), Material.BRICK),
+        box((-5, -3.5, 1.95), (5, 3.5, 3.4), Material.PLASTER),
         hexahedron(
             np.array([[-5, -3.5, 3.3], [5, -3.5, 3.3], [5, 3.5, 3.3], [-5, 3.5, 3.3]]),
             np.array([[-5, -0.02, 6.5], [5, -0.02, 6.5], [5, 0.02, 6.5], [-5, 0.02, 6.5]]),
-            t.PLASTER,
+            Material.PLASTER,
         ),
     ]
     for side in (-1, 1):
@@ -44,11 +44,11 @@ def house() -> Model:
             [[-5.6, y0, ridge - rise * 4.15], [5.6, y0, ridge - rise * 4.15], [5.6, 0, ridge], [-5.6, 0, ridge]]
         )
         low = low if side < 0 else low[[1, 0, 3, 2]]
-        parts.append(hexahedron(low, low + [0, 0, 0.2], t.TILES))
+        parts.append(hexahedron(low, low + [0, 0, 0.2], Material.TILES))
     parts += [
-        box((1.9, 0.8, 4.5), (2.9, 1.7, 7.7), t.BRICK),
-        box((1.8, 0.7, 7.7), (3.0, 1.8, 7.88), t.STONE),
-        box((-3.3, -3.0, 4.0), (-1.3, -0.6, 5.55), t.PLASTER),
+        box((1.9, 0.8, 4.5), (2.9, 1.7, 7.7), Material.BRICK),
+        box((1.8, 0.7, 7.7), (3.0, 1.8, 7.88), Material.STONE),
+        box((-3.3, -3.0, 4.0), (-1.3, -0.6, 5.55), Material.PLASTER),
         _dormer_roof(),
         *_window(-2.3, -3.02, 4.35, 1.1, 0.95, 0),
         *_porch(),
@@ -59,9 +59,9 @@ def house() -> Model:
         *_window(1.6, 5.02, 1.2, 1.0, 1.3, 1),
         *_window(0.0, 5.02, 4.1, 1.2, 1.2, 1),
         *_window(0.0, -5.02, 4.1, 1.0, 1.0, 1),
-        box((-5.06, -1.9, 0.4), (-4.96, -0.9, 2.5), t.WOOD),
-        box((-5.75, 0.5, -0.3), (-5.0, 3.1, 1.55), t.LOGS),
-        tube((4.4, 3.95, -0.3), (4.4, 3.95, 1.15), 0.42, t.WOOD, 18),
+        box((-5.06, -1.9, 0.4), (-4.96, -0.9, 2.5), Material.WOOD),
+        box((-5.75, 0.5, -0.3), (-5.0, 3.1, 1.55), Material.LOGS),
+        tube((4.4, 3.95, -0.3), (4.4, 3.95, 1.15), 0.42, Material.WOOD, 18),
     ]
     return Model(parts, (-21.0, 9.0, 21.0), _house_landmarks(ridge, ridge - rise * 4.15 + 0.2), 8.0)
 
@@ -95,23 +95,23 @@ def balloon() -> Model:
     down = np.array([np.cos(tangent), -np.sin(tangent)])
     length = (top[-1, 0] - 0.95) / -down[0]
     cone = top[-1] + np.linspace(0, length, 22)[1:, None] * down
-    envelope = lathe(np.concatenate([top, cone])[::-1], 160, t.FABRIC)
+    envelope = lathe(np.concatenate([top, cone])[::-1], 160, Material.FABRIC)
     x, y, z = envelope.vertices.T
     bulge = 1.0 + 0.022 * (np.abs(np.sin(8 * np.arctan2(y, x))) - 1.0)
-    envelope = Part(np.stack([x * bulge, y * bulge, z], axis=1), envelope.triangles, t.FABRIC)
+    envelope = Part(np.stack([x * bulge, y * bulge, z], axis=1), envelope.triangles, Material.FABRIC)
     mouth = cone[-1]
     parts = [envelope]
     for sx, sy in ((1, 1), (-1, 1), (-1, -1), (1, -1)):
-        parts.append(tube((0.7 * sx, 0.7 * sy, 1.1), (0.66 * sx, 0.66 * sy, mouth[1] + 0.03), 0.05, t.ROPE))
-        parts.append(blob((0.2, 0.2, 0.28), 0.15, 2, 5, t.ROPE).moved((0.55 * sx, 0.97 * sy, 0.55)))
+        parts.append(tube((0.7 * sx, 0.7 * sy, 1.1), (0.66 * sx, 0.66 * sy, mouth[1] + 0.03), 0.05, Material.ROPE))
+        parts.append(blob((0.2, 0.2, 0.28), 0.15, 2, 5, Material.ROPE).moved((0.55 * sx, 0.97 * sy, 0.55)))
     parts += [
-        box((-0.8, -0.8, -0.3), (0.8, 0.8, 0.2), t.WICKER),
-        box((-0.8, -0.8, 0.2), (0.8, -0.7, 1.15), t.WICKER),
-        box((-0.8, 0.7, 0.2), (0.8, 0.8, 1.15), t.WICKER),
-        box((-0.8, -0.7, 0.2), (-0.7, 0.7, 1.15), t.WICKER),
-        box((0.7, -0.7, 0.2), (0.8, 0.7, 1.15), t.WICKER),
-        box((-0.45, -0.12, mouth[1] - 0.35), (0.45, 0.12, mouth[1] - 0.15), t.TRIM),
-        tube((-0.66, -0.66, mouth[1] - 0.25), (0.66, 0.66, mouth[1] - 0.25), 0.05, t.ROPE),
+        box((-0.8, -0.8, -0.3), (0.8, 0.8, 0.2), Material.WICKER),
+        box((-0.8, -0.8, 0.2), (0.8, -0.7, 1.15), Material.WICKER),
+        box((-0.8, 0.7, 0.2), (0.8, 0.8, 1.15), Material.WICKER),
+        box((-0.8, -0.7, 0.2), (-0.7, 0.7, 1.15), Material.WICKER),
+        box((0.7, -0.7, 0.2), (0.8, 0.7, 1.15), Material.WICKER),
+        box((-0.45, -0.12, mouth[1] - 0.35), (0.45, 0.12, mouth[1] - 0.15), Material.TRIM),
+        tube((-0.66, -0.66, mouth[1] - 0.25), (0.66, 0.66, mouth[1] - 0.25), 0.05, Material.ROPE),
     ]
     landmarks = {"crown": (0.0, 0.0, centre + radius)}
     for k in range(8):
@@ -134,18 +134,18 @@ def sculpture() -> Model:
     big = 1.65 + 0.12 * np.cos(3 * angle)
     ring_points = np.stack([(big + across) * np.cos(angle), up, (big + across) * np.sin(angle)], axis=-1)
     tilt = rotation(2, 25.0) @ rotation(1, 12.0) @ rotation(0, 8.0)
-    ring = grid(ring_points, t.BRONZE).turned(tilt).moved((0.1, 0.0, 3.95))
+    ring = grid(ring_points, Material.BRONZE).turned(tilt).moved((0.1, 0.0, 3.95))
     slab_turn = rotation(2, -30.0) @ rotation(0, -17.0)
     slab_at = (-0.75, 1.05, 1.45)
-    slab = box((-0.85, -0.16, 0.0), (0.85, 0.16, 3.6), t.RUST).turned(slab_turn).moved(slab_at)
+    slab = box((-0.85, -0.16, 0.0), (0.85, 0.16, 3.6), Material.RUST).turned(slab_turn).moved(slab_at)
     parts = [
-        box((-1.9, -1.9, -0.5), (1.9, 1.9, 0.45), t.STONE),
-        box((-1.4, -1.4, 0.45), (1.4, 1.4, 1.75), t.STONE),
+        box((-1.9, -1.9, -0.5), (1.9, 1.9, 0.45), Material.STONE),
+        box((-1.4, -1.4, 0.45), (1.4, 1.4, 1.75), Material.STONE),
         ring,
-        blob((0.62, 0.62, 0.62), 0.0, 4, 1, t.TERRAZZO).moved((0.95, -0.95, 2.33)),
+        blob((0.62, 0.62, 0.62), 0.0, 4, 1, Material.TERRAZZO).moved((0.95, -0.95, 2.33)),
         slab,
-        tube((1.9, 0.2, -0.2), (1.25, 0.35, 3.2), 0.14, t.RUST, 16),
-        blob((0.5, 0.45, 0.35), 0.25, 4, 3, t.ROCK).moved((-1.55, -1.5, 0.6)),
+        tube((1.9, 0.2, -0.2), (1.25, 0.35, 3.2), 0.14, Material.RUST, 16),
+        blob((0.5, 0.45, 0.35), 0.25, 4, 3, Material.ROCK).moved((-1.55, -1.5, 0.6)),
     ]
     ring_top = ring.vertices[ring.vertices[:, 2].argmax()]
     corner = slab_turn @ np.array([-0.85, 0.16, 3.6]) + slab_at
@@ -171,7 +171,7 @@ def _window(centre: float, plane: float, sill: float, width: float, height: floa
     """Frame and glass on a wall y = plane (axis 0) or x = plane (axis 1), a few centimetres proud."""
     sign = np.sign(plane)
     parts = []
-    for material, grow, depth in ((t.TRIM, 0.1, 0.05), (t.GLASS, 0.0, 0.07)):
+    for material, grow, depth in ((Material.TRIM, 0.1, 0.05), (Material.GLASS, 0.0, 0.07)):
         near, far = sorted((plane - 0.1 * sign, plane + depth * sign))
         a, b = centre - width / 2 - grow, centre + width / 2 + grow
         z0, z1 = sill - grow, sill + height + grow
@@ -183,21 +183,21 @@ def _window(centre: float, plane: float, sill: float, width: float, height: floa
 def _dormer_roof() -> Part:
     """A lean-to roof over the dormer."""
     low = np.array([[-3.6, -3.35, 5.4], [-1.0, -3.35, 5.4], [-1.0, -0.3, 6.15], [-3.6, -0.3, 6.15]])
-    return hexahedron(low, low + [0, 0, 0.16], t.TILES)
+    return hexahedron(low, low + [0, 0, 0.16], Material.TILES)
 
 
 def _porch() -> list[Part]:
     """Steps, two posts, a small roof and the door."""
     low = np.array([[0.6, -5.5, 2.5], [4.6, -5.5, 2.5], [4.6, -3.4, 3.0], [0.6, -3.4, 3.0]])
     return [
-        box((0.9, -5.35, -0.5), (4.3, -3.5, 0.45), t.WOOD),
-        box((1.7, -5.75, -0.5), (3.4, -5.35, 0.22), t.STONE),
-        box((1.0, -5.25, 0.45), (1.18, -5.07, 2.65), t.TRIM),
-        box((4.02, -5.25, 0.45), (4.2, -5.07, 2.65), t.TRIM),
-        box((1.0, -5.2, 1.15), (1.9, -5.1, 1.25), t.TRIM),
-        box((3.3, -5.2, 1.15), (4.2, -5.1, 1.25), t.TRIM),
-        hexahedron(low, low + [0, 0, 0.14], t.TILES),
-        box((2.05, -3.56, 0.45), (3.05, -3.4, 2.5), t.WOOD),
-        sheet((1.9, -3.53, 0.45), (3.2, -3.53, 0.45), (3.2, -3.53, 2.65), (1.9, -3.53, 2.65), t.TRIM),
-        join([box((3.75, -3.9, 0.45), (4.25, -3.55, 0.95), t.HAY)]),
+        box((0.9, -5.35, -0.5), (4.3, -3.5, 0.45), Material.WOOD),
+        box((1.7, -5.75, -0.5), (3.4, -5.35, 0.22), Material.STONE),
+        box((1.0, -5.25, 0.45), (1.18, -5.07, 2.65), Material.TRIM),
+        box((4.02, -5.25, 0.45), (4.2, -5.07, 2.65), Material.TRIM),
+        box((1.0, -5.2, 1.15), (1.9, -5.1, 1.25), Material.TRIM),
+        box((3.3, -5.2, 1.15), (4.2, -5.1, 1.25), Material.TRIM),
+        hexahedron(low, low + [0, 0, 0.14], Material.TILES),
+        box((2.05, -3.56, 0.45), (3.05, -3.4, 2.5), Material.WOOD),
+        sheet((1.9, -3.53, 0.45), (3.2, -3.53, 0.45), (3.2, -3.53, 2.65), (1.9, -3.53, 2.65), Material.TRIM),
+        join([box((3.75, -3.9, 0.45), (4.25, -3.55, 0.95), Material.HAY)]),
     ]

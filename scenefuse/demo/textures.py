@@ -5,39 +5,29 @@ value noise in octaves; an octave fades out where its wavelength nears the pixel
 a pixel do as well, and leaves detail at every distance.
 """
 
+from enum import IntEnum
+
 import numba
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-TERRAIN, BRICK, PLASTER, TILES, WOOD, GLASS, TRIM, FABRIC, WICKER, ROPE = range(10)
-BRONZE, TERRAZZO, RUST, STONE, LEAVES, BARK, ROCK, BUSH, HAY, LOGS = range(10, 20)
 
-# Colours of the balloon's gores, in a sequence that no rotation maps onto itself.
+class Material(IntEnum):
+    """What a triangle is made of; its number seeds its noise."""
+
+    TERRAIN, BRICK, PLASTER, TILES, WOOD, GLASS, TRIM, FABRIC, WICKER, ROPE = range(10)
+    BRONZE, TERRAZZO, RUST, STONE, LEAVES, BARK, ROCK, BUSH, HAY, LOGS = range(10, 20)
+
+
+# Colours of the balloon's fabrics, and which of them its gores have, in a sequence that no rotation maps onto itself.
+_FABRICS = np.array([
+    [0.6, 0.55, 0.44], [0.62, 0.06, 0.05], [0.85, 0.45, 0.04],
+    [0.05, 0.18, 0.5], [0.06, 0.33, 0.18], [0.35, 0.08, 0.32],
+])  # fmt: skip
 _GORES = np.array([0, 1, 2, 0, 3, 4, 0, 1, 5, 2, 0, 4, 3, 5, 0, 2])
-_FABRICS = np.array(
-    [
-        [0.6, 0.55, 0.44],
-        [0.62, 0.06, 0.05],
-        [0.85, 0.45, 0.04],
-        [0.05, 0.18, 0.5],
-        [0.06, 0.33, 0.18],
-        [0.35, 0.08, 0.32],
-    ]
-)
-_PATH = np.array(
-    [
-        [-60.0, -30.0],
-        [-40.0, -12.0],
-        [-24.0, -3.0],
-        [-8.0, -4.0],
-        [3.0, -9.0],
-        [14.0, -4.0],
-        [24.0, 2.0],
-        [40.0, 2.0],
-        [70.0, 18.0],
-    ]
-)
+# Corners of the path's middle, x and y.
+_PATH = np.array([[-60.0, -30], [-40, -12], [-24, -3], [-8, -4], [3, -9], [14, -4], [24, 2], [40, 2], [70, 18]])
 
 
 @njit(cache=True, fastmath=True, inline="always")
@@ -185,14 +175,14 @@ def _albedo(material, x, y, z, u, v, fp):
     fine = fractal_noise(x, y, z, 0.6, 6, 1.15, fp, 200 + 10 * material)
     broad = fractal_noise(x, y, z, 3.0, 3, 0.6, fp, 205 + 10 * material)
     c = (0.5, 0.5, 0.5)
-    if material in (BRICK, STONE):
-        w, h = (0.46, 0.16) if material == BRICK else (0.85, 0.42)
-        mortar, r = _joint(u, v, w, h, 0.014 if material == BRICK else 0.02, fp, material)
-        a = (0.38, 0.13, 0.075) if material == BRICK else (0.33, 0.31, 0.27)
-        b = (0.22, 0.085, 0.06) if material == BRICK else (0.5, 0.46, 0.38)
+    if material in (Material.BRICK, Material.STONE):
+        w, h = (0.46, 0.16) if material == Material.BRICK else (0.85, 0.42)
+        mortar, r = _joint(u, v, w, h, 0.014 if material == Material.BRICK else 0.02, fp, material)
+        a = (0.38, 0.13, 0.075) if material == Material.BRICK else (0.33, 0.31, 0.27)
+        b = (0.22, 0.085, 0.06) if material == Material.BRICK else (0.5, 0.46, 0.38)
         c = _times(_mix(a, b, r), 1.0 + 0.5 * fine)
         c = _mix(c, (0.42, 0.39, 0.34), mortar * 0.85)
-    elif material == PLASTER:
+    elif material == Material.PLASTER:
         c = _mix((0.6, 0.49, 0.31), (0.48, 0.4, 0.29), 0.5 + 0.6 * broad)
         streak = fractal_noise(u * 3.0, v * 0.4, 0.0, 1.0, 5, 0.8, 3 * fp, 301)
         c = _times(c, 1.0 + 0.5 * fine + 0.16 * streak)
@@ -201,7 +191,7 @@ def _albedo(material, x, y, z, u, v, fp):
             beam = min(abs(v - 1.95), abs(v - 3.2))
         timber = _times((0.13, 0.07, 0.04), 1.0 + 0.5 * fine)
         c = _mix(timber, c, _step(0.075, 0.075 + fp, beam))
-    elif material == TILES:
+    elif material == Material.TILES:
         row = np.floor(v / 0.34)
         col = np.floor(u / 0.3 + 0.5 * (row % 2))
         r = _hash(int(col), int(row), 3, 21)
@@ -212,59 +202,59 @@ def _albedo(material, x, y, z, u, v, fp):
         c = _mix((0.42, 0.12, 0.06), (0.24, 0.085, 0.06), r)
         c = _mix(c, (0.17, 0.17, 0.09), 0.7 * _step(0.3, 0.8, broad + 0.3 * fine))
         c = _times(c, shade * (1.0 + 0.45 * fine))
-    elif material in (WOOD, TRIM):
+    elif material in (Material.WOOD, Material.TRIM):
         plank = np.floor(u / 0.22)
         r = _hash(int(plank), 3, 5, 41)
         grain = fractal_noise(u * 5.0, v * 0.5, r * 30.0, 0.7, 6, 0.85, 3 * fp, 43)
         gap = min(u - plank * 0.22, 0.22 - u + plank * 0.22)
         c = _mix((0.27, 0.15, 0.07), (0.4, 0.26, 0.14), r)
-        if material == TRIM:
+        if material == Material.TRIM:
             c = (0.62, 0.6, 0.55)
         c = _times(
             c, (1.0 + 0.4 * grain + 0.25 * fine) * (1 - 0.6 * (1 - _step(0.006, 0.012 + fp, gap)) * min(1.0, 0.05 / fp))
         )
-    elif material == GLASS:
+    elif material == Material.GLASS:
         c = _mix((0.03, 0.045, 0.07), (0.16, 0.19, 0.22), _step(-0.2, 0.6, broad + 0.6 * fine))
         bar = min(abs(u - 0.6 * np.floor(u / 0.6 + 0.5)), abs(v - 0.55 * np.floor(v / 0.55 + 0.5)))
         c = _mix((0.6, 0.58, 0.53), c, _step(0.03, 0.03 + fp, bar))
-    elif material == FABRIC:
+    elif material == Material.FABRIC:
         c = _fabric(x, y, z, fp)
-    elif material == WICKER:
+    elif material == Material.WICKER:
         weave = np.sin(u * 30.0) * np.sin(v * 30.0 + 3.14 * np.floor(u * 9.55)) * min(1.0, 0.05 / fp)
         c = _times((0.33, 0.2, 0.09), 1.0 + 0.35 * weave + 0.45 * fine)
-    elif material == ROPE:
+    elif material == Material.ROPE:
         c = _times((0.4, 0.34, 0.24), 1.0 + 0.4 * fine)
-    elif material == BRONZE:
+    elif material == Material.BRONZE:
         patina = _step(-0.15, 0.35, broad + 0.5 * fine)
         c = _mix((0.26, 0.13, 0.05), (0.14, 0.33, 0.26), patina)
         c = _times(c, 1.0 + 0.55 * fractal_noise(x, y, z, 0.35, 5, 1.1, fp, 401))
-    elif material == TERRAZZO:
+    elif material == Material.TERRAZZO:
         c = _times((0.58, 0.52, 0.44), 1.0 + 0.3 * fine)
         chip = fractal_noise(x, y, z, 0.22, 3, 0.9, fp, 411)
         c = _mix(c, (0.1, 0.13, 0.3), _step(0.3, 0.42, chip))
         c = _mix(c, (0.5, 0.1, 0.05), _step(0.3, 0.42, -chip))
-    elif material == RUST:
+    elif material == Material.RUST:
         c = _mix((0.16, 0.075, 0.045), (0.45, 0.18, 0.05), _step(-0.6, 0.6, fine + 0.5 * broad))
         plate = min(abs(u - 0.9 * np.floor(u / 0.9 + 0.5)), abs(v - 0.9 * np.floor(v / 0.9 + 0.5)))
         c = _times(c, 0.55 + 0.45 * _step(0.012, 0.012 + fp, plate))
         c = _times(c, 1.0 + 0.4 * fractal_noise(x, y, z, 0.3, 5, 0.95, fp, 421))
-    elif material in (LEAVES, BUSH):
+    elif material in (Material.LEAVES, Material.BUSH):
         leaf = fractal_noise(x, y, z, 0.55, 5, 0.95, fp, 431)
         c = _mix((0.035, 0.085, 0.02), (0.16, 0.24, 0.05), _step(-0.9, 0.9, leaf + 0.3 * broad))
-        if material == BUSH:
+        if material == Material.BUSH:
             c = _mix(c, (0.3, 0.21, 0.06), 0.45 * _step(-0.2, 0.7, broad))
         c = _times(c, 1.0 + 0.35 * fine)
-    elif material == BARK:
+    elif material == Material.BARK:
         c = _times(
             (0.17, 0.115, 0.075), 1.0 + 0.55 * fractal_noise(x * 2.5, y * 2.5, z * 0.6, 0.5, 5, 0.85, 2 * fp, 441)
         )
-    elif material == ROCK:
+    elif material == Material.ROCK:
         c = _mix((0.24, 0.23, 0.21), (0.42, 0.4, 0.36), 0.5 + 0.6 * fine)
         c = _mix(c, (0.2, 0.22, 0.09), 0.7 * _step(0.25, 0.6, broad))
-    elif material == HAY:
+    elif material == Material.HAY:
         straw = fractal_noise(x * 1.5, y * 3.0, z * 3.0, 0.5, 6, 0.9, 2 * fp, 451)
         c = _times((0.5, 0.37, 0.13), 1.0 + 0.5 * straw)
-    elif material == LOGS:
+    elif material == Material.LOGS:
         row = np.floor(v / 0.2)
         col = np.floor(u / 0.22 + 0.5 * (row % 2))
         du, dv = (u / 0.22 + 0.5 * (row % 2) - col - 0.5) * 0.22, v - (row + 0.5) * 0.2
@@ -357,7 +347,7 @@ def shade(
                 fp = d * pixel_angle / np.sqrt(max(towards, 0.15))
                 tri = triangle[n]
                 material = materials[tri]
-                if material == TERRAIN:
+                if material == Material.TERRAIN:
                     c = _terrain(px, py, pz, fp)
                 else:
                     f = frames[owners[tri]]
@@ -365,7 +355,7 @@ def shade(
                     y = f[3] * (py - f[1]) - f[4] * (px - f[0])
                     z = pz - f[2]
                     lx, ly = abs(f[3] * nx + f[4] * ny), abs(f[3] * ny - f[4] * nx)
-                    if material == TILES:
+                    if material == Material.TILES:
                         u, v = (x, z * 1.45) if lx < 0.3 else (y, z * 1.45)
                     elif abs(nz) > 0.8:
                         u, v = x, y

@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
-from scenefuse.demo import textures as t
 from scenefuse.demo.meshes import Part, blob, box, grid, rotation, tube
 from scenefuse.demo.objects import OBJECTS
-from scenefuse.demo.textures import noise_at
+from scenefuse.demo.textures import Material, noise_at, path_distance
 
 # Height of the ground at east, north.
 Height = Callable[[Array, Array], Array]
@@ -141,7 +140,7 @@ def _terrain(height: Height) -> Part:
     axis = np.concatenate([-outer[::-1], np.arange(-56.0, 56.01, 0.4), outer])
     x, y = np.meshgrid(axis, axis, indexing="ij")
     z = height(x.ravel(), y.ravel()).reshape(x.shape)
-    return grid(np.stack([x, y, z], axis=-1), t.TERRAIN)
+    return grid(np.stack([x, y, z], axis=-1), Material.TERRAIN)
 
 
 def _clutter(height: Height, centres: Array, radii: Array, rng: np.random.Generator) -> list[Part]:
@@ -156,7 +155,7 @@ def _clutter(height: Height, centres: Array, radii: Array, rng: np.random.Genera
         while len(spots) < count:
             x, y = rng.uniform(-reach, reach, 2)
             away = np.hypot(x - centres[:, 0], y - centres[:, 1])
-            if (away > margins).all() and np.hypot(x, y) > inner and t.path_distance(x, y) > 2.3:
+            if (away > margins).all() and np.hypot(x, y) > inner and path_distance(x, y) > 2.3:
                 spots.append((float(x), float(y)))
         return spots
 
@@ -166,15 +165,15 @@ def _clutter(height: Height, centres: Array, radii: Array, rng: np.random.Genera
     for x, y in free(55, 52.0, radii + 2.5):
         size = rng.uniform(0.35, 1.0)
         shape = (size * rng.uniform(0.9, 1.5), size * rng.uniform(0.9, 1.5), size)
-        bush = blob(shape, 0.3, 3, int(rng.integers(999)), t.BUSH)
+        bush = blob(shape, 0.3, 3, int(rng.integers(999)), Material.BUSH)
         parts.append(bush.turned(rotation(2, rng.uniform(0, 360))).moved((x, y, ground(x, y) + 0.35 * size)))
     for x, y in free(60, 50.0, radii + 1.0):
         size = rng.uniform(0.15, 0.6)
-        rock = blob((size * 1.3, size, 0.8 * size), 0.3, 3, int(rng.integers(999)), t.ROCK)
+        rock = blob((size * 1.3, size, 0.8 * size), 0.3, 3, int(rng.integers(999)), Material.ROCK)
         parts.append(rock.turned(rotation(2, rng.uniform(0, 360))).moved((x, y, ground(x, y) + 0.1 * size)))
     for x, y in free(9, 44.0, radii + 6.0):
         turn = rotation(2, rng.uniform(0, 360))
-        bale = tube((-0.6, 0, 0), (0.6, 0, 0), 0.62, t.HAY, 24).turned(turn)
+        bale = tube((-0.6, 0, 0), (0.6, 0, 0), 0.62, Material.HAY, 24).turned(turn)
         parts.append(bale.moved((x, y, ground(x, y) + 0.55)))
     lines: list[list[tuple[float, float]]] = [
         [(-34, -24), (-25, -18.5), (-15, -19), (-7, -26)],
@@ -191,17 +190,17 @@ def _clutter(height: Height, centres: Array, radii: Array, rng: np.random.Genera
 def _tree(x: float, y: float, z: float, rng: np.random.Generator, detail: int) -> list[Part]:
     """A trunk and a crown of a few rough ellipsoids."""
     tall = rng.uniform(3.5, 8.0)
-    parts = [tube((x, y, z - 0.3), (x, y, z + 0.6 * tall), 0.045 * tall, t.BARK, 9)]
+    parts = [tube((x, y, z - 0.3), (x, y, z + 0.6 * tall), 0.045 * tall, Material.BARK, 9)]
     if rng.random() < 0.3:
         for k in range(4):
             r = 0.24 * tall * (1 - 0.21 * k)
-            layer = blob((r, r, 0.2 * tall), 0.25, detail, int(rng.integers(999)), t.LEAVES)
+            layer = blob((r, r, 0.2 * tall), 0.25, detail, int(rng.integers(999)), Material.LEAVES)
             parts.append(layer.moved((x, y, z + tall * (0.35 + 0.2 * k))))
         return parts
     for k in range(5):
         r = tall * rng.uniform(0.15, 0.24)
         angle, away = rng.uniform(0, 2 * np.pi), 0.0 if k == 0 else tall * rng.uniform(0.1, 0.2)
-        crown = blob((r * 1.1, r, r * 0.9), 0.34, detail, int(rng.integers(999)), t.LEAVES)
+        crown = blob((r * 1.1, r, r * 0.9), 0.34, detail, int(rng.integers(999)), Material.LEAVES)
         spot = (x + away * np.cos(angle), y + away * np.sin(angle), z + tall * rng.uniform(0.6, 0.88))
         parts.append(crown.moved(spot))
     return parts
@@ -212,19 +211,19 @@ def _fence(start: Array, end: Array, ground: Callable[[float, float], float]) ->
     count = max(2, int(np.linalg.norm(end - start) / 2.2) + 1)
     spots = np.linspace(start, end, count)
     tops = [np.array([*p, ground(*p)]) for p in spots]
-    parts = [tube(p - [0, 0, 0.3], p + [0, 0, 1.15], 0.08, t.WOOD, 8) for p in tops]
+    parts = [tube(p - [0, 0, 0.3], p + [0, 0, 1.15], 0.08, Material.WOOD, 8) for p in tops]
     for a, b in zip(tops[:-1], tops[1:]):
-        parts += [tube(a + [0, 0, h], b + [0, 0, h], 0.05, t.WOOD, 6) for h in (0.5, 0.98)]
+        parts += [tube(a + [0, 0, h], b + [0, 0, h], 0.05, Material.WOOD, 6) for h in (0.5, 0.98)]
     return parts
 
 
 def _bench(x: float, y: float, z: float, yaw: float) -> list[Part]:
     """A bench of planks on two blocks."""
     pieces = [
-        box((-1.0, -0.25, 0.4), (1.0, 0.25, 0.48), t.WOOD),
-        box((-1.0, 0.22, 0.48), (1.0, 0.3, 0.95), t.WOOD),
-        box((-0.9, -0.2, -0.3), (-0.65, 0.2, 0.4), t.STONE),
-        box((0.65, -0.2, -0.3), (0.9, 0.2, 0.4), t.STONE),
+        box((-1.0, -0.25, 0.4), (1.0, 0.25, 0.48), Material.WOOD),
+        box((-1.0, 0.22, 0.48), (1.0, 0.3, 0.95), Material.WOOD),
+        box((-0.9, -0.2, -0.3), (-0.65, 0.2, 0.4), Material.STONE),
+        box((0.65, -0.2, -0.3), (0.9, 0.2, 0.4), Material.STONE),
     ]
     return [p.turned(rotation(2, yaw)).moved((x, y, z)) for p in pieces]
 

@@ -10,7 +10,6 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, sampled
 from scenefuse.cloud.tiles.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, setting, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
-from scenefuse.demo.cameras import read_cameras as read_true_cameras
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics.object_truth import (
@@ -22,7 +21,8 @@ from scenefuse.metrics.object_truth import (
     scene_scores,
     surface_to_find,
 )
-from scenefuse.metrics.thresholds import THRESHOLDS
+from scenefuse.metrics.scores import THRESHOLDS
+from scenefuse.metrics.true_cameras import read_cameras as read_true_cameras
 from scenefuse.metrics.truth import (
     camera_results,
     distances,

@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import sampled_rows
 from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, setting, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     Mesh,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scenefuse.cloud.clouds import sampled
 from scenefuse.core.stage import quantity, read_json, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.cameras import Cameras, read_cameras, visible
+from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     CameraFit,

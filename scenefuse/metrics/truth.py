@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from scenefuse.core.stage import StageError, quantity, threads
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.demo.cameras import Cameras
 from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
+from scenefuse.metrics.true_cameras import Cameras
 from scenefuse.photos.workspace import View, read_views
 
 # The posed photos of a model that the truth knows, by name, each with the place of its true camera.

@@ -17,7 +17,7 @@ from scipy import ndimage
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.prompts import PromptSettings, clicks_on, random_misses
+from scenefuse.demo.clicks import PromptSettings, clicks_on, random_misses
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.masks import prompted

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.georef.control import Control, Sighting, read_sighted, seen_at, sight
 from scenefuse.georef.control_file import ControlFile, SurveyedPoint
 from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
@@ -35,6 +34,7 @@ from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.georef.residuals import rms
 from scenefuse.marks.clicks import Click
 from scenefuse.metrics.evaluate_scene import within
+from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import HIDDEN, cast_together, read_mesh, sample_surface
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos

@@ -23,8 +23,8 @@ from scipy import ndimage
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.demo.cameras import read_cameras, visible
 from scenefuse.metrics.evaluate_scene import within
+from scenefuse.metrics.true_cameras import read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
     belongs_to_object,

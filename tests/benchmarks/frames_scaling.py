@@ -20,8 +20,8 @@ import pycolmap
 
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import quantity, run, write_json
-from scenefuse.demo.cameras import Cameras, read_cameras, visible
 from scenefuse.demo.capture import OrbitSettings, render_object
+from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import read_mesh, sample_surface
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.prior.refine_depth import refine_depth

@@ -22,9 +22,9 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import run, threads, value
 from scenefuse.core.transforms import Array, fit_sim3, look_at
 from scenefuse.demo import bodies, textures
-from scenefuse.demo.cameras import Cameras, pinhole
 from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
+from scenefuse.metrics.true_cameras import Cameras, pinhole
 from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
 from scenefuse.paper.chain import chained, trajectory_error
 from scenefuse.paper.monocular import (

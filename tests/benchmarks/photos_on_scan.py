@@ -24,10 +24,10 @@ from scenefuse.cloud.clouds import Cloud, write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array
-from scenefuse.demo.cameras import read_cameras
 from scenefuse.demo.world import ORIGIN
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.placement import GeoreferenceSettings
+from scenefuse.metrics.true_cameras import read_cameras
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import read_photos, write_photos
 

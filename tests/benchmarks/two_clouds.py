@@ -17,8 +17,8 @@ from support.marks import frame_of_its_own, marks_of
 from scenefuse.cloud.clouds import read_cloud, write_cloud, write_laz
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.demo.cameras import read_cameras
 from scenefuse.metrics.object_truth import read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.true_cameras import read_cameras
 from scenefuse.metrics.truth import registration_error
 from scenefuse.register.register import Known
 from scenefuse.two_clouds.register import REGISTERED, register

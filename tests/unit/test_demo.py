@@ -11,11 +11,11 @@ import pytest
 from PIL import Image
 
 from scenefuse.core.stage import StageError, manifest, read_json, value
-from scenefuse.demo import capture, clicks, prompts, textures
+from scenefuse.demo import capture, clicks, textures
 from scenefuse.demo.bodies import DRONE, IDEAL, PHONE, Body, Exposure, blur_kernel, draw_exposure, expose, vignetting
-from scenefuse.demo.cameras import Cameras, pinhole, read_cameras, visible
 from scenefuse.demo.world import ORIGIN, World, build_world, openness
 from scenefuse.marks.clicks import read_points
+from scenefuse.metrics.true_cameras import Cameras, pinhole, read_cameras, visible
 from scenefuse.photos.geodesy import LocalFrame
 
 FLIGHT = capture.FlightSettings(
@@ -155,7 +155,7 @@ def test_exif_position_is_the_true_one_when_noise_is_zero(rendered: Path) -> Non
 def test_clicks_without_noise_meet_at_the_landmarks(tmp_path: Path, world: World) -> None:
     folders = {"photos": tmp_path / "p", "truth": tmp_path / "t"}
     capture.render_object(name="sculpture", **folders, settings=ORBIT, camera="real", seed=0)
-    table = tmp_path / "prompts.tsv"
+    table = tmp_path / "clicks.tsv"
     clicks.click_points(
         name="sculpture",
         cameras=tmp_path / "t/cameras.json",
@@ -180,9 +180,9 @@ def test_an_object_is_clicked_in_the_photo_that_shows_most_of_it_some_pixels_off
     shown[30:90, 40:120] = 255
     for name, mask in (("a", shown // 2), ("b", shown), ("c", np.zeros_like(shown))):
         cv2.imwrite(str(tmp_path / f"masks/{name}.png"), mask)
-    settings = prompts.PromptSettings(inside=3, box=True)
+    settings = clicks.PromptSettings()
     for seed in range(5):
-        prompts.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=seed)
+        clicks.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=seed)
         marked = read_points(tmp_path / "prompts.tsv")
         assert (
             marked.kind == "labels"
@@ -197,7 +197,7 @@ def test_an_object_is_clicked_in_the_photo_that_shows_most_of_it_some_pixels_off
     cv2.imwrite(str(tmp_path / "masks/b.png"), np.zeros_like(shown))
     cv2.imwrite(str(tmp_path / "masks/a.png"), np.zeros_like(shown))
     with pytest.raises(StageError, match="no mask in .* shows the object"):
-        prompts.click_object(truth=tmp_path, clicks=tmp_path / "prompts.tsv", settings=settings, seed=0)
+        clicks.click_object(truth=tmp_path, clicks=tmp_path / "clicks.tsv", settings=settings, seed=0)
 
 
 def test_an_ideal_camera_changes_nothing(world: World) -> None:
@@ -297,7 +297,7 @@ def test_nothing_is_seen_through_a_wall(world: World) -> None:
 def test_the_sky_is_hidden_under_the_balloon(world: World) -> None:
     sky = openness(world, 8, 0)
     x, y = world.bounds("balloon").mean(0)[:2]
-    ground = np.unique(world.triangles[world.materials == textures.TERRAIN])
+    ground = np.unique(world.triangles[world.materials == textures.Material.TERRAIN])
     away = np.hypot(world.vertices[ground, 0] - x, world.vertices[ground, 1] - y)
     assert sky[ground[away < 1.5]].mean() < 0.7 < 0.85 < sky[ground[(away > 9) & (away < 12)]].mean()
 
@@ -314,7 +314,7 @@ def test_noise_fades_out_where_a_pixel_is_larger_than_it() -> None:
     ("name", "settings", "sentence"),
     [
         ("castle", ORBIT, "no object 'castle'; use one of house, balloon, sculpture"),
-        ("house", replace(ORBIT, views=0), "asked for 0 photos"),
+        ("house", replace(ORBIT, views=0), "without photos"),
         ("house", replace(ORBIT, width_px=4, height_px=4), "4 x 4 pixels"),
         ("house", replace(ORBIT, elevations_deg=()), "needs an elevation"),
     ],

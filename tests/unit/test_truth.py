@@ -14,12 +14,12 @@ from support.changed_scene import write_changes
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3, look_at, rotation_between
-from scenefuse.demo.cameras import Cameras, cameras_json, pinhole
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
 from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
+from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 from scenefuse.photos.maps import write_depth
 from scenefuse.photos.pictures import read_gray
 

@@ -87,7 +87,7 @@ rule click_fiducials:
         mem_mb=2000,
         runtime=10,
     params:
-        options=flags(config["demo"]["fiducials"]),
+        options="--least-miss-px 0 --most-miss-px 2",
         seed=config["seed"],
         script=script("demo/click_points.py"),
         code=code("demo/click_points.py"),
@@ -109,7 +109,7 @@ use rule click_fiducials as click_prompts with:
     benchmark:
         "results/benchmarks/click_prompts/{scene}-{object}.tsv"
     params:
-        options=flags(config["demo"]["prompts"]),
+        options="--photos 4 --separation-deg 25",
         seed=config["seed"],
         script=script("demo/click_points.py"),
         code=code("demo/click_points.py"),
@@ -135,11 +135,10 @@ rule click_object:
         mem_mb=2000,
         runtime=10,
     params:
-        options=flags(config["demo"]["clicks"]),
         seed=config["seed"],
         script=script("demo/click_object.py"),
         code=code("demo/click_object.py"),
     message:
         "Demo {wildcards.scene}: clicking the {wildcards.object} in one of its photos"
     shell:
-        "exec python {params.script} --truth {input} --clicks {output} --seed {params.seed} {params.options} &> {log}"
+        "exec python {params.script} --truth {input} --clicks {output} --seed {params.seed} &> {log}"

@@ -1,4 +1,4 @@
-"""Cameras of the demo: the mapping flight and the orbits, and their truth files."""
+"""True cameras of a capture: where each photo shows a point, what hides it, and the truth file that holds them."""
 
 from dataclasses import dataclass, field
 from functools import cached_property
