@@ -21,8 +21,6 @@ from scenefuse.fuse.modes import FusionSettings
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.metrics.completion import MetricSettings
-from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
-from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
@@ -149,8 +147,6 @@ SECTIONS: dict[str, list[Any]] = {
     "registration.fine": [FineSettings()],
     "fusion": [FusionSettings()],
     "metrics": [AgreementSettings(), MetricSettings()],
-    "evaluation.scene": [SceneEvaluationSettings()],
-    "evaluation.object": [ObjectEvaluationSettings()],
     "evaluation.paper": [ComparisonSettings()],
 }
 # Keys of a dataclass that its section does not hold: the other section of the same stage sets them.

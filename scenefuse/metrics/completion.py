@@ -13,10 +13,9 @@ from scenefuse.core.transforms import Array
 from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.register.agreement import NORMAL_NEIGHBOURS, AgreementSettings
 
-# Points at which the variation is measured over the paper's wide radii: their neighbourhoods are large.
-WIDE_SAMPLE = 1500
+MEASURES = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
 # Points whose neighbourhoods are held in memory together: a fine object's hold thousands of points each.
-AT_ONCE = 200
+NEIGHBOURHOODS_AT_ONCE = 200
 
 
 @dataclass(frozen=True)
@@ -96,15 +95,14 @@ def completion_metrics(parts: Sequence[Completion], settings: MetricSettings, se
     added = quantity(sum(len(part.added) for part in parts), "points")
     parts = [part for part in parts if len(part.added) >= 4 * settings.density_neighbours]
     if not parts:
-        names = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
-        return {n: quantity(None, "1") for m in names for n in (m, f"{m}_null")} | {"added_points": added}
+        return {n: quantity(None, "1") for m in MEASURES for n in (m, f"{m}_null")} | {"added_points": added}
     random = [replace(part, added=_random_cloud(part.added, seed)) for part in parts]
     real, null = _of_added(parts, settings, seed), _of_added(random, settings, seed)
     found: dict[str, dict[str, Any]] = {}
     for name in real:
         found |= {name: quantity(real[name], "1"), f"{name}_null": quantity(null[name], "1")}
     for when, clouds in (("before", [part.before for part in parts]), ("after", [part.after for part in parts])):
-        for name, number in _of_whole(clouds, parts, settings, seed).items():
+        for name, number in _variation_and_primitives(clouds, clouds, parts, settings, seed).items():
             found[f"{name}_{when}"] = quantity(number, "1")
     return found | {"added_points": added}
 
@@ -120,37 +118,24 @@ def _random_cloud(like: Array, seed: int) -> Array:
 
 def _of_added(parts: Sequence[Completion], settings: MetricSettings, seed: int) -> dict[str, float | None]:
     """Every number of the added points, the objects weighted by their number."""
-    weights = [len(part.added) for part in parts]
-    few = [sampled(part.added, settings.sample, seed) for part in parts]
-    found = {
-        "surface_variation": _mean(
-            [surface_variation(p.after, at, variation_radius(p, settings)) for p, at in zip(parts, few)], weights
-        )
-    }
-    fewer = [sampled(part.added, min(settings.sample, WIDE_SAMPLE), seed) for part in parts]
-    for percent in (1, 2, 4):
-        values = [surface_variation(p.after, at, percent / 100 * p.diagonal) for p, at in zip(parts, fewer)]
-        found[f"surface_variation_{percent}pct"] = _mean(values, weights)
-    for k in (settings.density_neighbours, 8, 32):
-        suffix = "" if k == settings.density_neighbours else f"_k{k}"
-        new = _spread([part.after for part in parts], k, settings.sample, seed)
-        old = _spread([part.before for part in parts], k, settings.sample, seed)
-        found[f"nue{suffix}"] = new[1] / old[1]
-        found[f"nue_density_invariant{suffix}"] = (new[1] / new[0]) / (old[1] / old[0])
-    scores = [_primitives(part.after, at, part.diagonal, settings, seed) for part, at in zip(parts, few)]
-    found["primitive_fitting_score"] = _mean(scores, weights)
-    return found
+    after, k = [part.after for part in parts], settings.density_neighbours
+    new = _spread(after, k, settings.sample, seed)
+    old = _spread([part.before for part in parts], k, settings.sample, seed)
+    found = _variation_and_primitives(after, [part.added for part in parts], parts, settings, seed)
+    nue = {"nue": new[1] / old[1], "nue_density_invariant": (new[1] / new[0]) / (old[1] / old[0])}
+    return {name: (found | nue)[name] for name in MEASURES}
 
 
-def _of_whole(
-    clouds: Sequence[Array], parts: Sequence[Completion], settings: MetricSettings, seed: int
+def _variation_and_primitives(
+    clouds: Sequence[Array], of: Sequence[Array], parts: Sequence[Completion], settings: MetricSettings, seed: int
 ) -> dict[str, float | None]:
-    """Surface variation and primitives of whole clouds, one for each object, at points of them all."""
-    weights, few = [len(cloud) for cloud in clouds], [sampled(cloud, settings.sample, seed) for cloud in clouds]
-    smooth = [
-        surface_variation(cloud, at, variation_radius(part, settings)) for cloud, at, part in zip(clouds, few, parts)
-    ]
-    plain = [_primitives(cloud, at, part.diagonal, settings, seed) for cloud, at, part in zip(clouds, few, parts)]
+    """Surface variation and primitives of clouds, one for each object, at some of the points `of` each.
+
+    The objects are weighted by the number of these points.
+    """
+    at, weights = [sampled(points, settings.sample, seed) for points in of], [len(points) for points in of]
+    smooth = [surface_variation(c, a, variation_radius(p, settings)) for c, a, p in zip(clouds, at, parts)]
+    plain = [_primitives(c, a, p.diagonal, settings, seed) for c, a, p in zip(clouds, at, parts)]
     return {"surface_variation": _mean(smooth, weights), "primitive_fitting_score": _mean(plain, weights)}
 
 
@@ -194,7 +179,10 @@ def surface_variation(cloud: Array, at: Array, radius: float) -> float | None:
         radius: of a neighbourhood, in the clouds' unit.
     """
     tree = cKDTree(cloud)
-    parts = [_variations(tree, at[start : start + AT_ONCE], radius) for start in range(0, len(at), AT_ONCE)]
+    parts = [
+        _variations(tree, at[start : start + NEIGHBOURHOODS_AT_ONCE], radius)
+        for start in range(0, len(at), NEIGHBOURHOODS_AT_ONCE)
+    ]
     found = np.concatenate(parts) if parts else np.empty(0)
     return float(found.mean()) if len(found) else None
 

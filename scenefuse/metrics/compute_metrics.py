@@ -1,4 +1,4 @@
-"""The metrics stage: one registration, and the completion where the object was fused."""
+"""The metrics stages: of one object's registration and completion, and of a scene with all its objects."""
 
 from pathlib import Path
 from typing import Any
@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import read_cloud
+from scenefuse.cloud.tiles.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.fuse_object import FROM_OBJECT
@@ -49,6 +50,41 @@ def compute_metrics(
         part = completion_of(scene.points, read_cloud(fused), FROM_OBJECT, diagonal)
         radius = {"surface_variation_radius": quantity(variation_radius(part, settings), unit)}
         content["completion"] = completion_metrics([part], settings, seed) | radius
-    for name, item in found.items():
-        print(f"{name:28s} {item['value']} {item['unit']}", flush=True)
+    _write(report, content)
+
+
+def compute_scene_metrics(
+    *, completed: Path, completed_json: Path, objects: list[Path], report: Path, seed: int, settings: MetricSettings
+) -> None:
+    """Measure the completed scene (method G2 to G5): the objects that were added to it, each counted by its points.
+
+    Args:
+        completed: the completed scene (PLY, with `source`).
+        completed_json: its JSON, which says which object each `source` is and which objects are in it.
+        objects: result folders of all the scene's objects; of those in it, registration/full/crop.ply and crop.json are
+            read.
+        report: output JSON with `completion`; a measure is null where nothing was added.
+        seed: of samples and of the random clouds that give the null values.
+        settings: see MetricSettings.
+    """
+    whole, known = open_cloud(completed), read_json(completed_json)
+    numbers = {name: int(number) for number, name in value(known, "sources").items()}
+    parts = []
+    for folder in objects:
+        if value(known, "added_points").get(folder.name, 0) == 0:
+            continue
+        crop = folder / "registration/full"
+        before, diagonal = read_cloud(crop / "crop.ply").points, float(value(read_json(crop / "crop.json"), "diagonal"))
+        # What an object adds lies no farther from its crop than the object is wide.
+        around = whole.near(before.min(0) - diagonal, before.max(0) + diagonal)[1]
+        parts.append(completion_of(before, around, numbers[folder.name], diagonal))
+    found = completion_metrics(parts, settings, seed) | {"objects": quantity(len(parts), "objects")}
+    _write(report, {"completion": found})
+
+
+def _write(report: Path, content: dict[str, dict[str, Any]]) -> None:
+    """Write the metrics, and print one a line."""
+    for group in content.values():
+        for name, item in group.items():
+            print(f"{name:34s} {item['value']} {item['unit']}", flush=True)
     write_json(report, content)

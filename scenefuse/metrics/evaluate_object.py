@@ -8,7 +8,7 @@ import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, sampled
 from scenefuse.cloud.tiles.tiled_cloud import open_cloud
-from scenefuse.core.stage import quantity, read_json, setting, value, write_json
+from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion
 from scenefuse.geometry.visual_hull import mask_iou
@@ -21,29 +21,18 @@ from scenefuse.metrics.object_truth import (
     scene_scores,
     surface_to_find,
 )
-from scenefuse.metrics.scores import THRESHOLDS
+from scenefuse.metrics.scores import THRESHOLDS, nearest, scores_at
 from scenefuse.metrics.true_cameras import read_cameras as read_true_cameras
 from scenefuse.metrics.truth import (
+    SAMPLES,
     camera_results,
     distances,
-    nearest,
     print_results,
     registration_error,
-    scores_at,
 )
 from scenefuse.photos.pictures import read_gray
 from scenefuse.photos.workspace import read_cameras, read_views
 from scenefuse.sfm.undistort import undistort_picture
-
-
-@dataclass(frozen=True)
-class ObjectEvaluationSettings:
-    """Evaluation of an object."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from a cloud for its distances to the truth."""
-    max_photos: int = setting(8, least=1)
-    """Photos whose depth maps are compared, spread evenly."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +69,7 @@ class EvaluationInputs:
     """What fusion changed in the scene; as `fused`."""
 
 
-def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settings: ObjectEvaluationSettings) -> None:
+def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, samples: int = SAMPLES) -> None:
     """Compare an object with its truth: masks, cameras, depth after each stage, cloud, registration, completed scene.
 
     Definitions (method G8). Every length is over the diagonal of the object's true bounding box; F-score, precision and
@@ -95,12 +84,12 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
         inputs: see EvaluationInputs.
         report: output JSON.
         seed: of the drawing.
-        settings: see ObjectEvaluationSettings.
+        samples: points drawn from the true surface, and from a cloud for its distances to the truth.
 
     Raises:
         StageError: a truth file is missing, or knows fewer than three of the model's photos.
     """
-    known = read_object_truth(inputs.workspace, inputs.truth_scene, inputs.truth_object, settings.samples, seed)
+    known = read_object_truth(inputs.workspace, inputs.truth_scene, inputs.truth_object, samples, seed)
     truth_from_scene = Sim3.from_matrix(np.array(value(read_json(inputs.scene_json), "truth_from_scene")))
     points = read_cloud(inputs.cloud).points
     position = float(np.median(known.fit.position)) / known.diagonal
@@ -109,12 +98,12 @@ def evaluate_object(*, inputs: EvaluationInputs, report: Path, seed: int, settin
         **({} if inputs.masks is None else _mask_results(inputs, inputs.masks)),
         **camera_results(known.fit, len(known.orbit.names)),
         "camera_position_over_diagonal": quantity(position, "1"),
-        **depth_results(list(inputs.stages), known, settings.max_photos),
-        **cloud_results(known.fit.truth_from_model.apply(points), known, settings.samples, seed),
+        **depth_results(list(inputs.stages), known),
+        **cloud_results(known.fit.truth_from_model.apply(points), known, samples, seed),
     }
 
     def errors_of(path: Path) -> dict[str, Any]:
-        return _registration_results(read_json(path), known, truth_from_scene, points, settings.samples, seed)
+        return _registration_results(read_json(path), known, truth_from_scene, points, samples, seed)
 
     variants = {path.parent.name: errors_of(path) for path in inputs.variants}
     result |= next(iter(variants.values()), {})

@@ -1,6 +1,5 @@
 """The demo's scene compared with the demo's truth; only the evaluation reads the truth."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -9,32 +8,25 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import sampled_rows
 from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
-from scenefuse.core.stage import quantity, read_json, setting, value, write_json
+from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.metrics.scores import nearest
 from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
+    SAMPLES,
     Mesh,
     Posed,
     camera_results,
     cast_together,
     distances,
     fit_cameras,
-    nearest,
     print_results,
     read_mesh,
     read_posed,
     sample_surface,
 )
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
-
-
-@dataclass(frozen=True)
-class SceneEvaluationSettings:
-    """Evaluation of a scene."""
-
-    samples: int = setting(60000, least=1)
-    """Points drawn from the true surface, and from the cloud for its distances to the truth."""
 
 
 def evaluate_scene(
@@ -45,7 +37,7 @@ def evaluate_scene(
     truth: Path,
     report: Path,
     seed: int,
-    settings: SceneEvaluationSettings,
+    samples: int = SAMPLES,
 ) -> None:
     """Compare a scene of the demo with its truth: cameras, georeferencing, dense cloud.
 
@@ -59,7 +51,7 @@ def evaluate_scene(
         truth: the flight's truth folder.
         report: output JSON; holds `truth_from_scene` (4x4), which the objects' evaluation reads.
         seed: of the drawing.
-        settings: see SceneEvaluationSettings.
+        samples: points drawn from the true surface, and from the cloud for its distances to the truth.
 
     Raises:
         StageError: the truth is missing, or knows fewer than three of the model's photos.
@@ -74,7 +66,7 @@ def evaluate_scene(
         **camera_results(fit, len(cameras.names)),
         "georeference_error_median": quantity(georeference_error, "m"),
         "georeference_scale_error_pct": quantity(100 * abs(fit.truth_from_model.scale - 1), "%"),
-        **_cloud_results(open_cloud(cloud), fit.truth_from_model, content, meshes, cameras, settings.samples, seed),
+        **_cloud_results(open_cloud(cloud), fit.truth_from_model, content, meshes, cameras, samples, seed),
         "truth_from_scene": quantity(fit.truth_from_model.matrix, "m"),
     }
     write_json(report, result)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scenefuse.cloud.clouds import sampled
 from scenefuse.core.stage import quantity, read_json, value
 from scenefuse.core.transforms import Array
+from scenefuse.metrics.scores import nearest, scores_at
 from scenefuse.metrics.true_cameras import Cameras, read_cameras, visible
 from scenefuse.metrics.truth import (
     HIDDEN,
@@ -20,15 +21,15 @@ from scenefuse.metrics.truth import (
     cast_together,
     distances,
     fit_cameras,
-    nearest,
     read_mesh,
     read_posed,
     sample_surface,
-    scores_at,
     true_depth,
 )
 from scenefuse.photos.maps import read_depth
 
+# Photos whose depth maps are compared, spread evenly.
+COMPARED_PHOTOS = 8
 # How far around the object's true box a scene's points count as its own, as a share of its diagonal: farther off than
 # any stray point that a person would take for a part of it.
 MARGIN = 0.05
@@ -90,7 +91,7 @@ def read_object_truth(workspace: Path, truth_scene: Path, truth_object: Path, sa
     )
 
 
-def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int) -> dict[str, Any]:
+def depth_results(stages: list[Path], known: ObjectTruth, max_photos: int = COMPARED_PHOTOS) -> dict[str, Any]:
     """Depth errors of every stage over pixels that truly show the object; a missing depth is outside the 1 %."""
     posed, truth_from_object = known.posed, known.fit.truth_from_model
     chosen = np.unique(np.linspace(0, len(posed) - 1, min(max_photos, len(posed))).astype(int))

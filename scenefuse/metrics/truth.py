@@ -7,11 +7,9 @@ from typing import Any
 import numpy as np
 import open3d as o3d
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from scenefuse.core.stage import StageError, quantity, threads
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
 from scenefuse.metrics.true_cameras import Cameras
 from scenefuse.photos.workspace import View, read_views
 
@@ -19,6 +17,8 @@ from scenefuse.photos.workspace import View, read_views
 Posed = list[tuple[View, int]]
 # A sampled point counts as hidden when a surface lies farther than this before it, metres.
 HIDDEN = 0.02
+# Points drawn from a true surface, and from a cloud for its distances to the truth.
+SAMPLES = 60_000
 
 
 @dataclass(frozen=True)
@@ -158,40 +158,6 @@ def true_depth(
     rays = np.concatenate([centre, directions], axis=-1).astype(np.float32)
     hits = scene.cast_rays(o3d.core.Tensor.from_numpy(rays), nthreads=threads())
     return hits["t_hit"].numpy(), hits["geometry_ids"].numpy().view(np.int32).astype(np.int64)
-
-
-def f_score(
-    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], tau: float
-) -> tuple[float, float, float]:
-    """Precision, recall and their harmonic mean at a distance `tau` (Knapitsch et al. 2017, section 4)."""
-    precision = float((cloud_to_truth <= tau).mean()) if len(cloud_to_truth) else 0.0
-    recall = float((truth_to_cloud <= tau).mean()) if len(truth_to_cloud) else 0.0
-    total = precision + recall
-    return precision, recall, 2 * precision * recall / total if total > 0 else 0.0
-
-
-def scores_at(
-    cloud_to_truth: NDArray[np.floating], truth_to_cloud: NDArray[np.floating], diagonal: float
-) -> dict[str, dict[str, float]]:
-    """F-score, precision and recall at each of THRESHOLDS (method G8): {"1pct": {"f_score": ..., ...}, ...}.
-
-    Args:
-        cloud_to_truth: (N,) distances of the cloud's points to the true surface.
-        truth_to_cloud: (M,) distances of points on the true surface to the cloud.
-        diagonal: of the object's true bounding box, in the unit of the distances.
-    """
-    found = {}
-    for ending, share in THRESHOLDS.items():
-        precision, recall, score = f_score(cloud_to_truth, truth_to_cloud, share * diagonal)
-        found[ending] = dict(zip(SCORES, (score, precision, recall)))
-    return found
-
-
-def nearest(points: Array, cloud: Array) -> Array:
-    """(N,) distance of each of (N, 3) points to the nearest point of a cloud; infinite when it is empty."""
-    if len(cloud) == 0:
-        return np.full(len(points), np.inf)
-    return cKDTree(cloud).query(points, workers=threads())[0]
 
 
 def belongs_to_object(

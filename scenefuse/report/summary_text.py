@@ -8,13 +8,13 @@ import pandas as pd
 
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.missing import CLASSES
-from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
+from scenefuse.metrics.completion import MEASURES
+from scenefuse.metrics.scores import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.disk import disk_line
 from scenefuse.report.tables import (
     BESIDE,
-    COMPLETION,
     REGISTRATION,
     completion_table,
     number_in,
@@ -76,7 +76,7 @@ def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
     frame = [("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")]
     lines += _line("frame", _pairs(frame)) + _survey_lines(fields)
     lines += _line("cloud", _pairs([("points", row["points"], ""), ("spacing", row["spacing"], str(unit))]))
-    measures = [{"measure": name, **{c: row.get(_beside(name, c)) for c in _COLUMNS}} for name in COMPLETION]
+    measures = [{"measure": name, **{c: row.get(_beside(name, c)) for c in _COLUMNS}} for name in MEASURES]
     lines += _completed_lines(fields) + _completion_lines(measures)
     return lines + _truth_lines(fields) + _remarks(fields)
 

@@ -10,7 +10,8 @@ from typing import Any
 import pandas as pd
 
 from scenefuse.core.job_records import JobRecords, why_unfinished
-from scenefuse.metrics.thresholds import SCORES, THRESHOLDS
+from scenefuse.metrics.completion import MEASURES
+from scenefuse.metrics.scores import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
 from scenefuse.report.values import Fields, find, number, unit_of
 
@@ -32,7 +33,6 @@ REGISTRATION: dict[str, str] = {
     "placed_f_score_1pct": "truth.placed_f_score_1pct",
 }
 # The completion metrics of the completed scene that scenes.tsv holds, each with what stands beside it.
-COMPLETION = ("surface_variation", "nue", "nue_density_invariant", "primitive_fitting_score")
 BESIDE = ("null", "before", "after")
 # Columns of scenes.tsv for surveyed points, in `georeference.json` too.
 SURVEYED = tuple(
@@ -137,7 +137,7 @@ def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
             "completed_points": number_in(fields, "completed.points"),
             "completed_by": None if added is None else ", ".join(added) or "none",
         }
-        for measure in (n for m in COMPLETION for n in (m, *(f"{m}_{beside}" for beside in BESIDE))):
+        for measure in (n for m in MEASURES for n in (m, *(f"{m}_{beside}" for beside in BESIDE))):
             if f"metrics.completion.{measure}" in fields:
                 row[measure] = number_in(fields, f"metrics.completion.{measure}")
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}

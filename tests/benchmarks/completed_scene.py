@@ -19,7 +19,6 @@ from typing import Any, get_args, get_type_hints
 import numpy as np
 import open3d as o3d
 import pandas as pd
-from scenefuse.metrics.scores import THRESHOLDS
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
@@ -32,6 +31,7 @@ from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
 from scenefuse.fuse.write import FROM_OBJECT, together
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.scores import THRESHOLDS
 from scenefuse.metrics.true_cameras import read_cameras
 from scenefuse.metrics.truth import registration_error
 from scenefuse.photos.workspace import read_workspace

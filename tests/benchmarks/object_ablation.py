@@ -20,8 +20,8 @@ import torch
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
-from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.metrics.truth import belongs_to_object, distances
+from scenefuse.metrics.object_truth import COMPARED_PHOTOS, ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.truth import SAMPLES, belongs_to_object, distances
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.prior.refine_depth import refine_depth
 from scenefuse.nerf.rendered_maps import psnr
@@ -205,7 +205,7 @@ def object_ablation(
         settings: laid over the shipped ones, or none.
     """
     shipped = read_settings(settings)
-    own, limits = shipped["object"], shipped["evaluation"]["object"]
+    own = shipped["object"]
     out = results / "bench/object_ablation.tsv"
     out.parent.mkdir(parents=True, exist_ok=True)
     rows: list[dict[str, Any]] = pd.read_csv(out, sep="\t").to_dict("records") if out.is_file() else []
@@ -215,15 +215,13 @@ def object_ablation(
         folder, known = results / "objects" / name, results / "demo/demo/truth"
         truth = None
         if (known / name).is_dir():
-            truth = read_object_truth(
-                folder / "undistorted", known / "scene", known / name, limits["samples"], shipped["seed"]
-            )
+            truth = read_object_truth(folder / "undistorted", known / "scene", known / name, SAMPLES, shipped["seed"])
         for seed in range(seeds):
             for variant in chosen:
                 if (name, variant, seed) in done:
                     continue
                 print(f"{name} {variant} {seed}", flush=True)
-                measured = one(folder, truth, chosen[variant], seed, own, limits["max_photos"])
+                measured = one(folder, truth, chosen[variant], seed, own, COMPARED_PHOTOS)
                 rows.append({"object": name, "variant": variant, "seed": seed} | measured)
                 pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")
     print_table(pd.DataFrame(rows), seeds)

@@ -18,6 +18,7 @@ from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
 from scenefuse.geometry.consistency import compare
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.truth import SAMPLES
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
@@ -78,7 +79,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
     own = settings["object"] | {key: settings["scene"][key] for key in ("depth_maps", "dense_cloud")}
     width = own["nerf"]["width_px"]
     views = load_views(folder / "undistorted", folder / "masks", width, 0)
-    limits, rows = settings["evaluation"]["object"], []
+    rows = []
     for maps, over in DEPTH.items():
         with tempfile.TemporaryDirectory() as temporary:
             depth, report = Path(temporary) / maps.replace(" ", "_"), Path(temporary) / "depth.json"
@@ -90,7 +91,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
             )  # fmt: skip
             mask_depths(depth, views)
             wall, cpu = time.monotonic() - start, used(began)
-            errors = depth_results([depth], truth, limits["max_photos"])
+            errors = depth_results([depth], truth)
             for fusion, changes in FUSION.items():
                 start, began = time.monotonic(), os.times()
                 try:
@@ -105,7 +106,7 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
                     {"object": folder.name, "method": "mvs", "maps": maps, "fusion": fusion}
                     | {"depth_pct": 100 * (value(errors, f"{depth.name}_depth_error") or np.nan)}
                     | {"within_1pct": value(errors, f"{depth.name}_depth_within_1pct")}
-                    | measured(cloud, truth, limits["samples"], settings["seed"])
+                    | measured(cloud, truth, SAMPLES, settings["seed"])
                     | {"seconds": seconds, "cpu_seconds": work}
                 )
                 print(rows[-1], flush=True)
@@ -114,18 +115,18 @@ def trials(folder: Path, truth: ObjectTruth, settings: dict[str, Any], pictures:
 
 def early_stages(folder: Path, truth: ObjectTruth, settings: dict[str, Any]) -> list[dict[str, Any]]:
     """The maps of stages 1 and 3, fused and cleaned as the object's cloud: what the NeRF adds to them."""
-    own, limits, rows = settings["object"], settings["evaluation"]["object"], []
+    own, rows = settings["object"], []
     for stage in ("stage1", "stage3"):
         depth = folder / stage
         width = read_depth(next(iter(sorted((depth / "depth_maps").glob("*.bin"))))).shape[1]
         views = load_views(folder / "undistorted", folder / "masks", width, 0)
         cloud = cleaned(fused(folder, depth, depth, views, own, None), folder, own)
-        errors = depth_results([depth], truth, limits["max_photos"])
+        errors = depth_results([depth], truth)
         rows.append(
             {"object": folder.name, "method": "stage 1 alone" if stage == "stage1" else "stages 1 to 3"}
             | {"maps": stage, "fusion": "object", "depth_pct": 100 * value(errors, f"{stage}_depth_error")}
             | {"within_1pct": value(errors, f"{stage}_depth_within_1pct")}
-            | measured(cloud, truth, limits["samples"], settings["seed"])
+            | measured(cloud, truth, SAMPLES, settings["seed"])
         )
     return rows
 
@@ -158,14 +159,14 @@ def measured(cloud: Cloud, truth: ObjectTruth, samples: int, seed: int) -> dict[
 
 def four_stages(results: Path, name: str, truth: ObjectTruth, settings: dict[str, Any]) -> dict[str, Any]:
     """The workflow's cloud, measured alike, and the time of its stages."""
-    folder, limits = results / "objects" / name, settings["evaluation"]["object"]
+    folder = results / "objects" / name
     times = [pd.read_csv(results / f"benchmarks/{stage}/{name}.tsv", sep="\t").iloc[-1] for stage in STAGES]
-    errors = depth_results([folder / "stage4"], truth, limits["max_photos"])
+    errors = depth_results([folder / "stage4"], truth)
     return (
         {"object": name, "method": "four stages", "maps": "stage4", "fusion": "object"}
         | {"depth_pct": 100 * value(errors, "stage4_depth_error")}
         | {"within_1pct": value(errors, "stage4_depth_within_1pct")}
-        | measured(read_cloud(folder / "object.ply"), truth, limits["samples"], settings["seed"])
+        | measured(read_cloud(folder / "object.ply"), truth, SAMPLES, settings["seed"])
         | {"seconds": sum(t["s"] for t in times), "cpu_seconds": sum(t["cpu_time"] for t in times)}
     )
 
@@ -191,12 +192,10 @@ def object_mvs(
     chosen, rows = read_settings(settings), []
     out = results / "bench/object_mvs.tsv"
     (out.parent / "object_mvs").mkdir(parents=True, exist_ok=True)
-    limits, known = chosen["evaluation"]["object"], results / "demo/demo/truth"
+    known = results / "demo/demo/truth"
     for name in objects:
         folder = results / "objects" / name
-        truth = read_object_truth(
-            folder / "undistorted", known / "scene", known / name, limits["samples"], chosen["seed"]
-        )
+        truth = read_object_truth(folder / "undistorted", known / "scene", known / name, SAMPLES, chosen["seed"])
         rows += [four_stages(results, name, truth, chosen), *early_stages(folder, truth, chosen)]
         rows += trials(folder, truth, chosen, out.parent / "object_mvs")
         pd.DataFrame(rows).to_csv(out, sep="\t", index=False, float_format="%.5g")

@@ -23,12 +23,11 @@ import pandas as pd
 
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.job_records import JobRecords, why_unfinished
-from scenefuse.core.settings import build, read_settings
+from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.metrics.evaluate_object import ObjectEvaluationSettings
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
-from scenefuse.metrics.truth import registration_error, true_depth
+from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
 from scenefuse.paper.chain import trajectory_error
 from scenefuse.paper.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.paper.published import OBJECTS, published
@@ -56,14 +55,14 @@ MOTIONS = 200
 class Run:
     """What a run of the workflow made of an object, and the truth of it, where there is one."""
 
-    def __init__(self, results: Path, name: str, settings: ObjectEvaluationSettings, seed: int) -> None:
+    def __init__(self, results: Path, name: str, seed: int) -> None:
         """Read the truth, and the poses of the object's model in it."""
-        self.results, self.folder, self.settings, self.seed = results, results / "objects" / name, settings, seed
+        self.results, self.folder, self.seed = results, results / "objects" / name, seed
         self.jobs = JobRecords(results / "logs", results / "benchmarks")
         truth, self.known = results / "demo" / SCENE / "truth", None
         if (truth / name).is_dir():
             workspace = self.folder / "undistorted"
-            self.known = read_object_truth(workspace, truth / "scene", truth / name, settings.samples, seed)
+            self.known = read_object_truth(workspace, truth / "scene", truth / name, SAMPLES, seed)
 
     def collected(self) -> Collected:
         """What the summary would know of the object."""
@@ -72,10 +71,10 @@ class Run:
     def measures(self) -> dict[str, Any]:
         """All measures, as far as the run came; lengths in % of the object's diagonal, errors against the truth."""
         rows: dict[str, Any] = {"stopped by": why_unfinished(self.jobs, self.folder.name) or "nothing stopped it"}
-        rows |= of_stages(self.folder, self.known, self.settings.max_photos)
+        rows |= of_stages(self.folder, self.known)
         if self.known is not None and (self.folder / "object.ply").is_file():
             points = self.known.fit.truth_from_model.apply(read_cloud(self.folder / "object.ply").points)
-            cloud = cloud_results(points, self.known, self.settings.samples, self.seed)
+            cloud = cloud_results(points, self.known, SAMPLES, self.seed)
             rows |= {f"cloud: F {name} %": value(cloud, f"cloud_f_score_{key}") for name, key in SCORES.items()}
         registered = self.folder / "registration/full"
         if (registered / "coarse.json").is_file():
@@ -101,14 +100,14 @@ class Run:
         return rows | {"shift (%)": 100 * error.translation_over_diagonal}
 
 
-def of_stages(folder: Path, known: ObjectTruth | None, max_photos: int) -> dict[str, Any]:
+def of_stages(folder: Path, known: ObjectTruth | None) -> dict[str, Any]:
     """What each of the four stages that are there came to: poses, depth, renders, rays and seconds."""
     rows: dict[str, Any] = {}
     reports = {n: read_json(folder / f"stage{n}.json") for n in (1, 2, 3, 4) if (folder / f"stage{n}.json").is_file()}
     for number in sorted(reports.keys() & {1, 3}):
         rows |= {f"{name}, stage {number}": pose for name, pose in of_poses(reports[number], known).items()}
     stages = [folder / f"stage{number}" for number in reports]
-    depths = {} if known is None else depth_results(stages, known, max_photos)
+    depths = {} if known is None else depth_results(stages, known)
     for number, report in reports.items():
         if depths:
             error = value(depths, f"stage{number}_depth_error")
@@ -228,11 +227,10 @@ def paper_preset(
         table: TSV to write, too.
     """
     settings = read_settings(None)
-    evaluation = build(ObjectEvaluationSettings, settings["evaluation"]["object"])
     rows = []
     for name in objects:
         folders = {CHAINED: chained, FROM_SFM: from_sfm, SHIPPED: shipped}
-        runs = {column: Run(results, name, evaluation, settings["seed"]) for column, results in folders.items()}
+        runs = {column: Run(results, name, settings["seed"]) for column, results in folders.items()}
         columns: dict[str, dict[str, Any]] = {PAPER: of_tables(published(name))}
         columns |= {column: found.measures() for column, found in runs.items()}
         columns[NULL] = of_chance(runs[SHIPPED]) | of_chance_in_stages(runs[SHIPPED], runs[CHAINED])

@@ -16,9 +16,10 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3, look_at, rotation_between
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth as tr
-from scenefuse.metrics.evaluate_object import EvaluationInputs, ObjectEvaluationSettings, evaluate_object
-from scenefuse.metrics.evaluate_scene import SceneEvaluationSettings, evaluate_scene
+from scenefuse.metrics.evaluate_object import EvaluationInputs, evaluate_object
+from scenefuse.metrics.evaluate_scene import evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
+from scenefuse.metrics.scores import f_score
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 from scenefuse.photos.maps import write_depth
 from scenefuse.photos.pictures import read_gray
@@ -126,7 +127,7 @@ def scene_of(root: Path, out: Path) -> None:
     evaluate_scene(
         model=root / "scene", georeference_json=root / "georeference.json", cloud=root / "before.ply",
         truth=root / "truth/scene", report=out, seed=0,
-        settings=SceneEvaluationSettings(samples=20000),
+        samples=20000,
     )  # fmt: skip
 
 
@@ -149,7 +150,7 @@ def test_georeferencing_is_measured_with_nothing_fitted(planted: Path, tmp_path:
     evaluate_scene(
         model=tmp_path / "model", georeference_json=tmp_path / "g.json", cloud=planted / "before.ply",
         truth=planted / "truth/scene", report=tmp_path / "s.json", seed=0,
-        settings=SceneEvaluationSettings(samples=2000),
+        samples=2000,
     )  # fmt: skip
     assert value(read_json(tmp_path / "s.json"), "georeference_error_median") == pytest.approx(2.0, abs=1e-3)
 
@@ -173,8 +174,7 @@ def object_of(planted: Path, folder: Path, **other: Path) -> dict:
         truth_scene=planted / "truth/scene",
         truth_object=planted / "truth/thing",
     )
-    settings = ObjectEvaluationSettings(samples=20000, max_photos=5)
-    evaluate_object(inputs=replace(inputs, **other), report=folder / "o.json", seed=0, settings=settings)
+    evaluate_object(inputs=replace(inputs, **other), report=folder / "o.json", seed=0, samples=20000)
     return read_json(folder / "o.json")
 
 
@@ -249,10 +249,10 @@ def test_a_scene_is_scored_by_its_points_on_the_object_alone(planted: Path) -> N
 
 
 def test_f_score_by_hand() -> None:
-    precision, recall, score = tr.f_score(np.array([0.1, 0.1, 0.3, 0.3]), np.array([0.1, 0.9, 0.9, 0.9]), 0.2)
+    precision, recall, score = f_score(np.array([0.1, 0.1, 0.3, 0.3]), np.array([0.1, 0.9, 0.9, 0.9]), 0.2)
     assert (precision, recall) == (0.5, 0.25)
     assert score == pytest.approx(2 * 0.5 * 0.25 / 0.75)
-    assert tr.f_score(np.empty(0), np.array([np.inf]), 0.2) == (0.0, 0.0, 0.0)
+    assert f_score(np.empty(0), np.array([np.inf]), 0.2) == (0.0, 0.0, 0.0)
 
 
 def test_registration_error_by_hand() -> None:
@@ -308,5 +308,5 @@ def test_bad_input_is_named(planted: Path, tmp_path: Path) -> None:
         evaluate_scene(
             model=planted / "scene", georeference_json=planted / "georeference.json", cloud=planted / "before.ply",
             truth=scene_of_bad, report=tmp_path / "s.json", seed=0,
-        settings=SceneEvaluationSettings(samples=10),
+        samples=10,
         )  # fmt: skip

@@ -1,6 +1,6 @@
 # Registration and completion metrics, and errors against truth where it is known.
 #
-# INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth; config: metrics, evaluation
+# INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth; config: metrics
 # OUTPUTS   results/objects/{object}/metrics.json, registration/{variant}/metrics.json
 #           results/scenes/{scene}/metrics.json
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
@@ -110,7 +110,6 @@ rule evaluate_scene:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        options=flags(config["evaluation"]["scene"]),
         seed=config["seed"],
         script=script("metrics/evaluate_scene.py"),
         files=state_of(scene_truth),
@@ -119,7 +118,7 @@ rule evaluate_scene:
         "Scene {wildcards.scene}: comparing with the truth"
     shell:
         "exec python {params.script} --model {input.model} --georeference-json {input.georeference} --cloud {input.cloud}"
-        " --truth {input.truth:q} --report {output} --seed {params.seed} {params.options} &> {log}"
+        " --truth {input.truth:q} --report {output} --seed {params.seed} &> {log}"
 
 
 rule evaluate_object:
@@ -161,7 +160,6 @@ rule evaluate_object:
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
         made=options_of("masks", "stages"),
-        options=flags(config["evaluation"]["object"]),
         seed=config["seed"],
         script=script("metrics/evaluate_object.py"),
         files=state_of(object_truth),
@@ -172,4 +170,4 @@ rule evaluate_object:
         "exec python {params.script} --workspace {input.workspace} --sparse {input.sparse} --undistorted {input.undistorted}"
         " {params.made} --cloud {input.cloud} --variants {input.variants} --alignment-json {input.alignment} --scene {input.scene} --fused {input.fused}"
         " --checked {input.checked} --scene-json {input.scene_json} --truth-scene {input.truth[0]:q} --truth-object {input.truth[1]:q}"
-        " --report {output} --seed {params.seed} {params.options} &> {log}"
+        " --report {output} --seed {params.seed} &> {log}"
