@@ -13,9 +13,9 @@ from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.metrics.completion import MEASURES
 from scenefuse.metrics.scores import SCORES, THRESHOLDS
 from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
-from scenefuse.report.values import Fields, find, number, unit_of
+from scenefuse.report.values import Fields, find, number
 
-# Columns of registration.tsv and rows of ablation.tsv: name, and where its value stands.
+# Columns of registration.tsv: name, and where its value stands.
 REGISTRATION: dict[str, str] = {
     "scale": "fine.scale",
     "f_score": "fine.f_score",
@@ -54,23 +54,6 @@ def registration_table(objects: list[Collected], variants: list[str]) -> pd.Data
             }
             rows.append({**row, **{name: number_in(fields, key) for name, key in REGISTRATION.items()}})
     return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *REGISTRATION])
-
-
-def ablation_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
-    """One row an object and measure, one column a variant, all at the same thresholds."""
-    rows: list[dict[str, Any]] = []
-    for item in (item for item in objects if not item.alone):
-        rows.append({"object": item.name, "measure": "status", "unit": ""} | {a: status_of(item, a) for a in variants})
-        for name, key in REGISTRATION.items():
-            values = {variant: number_in(item.variants.get(variant, {}), key) for variant in variants}
-            if any(v is not None for v in values.values()):
-                unit = next(
-                    u for variant in variants if (u := unit_of(item.variants.get(variant, {}), key)) is not None
-                )
-                rows.append(
-                    {"object": item.name, "measure": name, "unit": unit} | {a: _six(v) for a, v in values.items()}
-                )
-    return pd.DataFrame(rows, columns=["object", "measure", "unit", *variants])
 
 
 def completion_table(objects: list[Collected], variant: str) -> pd.DataFrame:
@@ -184,11 +167,6 @@ def records(table: pd.DataFrame) -> list[dict[str, Any]]:
 def truth_numbers(fields: Fields) -> Fields:
     """The numbers among the comparisons with truth; matrices and lists are left out."""
     return {k: v for k, v in fields.items() if k.startswith("truth.") and isinstance(v["value"], (int, float))}
-
-
-def _six(item: float | int | None) -> str | None:
-    """Six significant digits: in a column that also holds text, pandas would print all seventeen."""
-    return None if item is None else f"{item:.6g}"
 
 
 def number_in(fields: Fields, *names: str) -> float | int | None:

@@ -7,7 +7,6 @@ from scenefuse.report.collected import Collected, RunInputs, collect_run, read_f
 from scenefuse.report.disk import disk_table
 from scenefuse.report.summary_text import summary_text
 from scenefuse.report.tables import (
-    ablation_table,
     completion_table,
     objects_table,
     registration_table,
@@ -20,7 +19,7 @@ from scenefuse.report.values import Fields, find
 def write_summary(*, run: RunInputs, summary: Path) -> None:
     """Collect every stage JSON and benchmark into tables and a text that reads well in a terminal.
 
-    Writes registration.tsv, completion.tsv, ablation.tsv, runtime.tsv, scenes.tsv, objects.tsv, disk.tsv and,
+    Writes registration.tsv, completion.tsv, runtime.tsv, scenes.tsv, objects.tsv, disk.tsv and,
     last, summary.txt.
     A value that does not exist is '-'. An object without results is named with the last error of its logs. What an
     earlier run left behind a step that failed since is not shown.
@@ -41,7 +40,6 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     tables = {
         "registration": registration_table(found, run.variants),
         "completion": completion_table(found, run.variants[0]),
-        "ablation": ablation_table(found, run.variants),
         "runtime": runtime_table(run.jobs.benchmarks),
         "scenes": scenes_table(scene_fields, run.jobs),
         "objects": objects_table(found),

@@ -63,7 +63,11 @@ def results(tmp_path):
         counts = {f"{kind}_points": quantity(count, "points") for kind, count in fused.items()}
         write_json(folder / "fusion.json", counts | notes)
         variants = {variant: {"scale_error_pct": quantity(0.5 + k, "%")} for k, variant in enumerate(("full", "paper"))}
-        scene_scores = {f"scene_f_score_{w}_05pct": quantity(v, "1") for w, v in (("before", 0.4), ("after", 0.9))}
+        scene_scores = {
+            f"scene_f_score_{when}_{share}pct": quantity(score, "1")
+            for share in ("05", "1")
+            for when, score in (("before", 0.4), ("after", 0.9))
+        }
         scene_scores |= {f"cloud_f_score_{e}pct": quantity(v, "1") for e, v in (("025", 0.71), ("2", 0.98))}
         write_json(
             folder / "truth.json", {"stage1_depth_error": quantity(0.02, ""), "variants": variants, **scene_scores}
@@ -111,13 +115,6 @@ def test_registration_holds_every_object_and_variant(results):
     assert np.isnan(table.loc[("sculpture", "full"), "scale"])
 
 
-def test_ablation_sets_the_variants_side_by_side(results):
-    table = read(summarise(results), "ablation").set_index(["object", "measure"])
-    assert table.loc[("house", "scale"), "unit"] == "m per object unit"
-    assert [float(table.loc[("house", "scale"), variant]) for variant in ("full", "paper")] == [2.0, 3.0]
-    assert table.loc[("sculpture", "status"), "full"] == "failed"
-
-
 def test_completion_sets_value_null_before_and_after_side_by_side(results):
     table = read(summarise(results), "completion").set_index(["object", "measure"])
     assert table.loc[("house", "nue"), ["value", "null"]].tolist() == [1.25, 2.5]
@@ -134,19 +131,14 @@ def test_the_completed_scene_has_its_metrics_beside_their_nulls(results):
     names = ("house", "balloon")
     row = read(summarise(results, names), "scenes").iloc[0]
     assert {name: row[name] for name in found} == found
-    scene = (results / "summary/summary.txt").read_text().split("object house")[0]
-    assert re.search(r"nue +0\.9 +1\.7 +- +-\n", scene) and re.search(r"surface_variation +0\.05 +- +- +0\.04\n", scene)
 
 
 def test_scores_against_truth_stand_at_their_thresholds(results):
     summary = summarise(results)
     objects = read(summary, "objects").set_index("object")
     assert objects.loc["house", ["cloud_f_score_025pct", "cloud_f_score_2pct"]].tolist() == [0.71, 0.98]
-    lines = (summary / "summary.txt").read_text().splitlines()
-    start = next(n for n, line in enumerate(lines) if line.startswith("truth, at a share"))
-    assert lines[start].split()[-8:] == ["0.25", "%", "0.5", "%", "1", "%", "2", "%"]
-    assert lines[start + 1].split() == ["cloud", "F-score", "0.71", "-", "-", "0.98"]
-    assert lines[start + 2].split() == ["scene", "F-score", "-", "0.4", "->", "0.9", "-", "-"]
+    text = " ".join((summary / "summary.txt").read_text().split())
+    assert "truth scene F-score at 1 % 0.4 -> 0.9, scale off 0.5 %" in text
 
 
 def test_one_name_has_one_source(results):
@@ -429,12 +421,3 @@ def test_a_page_without_a_summary_is_refused(tmp_path):
     with pytest.raises(StageError, match="write the summary first"):
         write_report(summary=tmp_path, scenes=[], objects=[], title="x", report=tmp_path / "report.html")
     assert not (tmp_path / "report.html").exists()
-
-
-def test_a_variant_without_a_gate_is_neither_ok_nor_registered(results):
-    fine = results / "objects/house/registration/paper/fine.json"
-    write_json(fine, load(fine) | {"status": quantity("ungated", "")})
-    summary = summarise(results)
-    assert read(summary, "registration").set_index(["object", "variant"]).loc[("house", "paper"), "status"] == "ungated"
-    lines = [line.split() for line in (summary / "summary.txt").read_text().splitlines()]
-    assert ["paper", "ungated"] in [words[:2] for words in lines]

@@ -11,7 +11,6 @@ include: "../functions/report.smk"
 TABLES = [
     "registration",
     "completion",
-    "ablation",
     "runtime",
     "scenes",
     "objects",
