@@ -7,13 +7,13 @@ from scenefuse.report.collected import Collected
 from scenefuse.report.values import Fields, find
 
 # Names quoted of a list of photos.
-QUOTED = 5
-# A wider angle without any photo leaves a side of the object unseen, degrees.
-WIDE_GAP_DEG = 100.0
-# Masks deserve a word where more than this share of the photos is left out, or where the others agree by less (IoU).
-MANY_LEFT_OUT, POOR_AGREEMENT = 0.1, 0.75
-# Photos this much brighter or darker than the others, in stops (powers of two), deserve a word.
-EXPOSURE_JUMP = 0.7
+MAX_NAMES = 5
+# A wider angle without any photo leaves a side of the object unseen.
+MAX_GAP_DEG = 100.0
+# Masks are mentioned where more than this share of the photos is left out, or where the others agree by less (IoU).
+MAX_LEFT_OUT, MIN_AGREEMENT = 0.1, 0.75
+# Photos are mentioned that are more than this brighter or darker than the others, in stops (powers of two).
+MAX_EXPOSURE_STOPS = 0.7
 
 
 def diagnose(item: Collected) -> list[str]:
@@ -23,8 +23,8 @@ def diagnose(item: Collected) -> list[str]:
 
 def named(items: list[str], mark: str = ", ") -> str:
     """Photos by their names, or sentences, with a mark between them; a few of many."""
-    more = len(items) - QUOTED
-    return mark.join(items[:QUOTED]) + (f" and {more} more" if more > 0 else "")
+    more = len(items) - MAX_NAMES
+    return mark.join(items[:MAX_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def _split(fields: Fields) -> Iterator[str]:
@@ -59,7 +59,7 @@ def _misplaced(fields: Fields) -> Iterator[str]:
 def _one_side(fields: Fields) -> Iterator[str]:
     """A side from which there is no photo."""
     gap, between = find(fields, "undistorted.largest_gap_deg"), find(fields, "undistorted.gap_between")
-    if gap is not None and gap > WIDE_GAP_DEG:
+    if gap is not None and gap > MAX_GAP_DEG:
         yield (
             f"no photo looks at it from within {gap:.0f} degrees, between {between[0]} and {between[1]}: what can only"
             " be seen from there is missing; photograph it from there, if one can stand there"
@@ -79,13 +79,13 @@ def _clicks(fields: Fields) -> Iterator[str]:
 def _masks(fields: Fields) -> Iterator[str]:
     """Masks that disagree with each other."""
     left_out, photos = find(fields, "masks.photos_left_out") or [], find(fields, "masks.photos") or 0
-    if len(left_out) > MANY_LEFT_OUT * photos:
+    if len(left_out) > MAX_LEFT_OUT * photos:
         yield (
             f"{len(left_out)} of {photos} masks disagree with the others and are left out ({named(left_out)}): look at"
             " masks.png; click the object's ends, or what the masks take by mistake, in one of these photos"
         )
     agreement = find(fields, "masks.median_agreement")
-    if agreement is not None and agreement < POOR_AGREEMENT:
+    if agreement is not None and agreement < MIN_AGREEMENT:
         yield (
             f"the masks that are left agree by {agreement:.2f} only (IoU with their common hull): they hold different"
             " things in different photos, or the cameras are wrong; look at masks.png"
@@ -100,11 +100,12 @@ def _exposed(fields: Fields) -> Iterator[str]:
         yield f"blurred photos ({len(names)}): {named(names)}; they count less in the NeRF: replace or remove them"
     gains = find(fields, "stage2.photo_gains") or {}
     stops = {name: abs(math.log2(sum(gain) / len(gain))) for name, gain in gains.items()}
-    jumps = sorted((name for name in stops if stops[name] > EXPOSURE_JUMP), key=lambda name: -stops[name])
+    jumps = sorted((name for name in stops if stops[name] > MAX_EXPOSURE_STOPS), key=lambda name: -stops[name])
     if jumps:
         yield (
-            f"photos exposed {EXPOSURE_JUMP:g} stops and more beside the others ({len(jumps)}): {named(jumps)}; it is"
-            " evened out, but what is too dark or too bright holds no detail: fix the exposure while photographing"
+            f"photos more than {MAX_EXPOSURE_STOPS:g} stops brighter or darker than the others ({len(jumps)}):"
+            f" {named(jumps)}; training evens this out, but what is too dark or too bright holds no detail: fix the"
+            " exposure while photographing"
         )
 
 

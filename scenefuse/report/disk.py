@@ -1,4 +1,4 @@
-"""The room that results take on the disk: what a run will need, before it begins, and what it has taken."""
+"""Disk space: what a run will need, before it begins, and what its results take."""
 
 import math
 import os
@@ -15,25 +15,20 @@ from PIL.ExifTags import Base
 from scenefuse.core.stage import StageError
 from scenefuse.photos.photo_files import photo_files
 
-# Fitted by hand to what the demo took (docs/results.md, The room on the disk).
-FEATURE_BYTES = 450
-"""A feature, in both databases of a model, with its matches."""
-PHOTO_BYTES = 2
-"""A pixel of a photo: of its copies, as JPEG."""
-SCENE_BYTES = 19
-"""A pixel of a scene's depth, normal and confidence maps, and its share of the clouds."""
-OBJECT_BYTES = 60
-"""A pixel of an object's maps of stages 1 to 4, its share of the registration and the pictures."""
-LARGEST = 4
-"""Parts that the summary names."""
-SIDEWAYS = (5, 6, 7, 8)
-"""EXIF orientations of photos that are turned by a quarter."""
+# Bytes that a feature takes in both databases of a model, with its matches; a pixel of a photo in its copies as JPEG; a
+# pixel of a scene's depth, normal and confidence maps, with its share of the clouds; a pixel of an object's maps of
+# stages 1 to 4, with its share of the registration and the pictures. Fitted to what the demo took (docs/results.md).
+BYTES = {"feature": 450, "photo": 2, "scene": 19, "object": 60}
+# Parts that the summary names.
+MAX_PARTS = 4
 TEMPORARY = ".tmp-"
 
 
 def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> int | None:
-    """Bytes that a scene or an object from photos will take; None where that cannot be told: a cloud, a video, photos
-    that are yet to be made or cannot be read. With a cloud beside the photos there are no maps.
+    """Bytes that a scene or an object from photos will take, or None where they are not known.
+
+    They are not known of a cloud, a video, and photos that are yet to be made or cannot be read. With a cloud beside
+    the photos there are no maps.
 
     Args:
         kind: `scene` or `object`.
@@ -45,26 +40,27 @@ def forecast(kind: str, row: Mapping[str, Any], settings: Mapping[str, Any]) -> 
     try:
         photos = photo_files(Path(row["photos"]))
         with Image.open(photos[0]) as first:
-            turned = first.getexif().get(Base.Orientation) in SIDEWAYS
+            # Of the orientations 1 to 8, the last four are turned by a quarter.
+            turned = first.getexif().get(Base.Orientation, 1) > 4
             width, height = reversed(first.size) if turned else first.size
     except (OSError, StageError, Image.DecompressionBombError):
         return None
     own, longest, count = settings[kind], max(width, height), len(photos)
     if kind == "scene":
         photo = min(1.0, own["undistort"]["max_size_px"] / longest)
-        maps = SCENE_BYTES * min(photo, own["depth_maps"]["max_image_size_px"] / longest) ** 2
+        maps = BYTES[kind] * min(photo, own["depth_maps"]["max_image_size_px"] / longest) ** 2
     else:
         photo = min(1.0, own["frames"]["max_width_px"] / width)
-        maps = OBJECT_BYTES * min(photo, own["nerf"]["width_px"] / width) ** 2
+        maps = BYTES[kind] * min(photo, own["nerf"]["width_px"] / width) ** 2
         count = math.ceil(count / own["frames"]["frame_step"])
         count = min(count, own["frames"]["max_frames"] or count)
     maps *= not row.get("cloud")
-    pixels = width * height * (PHOTO_BYTES * photo**2 + maps)
-    return round(count * (pixels + FEATURE_BYTES * own["features"]["max_features"]))
+    pixels = width * height * (BYTES["photo"] * photo**2 + maps)
+    return round(count * (pixels + BYTES["feature"] * own["features"]["max_features"]))
 
 
 def forecast_note(needed: Mapping[Path, int | None], keep_maps: bool = True) -> str:
-    """What a run needs beside what is free, in a sentence; "" where nothing of it can be told.
+    """What a run needs and what is free, in a sentence; "" where nothing is known.
 
     Args:
         needed: bytes by folder of results, which need not exist; None where they are unknown.
@@ -88,8 +84,7 @@ def forecast_note(needed: Mapping[Path, int | None], keep_maps: bool = True) -> 
 
 
 def disk_table(folders: Iterable[Path]) -> pd.DataFrame:
-    """Room that the parts of result folders take: columns name (`scenes/{scene}` for instance), part, megabytes; the
-    largest part of each first."""
+    """Disk space of the parts of result folders: name (`scenes/{scene}` for instance), part, megabytes, largest first."""
     rows = [
         {"name": f"{folder.parent.name}/{folder.name}", "part": part, "megabytes": size / 1e6}
         for folder in folders
@@ -101,14 +96,14 @@ def disk_table(folders: Iterable[Path]) -> pd.DataFrame:
 def disk_line(table: pd.DataFrame, name: str) -> str:
     """All of `scenes/{scene}` or `objects/{object}`, and its largest parts; "" where all are below a megabyte."""
     own = table[table["name"] == name]
-    large = own[own["megabytes"] >= 1].head(LARGEST)
+    large = own[own["megabytes"] >= 1].head(MAX_PARTS)
     parts = [f"{part} {_size(1e6 * megabytes)}" for part, megabytes in zip(large["part"], large["megabytes"])]
     return ": ".join([_size(1e6 * own["megabytes"].sum()), ", ".join(parts)]) if parts else ""
 
 
 def parts_of(folder: Path) -> dict[str, int]:
-    """Bytes of the files in a folder, and of those below each folder in it; links take no room. What comes and goes
-    meanwhile, as jobs write it, is left out."""
+    """Bytes of the files in a folder, and of those below each folder in it; links take none. Temporary files of
+    running jobs are left out."""
     parts: dict[str, int] = {}
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if TEMPORARY not in name]

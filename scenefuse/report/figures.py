@@ -15,19 +15,18 @@ from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, upright
-from scenefuse.report.render import luminance, orbit_camera, point_radii, render
+from scenefuse.report.render import MAX_DRAWN, luminance, orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
 
-SCENE_COLOR, ADDED_COLOR, UNCONFIRMED_COLOR = (205, 208, 212), (240, 120, 25), (150, 60, 170)
-CROP_COLOR, OBJECT_COLOR = (40, 95, 185), (245, 170, 85)
-MISSING_COLORS = {NEVER_SEEN: (214, 38, 31), UNTEXTURED: (52, 101, 196), CONTRADICTED: (150, 60, 170)}
-Discs = list[tuple[Cloud, NDArray[np.float32]]]
-"""Clouds and the radii of their points' discs."""
-MOST_DRAWN = 2_000_000
-"""Points of a scene in its figure; of more, every so manyth."""
+GREY, ORANGE, PALE_ORANGE, BLUE, RED, PURPLE = np.array(
+    [[205, 208, 212], [240, 120, 25], [245, 170, 85], [40, 95, 185], [214, 38, 31], [150, 60, 170]], np.uint8
+)
+MISSING_COLORS = {NEVER_SEEN: RED, UNTEXTURED: BLUE, CONTRADICTED: PURPLE}
+# Points of an object's 3D view: with three objects and a scene, the page stays well below 15 MB.
 VIEW_POINTS = 150_000
-"""Of an object's 3D view: with three objects and a scene, the page stays well below 15 MB."""
+# Clouds and the radii of their points' discs.
+Discs = list[tuple[Cloud, NDArray[np.float32]]]
 
 
 def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
@@ -130,12 +129,13 @@ def draw_scene(
         StageError: an input is missing.
     """
     scene = open_cloud(dense)
-    every = max(1, -(-len(scene) // MOST_DRAWN))
+    every = max(1, -(-len(scene) // MAX_DRAWN))
     cloud = concatenate([part for _, part in scene.parts(every)])
     views = [] if georeferenced is None else read_views(georeferenced)
     centres = np.array([view.centre for view in views]).reshape(-1, 3)
     shown = [folder for folder in objects if folder.name not in failed]
-    boxes = {f.name: _box_corners(read_cloud(f / "registration/full/crop.ply").points) for f in shown}
+    crops = {f.name: read_cloud(f / "registration/full/crop.ply").points for f in shown}
+    boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
     cameras = "given as a cloud, no cameras" if georeferenced is None else f"cameras (red): {len(centres)}"
     drawn = "" if every == 1 else f" (one in {every} is drawn)"
     note = f"{len(scene):,} points{drawn}, {cameras}, objects (boxes): {len(boxes)}"
@@ -145,8 +145,7 @@ def draw_scene(
 def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict[str, Array]) -> Image:
     """The scene from above and obliquely; cameras at `centres` (N, 3), boxes of 8 corners."""
     radii = point_radii(cloud.points)
-    low, high = np.percentile(cloud.points, [1, 99], axis=0)
-    ground = _box_corners(np.stack([low, high]))
+    ground = box_corners(*np.percentile(cloud.points, [1, 99], axis=0))
     views = {
         "from above": orbit_camera(ground, -90.0, 90.0, (640, 520), orthographic=True),
         "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, (760, 520)),
@@ -167,11 +166,6 @@ def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict
             _draw_box(axes, camera.project(corners)[0], label)
         left += camera.width_px + 8
     return to_image(sheet)
-
-
-def _box_corners(points: Array) -> Array:
-    """The eight corners of the points' bounding box, x slowest."""
-    return box_corners(points.min(0), points.max(0))
 
 
 def _added(cloud: Cloud) -> NDArray[np.bool_]:
@@ -212,8 +206,8 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     kinds = join.after.fields.get("evidence", np.zeros(len(added), np.uint8))
     unconfirmed = added & (kinds == NERF_ONLY)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.where(added[:, None], ADDED_COLOR, SCENE_COLOR)
-    colors = (np.where(unconfirmed[:, None], UNCONFIRMED_COLOR, colors) * shade).astype(np.uint8)
+    colors = np.where(added[:, None], ORANGE, GREY)
+    colors = (np.where(unconfirmed[:, None], PURPLE, colors) * shade).astype(np.uint8)
     images: list[Image | None] = [
         render(join.after, orbit_camera(join.framed, a, 22.0, tile), radii, colors) for a in SIDES_DEG
     ]
@@ -230,9 +224,7 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     tile = (430, 350)
     kinds = cells.fields["missing"] if len(cells) else np.zeros(0, np.uint8)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.concatenate(
-        [SCENE_COLOR * shade, np.array([MISSING_COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)]
-    )
+    colors = np.concatenate([GREY * shade, np.array([MISSING_COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)])
     side = 1.2 * float(np.median(radii)) if len(cells) < 2 else 0.8 * spacing(cells.points)
     cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
     middle = (join.framed.min(0) + join.framed.max(0)) / 2
@@ -274,11 +266,11 @@ def _registration(name: str, join: Surroundings) -> Image:
     """The object over the crop from three sides."""
     tile, dots = (480, 390), point_radii(join.crop.points)
     radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
-    colors, framed = np.tile(np.array(CROP_COLOR, dtype=np.uint8), (len(join.crop), 1)), join.crop.points
+    colors, framed = np.tile(BLUE, (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])
         radii = np.concatenate([radii, point_radii(join.object_cloud.points)])
-        colors = np.concatenate([colors, np.tile(np.array(OBJECT_COLOR, dtype=np.uint8), (len(join.object_cloud), 1))])
+        colors = np.concatenate([colors, np.tile(PALE_ORANGE, (len(join.object_cloud), 1))])
     # Small dots of the crop over the closed surface of the object; without normals both are shaded by depth alone.
     cloud = Cloud(framed)
     views = {"side, azimuth 30°": (30.0, 12.0), "side, azimuth 120°": (120.0, 12.0), "from above": (-90.0, 90.0)}

@@ -20,16 +20,18 @@ from scenefuse.core.transforms import look_at
 Image = NDArray[np.uint8]
 Array = NDArray[np.float64]
 
-WHITE = (255, 255, 255)
-_SUPERSAMPLING = 2
-_EDGE_ON = 0.65
-"""Least cosine between a disc's normal and the ray: its width over its length."""
-_STRAY = 1.4
-"""Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small."""
-_AT_ONCE = 1_000_000
-"""Points whose neighbours are looked up at once: bounds the memory."""
-_SHARPNESS = 3
-"""Power of the blending weight's fall: with more, single points show; with less, fine texture blurs."""
+# Points of a scene that are drawn or shown; of a larger scene every n-th, so that there are no more.
+MAX_DRAWN = 2_000_000
+# Samples along each side of a pixel.
+SUPERSAMPLING = 2
+# Smallest cosine between a disc's normal and the ray: its width over its length. Normals are not exact.
+MIN_COSINE = 0.65
+# Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small.
+MAX_RADIUS_RATIO = 1.4
+# Points whose neighbours are found at once: bounds the memory.
+POINTS_AT_ONCE = 1_000_000
+# Power of the blending weight's fall: with more, single points show; with less, fine texture blurs.
+BLENDING_POWER = 3
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ def point_radii(
     tree, most = cKDTree(points), min(2 * neighbours, len(points) - 1)
     reach, around = np.empty(len(points), dtype=np.float32), np.empty(len(points), dtype=np.float32)
     nearest = np.empty((len(points), most), dtype=np.int32)
-    parts = [slice(start, start + _AT_ONCE) for start in range(0, len(points), _AT_ONCE)]
+    parts = [slice(start, start + POINTS_AT_ONCE) for start in range(0, len(points), POINTS_AT_ONCE)]
     for part in parts:
         distance, index = tree.query(points[part], k=most + 1, workers=threads())
         reach[part], nearest[part] = distance[:, neighbours], index[:, 1:]
@@ -132,7 +134,7 @@ def point_radii(
     for one in np.unique(of):
         middle[of == one] = float(np.median(reach[of == one])) or 1e-9
     # Points that coincide still get a disc.
-    spacing = np.clip(reach, around / 2, _STRAY * around)
+    spacing = np.clip(reach, around / 2, MAX_RADIUS_RATIO * around)
     return (factor * np.clip(spacing, middle / 20, middle * limit)).astype(np.float32)
 
 
@@ -146,7 +148,7 @@ def render(
     camera: Camera,
     radii: ArrayLike,
     colors: ArrayLike | None = None,
-    background: tuple[int, int, int] = WHITE,
+    background: tuple[int, int, int] = (255, 255, 255),
     light: float = 0.35,
     eye_dome: float = 0.8,
 ) -> Image:
@@ -163,9 +165,9 @@ def render(
     """
     fine = replace(
         camera,
-        focal_px=camera.focal_px * _SUPERSAMPLING,
-        width_px=camera.width_px * _SUPERSAMPLING,
-        height_px=camera.height_px * _SUPERSAMPLING,
+        focal_px=camera.focal_px * SUPERSAMPLING,
+        width_px=camera.width_px * SUPERSAMPLING,
+        height_px=camera.height_px * SUPERSAMPLING,
     )
     rgb = _base_colors(cloud, colors) * _head_light(cloud, camera, light)[:, None]
     pixels, depth = fine.project(cloud.points)
@@ -192,7 +194,7 @@ def render(
         step = np.float32(max(high - low, 1e-6) * 0.02)
         picture *= _eye_dome(surface, 1.2 * size, step, np.float32(eye_dome))[..., None]
     picture[~covered] = np.asarray(background, dtype=np.float32)
-    shape = (camera.height_px, _SUPERSAMPLING, camera.width_px, _SUPERSAMPLING, 3)
+    shape = (camera.height_px, SUPERSAMPLING, camera.width_px, SUPERSAMPLING, 3)
     return np.clip(picture.reshape(shape).mean((1, 3)) + 0.5, 0, 255).astype(np.uint8)
 
 
@@ -223,8 +225,7 @@ def _slopes(cloud: Cloud, camera: Camera, pixels: Array) -> NDArray[np.float32]:
     if not camera.orthographic:
         rays = (pixels - np.array([camera.width_px, camera.height_px]) / 2) / camera.focal_px
         along = along + (normals[:, :2] * rays).sum(1)
-    # A disc seen edge-on keeps some width: normals are not exact.
-    along = np.where(along < 0, -1, 1) * np.maximum(np.abs(along), _EDGE_ON)
+    along = np.where(along < 0, -1, 1) * np.maximum(np.abs(along), MIN_COSINE)
     return np.asarray(-normals[:, :2] / along[:, None], dtype=np.float32)
 
 
@@ -256,7 +257,7 @@ def _splat(pixels, depth, slopes, radius_px, radius, rgb, width, height):  # typ
                 t = a * slopes[i, 0] + b * slopes[i, 1]
                 q = (a * a + b * b + t * t) / (r * r)
                 if q <= 1.0 and depth[i] + radius[i] * np.float32(t / r - 1.5) <= surface[v, u]:
-                    w = np.float32(1.02 - q) ** _SHARPNESS
+                    w = np.float32(1.02 - q) ** BLENDING_POWER
                     total[v, u] += w
                     for c in range(3):
                         picture[v, u, c] += w * rgb[i, c]

@@ -19,9 +19,9 @@ from scenefuse.report.values import find, flatten, load, number, unit_of
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
 REACH = (0.35, 0.35, 0.15)
-DARK, BRIGHT, MOST_BRIGHTER = 100.0, 160.0, 4.0
-"""Surroundings of which nine points in ten are darker than the first (0..255) are shown brighter, so that the tenth has
-the second, by a factor of at most the third: a place in the shade would be a black picture."""
+# A place in the shade would be a black picture: where nine points in ten are darker than DARK (0 to 255), colours are
+# shown brighter, so that the tenth is as bright as BRIGHT, by a factor of at most MAX_FACTOR.
+DARK, BRIGHT, MAX_FACTOR = 100.0, 160.0, 4.0
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def how_much_brighter(cloud: Cloud) -> float:
     if cloud.colors is None or not len(cloud):
         return 1.0
     upper = float(np.percentile(luminance(cloud.colors), 90))
-    return 1.0 if upper >= DARK else round(min(BRIGHT / max(upper, 1.0), MOST_BRIGHTER), 1)
+    return 1.0 if upper >= DARK else round(min(BRIGHT / max(upper, 1.0), MAX_FACTOR), 1)
 
 
 def with_brighter(cloud: Cloud, factor: float) -> Cloud:

@@ -10,14 +10,11 @@ from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.photos.geodesy import length_unit
+from scenefuse.report.render import MAX_DRAWN
 from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
 
+# Points of a scene's view; with those of three objects, the page stays well below 15 MB.
 VIEW_POINTS = 250_000
-"""Of a scene's view; see the note at that of an object."""
-MOST_READ = 2_000_000
-"""Of a larger scene one in so many points is looked at, that there are no more than these, and all near the objects."""
-AZIMUTH_DEG, ELEVATION_DEG = -60.0, 35.0
-"""As in the scene's figure, a little higher: the objects do not hide each other."""
 
 
 def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeference_json: Path, folder: Path) -> None:
@@ -35,7 +32,7 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     """
     scene, whole, about = open_cloud(dense), open_cloud(completed), read_json(completed_json)
     sources = {int(number): name for number, name in value(about, "sources").items()}
-    every = max(1, -(-len(scene) // MOST_READ))
+    every = max(1, -(-len(scene) // MAX_DRAWN))
     boxes = _objects(whole, value(about, "scene_points"))
     before, after = _read(scene, every, boxes), _read(whole, every, boxes)
     # Stray points far out would take the precision of the positions, and the picture.
@@ -47,8 +44,8 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     points.fields["near"][:] = _near_objects(points)
     thinned = thin(points, VIEW_POINTS)
     unit = length_unit(georeference_json)
-    view = View(thinned, sources, unit, low, high, AZIMUTH_DEG, ELEVATION_DEG, *counts)
-    write_view(folder, view)
+    # As in the scene's figure, a little higher: the objects do not hide each other.
+    write_view(folder, View(thinned, sources, unit, low, high, -60.0, 35.0, *counts))
     of = "" if every == 1 else f"; of the scene away from its objects one in {every} was looked at"
     print(f"{folder}/view.ply: {len(thinned):,} of {len(points):,} points{of}", flush=True)
 

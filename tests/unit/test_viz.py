@@ -330,7 +330,7 @@ def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(ca
 
 
 def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_object(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenefuse.report.view_scene.MOST_READ", 2000)
+    monkeypatch.setattr("scenefuse.report.view_scene.MAX_DRAWN", 2000)
     scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
     about = {"sources": quantity({"0": "scene", "1": "box"}, ""), "scene_points": quantity(len(scene), "points")}
     write_json(tmp_path / "completed.json", about)
