@@ -84,7 +84,7 @@ def forecast_note(needed: Mapping[Path, int | None], keep_maps: bool = True) -> 
 
 
 def disk_table(folders: Iterable[Path]) -> pd.DataFrame:
-    """Disk space of the parts of result folders: name (`scenes/{scene}` for instance), part, megabytes, largest first."""
+    """Disk space of the parts of result folders: name (such as `scenes/{scene}`), part, megabytes; largest first."""
     rows = [
         {"name": f"{folder.parent.name}/{folder.name}", "part": part, "megabytes": size / 1e6}
         for folder in folders
