@@ -27,7 +27,7 @@ from scenefuse.paper.paper_tables import (
 )
 from scenefuse.paper.published import published
 from scenefuse.photos.workspace import posed_images, read_model
-from scenefuse.report.collected import Collected, RunInputs, collect_run, status_of
+from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import find, load
 
 ON_DEMAND = ("fused_scene.json",)
@@ -65,7 +65,7 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
     beside = _of_other_results(run, results, [v for v in VARIANTS if v in {variant for _, variant in summarised}])
     unfinished = why_not_finished(results, beside)
     rows: list[dict[str, Any]] = []
-    for number, (item, other) in enumerate(zip(collect_run(run)[1], collect_run(beside)[1])):
+    for number, (item, other) in enumerate(zip(summarise(run).objects, summarise(beside).objects)):
         if item.alone:
             continue
         folder, its_folder = run.objects[number], beside.objects[number]
@@ -138,7 +138,7 @@ def why_not_finished(results: Path, run: RunInputs) -> str:
     return f"the run in {results} is not finished: {newer} is newer than its summary" if newer else ""
 
 
-def why_not_comparable(pairs: list[tuple[Path, Path]], item: Collected, other: Collected) -> str:
+def why_not_comparable(pairs: list[tuple[Path, Path]], item: ObjectSummary, other: ObjectSummary) -> str:
     """Why what another run made of an object cannot stand beside this run's, or "".
 
     Args:
@@ -147,7 +147,7 @@ def why_not_comparable(pairs: list[tuple[Path, Path]], item: Collected, other: C
         other: what the other one did.
     """
     # Only the paper's stage 1 says whose poses it gives, and only the paper's registration has no gate.
-    if find(other.stages, "stage1.pose_source") is not None or status_of(other, "full") == "ungated":
+    if find(other.stages, "stage1.pose_source") is not None or other.status("full") == "ungated":
         return f"{pairs[0][1]} is of recipe paper itself"
     try:
         for own, its in pairs:
@@ -187,7 +187,7 @@ def _taken_from(folder: Path) -> Any:
     return [find(load(folder / name), "points") for name in ("object.json", "dense.json")]
 
 
-def _tau_share(item: Collected) -> float | None:
+def _tau_share(item: ObjectSummary) -> float | None:
     """Tau as a share of the crop's diagonal; None without a pose."""
     fields = item.variants.get("full", {})
     tau, diagonal = find(fields, "metrics.registration.tau"), find(fields, "crop.diagonal")

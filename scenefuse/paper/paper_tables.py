@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.agreement import registration_metrics
-from scenefuse.report.collected import Collected, reason_of, status_of
+from scenefuse.report.run_summary import ObjectSummary
 from scenefuse.report.values import Fields, find
 
 PAPER, HERE, SCENEFUSE = "paper (published, its own data)", "paper preset (here)", "scenefuse"
@@ -99,17 +99,17 @@ class Column:
     measured: bool = True
 
 
-def column_of(item: Collected) -> Column:
+def column_of(item: ObjectSummary) -> Column:
     """A run's numbers, and why a variant has no pose or none that was accepted."""
     notes = {}
     for variant in VARIANTS:
-        status = status_of(item, variant)
+        status = item.status(variant)
         if status not in ("registered", "ungated"):
-            notes[variant] = ", ".join(filter(None, (status, reason_of(item, variant))))
+            notes[variant] = ", ".join(filter(None, (status, item.reason(variant))))
     return Column(_cells({v: _measured(item.variants.get(v, {})) for v in VARIANTS}), notes, _told(item))
 
 
-def _told(item: Collected) -> str:
+def _told(item: ObjectSummary) -> str:
     """Of a run of the paper's recipe: whose poses it went on with, what it drew of the paper's rays, and its prior."""
     fields = item.stages
     source = find(fields, "stage1.pose_source")
@@ -134,7 +134,7 @@ def without(reason: str) -> Column:
     return Column(notes=dict.fromkeys(VARIANTS, reason))
 
 
-def null_of(folder: Path, item: Collected, seed: int) -> Column | None:
+def null_of(folder: Path, item: ObjectSummary, seed: int) -> Column | None:
     """What the measures give for nothing, on a run's crop and by its tau; None where the run did not come so far.
 
     Of the registration: a random cloud in the place of the object, as many points, uniform in the box of the crop, for
@@ -155,7 +155,7 @@ def null_of(folder: Path, item: Collected, seed: int) -> Column | None:
     return Column(_cells(dict.fromkeys(VARIANTS, found | _measured(fields, "_null"))))
 
 
-def on_crop_of(folder: Path, item: Collected, its_folder: Path, here_from_there: Sim3) -> Column:
+def on_crop_of(folder: Path, item: ObjectSummary, its_folder: Path, here_from_there: Sim3) -> Column:
     """What another run's pose gives on this run's crop, by this run's tau: the same part of the scene for both.
 
     Args:

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 
-from scenefuse.report.collected import Collected
+from scenefuse.report.run_summary import ObjectSummary
 from scenefuse.report.values import Fields, find
 
 # Names quoted of a list of photos.
@@ -16,7 +16,7 @@ MAX_LEFT_OUT, MIN_AGREEMENT = 0.1, 0.75
 MAX_EXPOSURE_STOPS = 0.7
 
 
-def diagnose(item: Collected) -> list[str]:
+def diagnose(item: ObjectSummary) -> list[str]:
     """Sentences on an object's photos, masks and clicks, in the order of the stages; none where all is well."""
     return [sentence for cause in CAUSES for sentence in cause(item.stages)]
 

@@ -12,9 +12,9 @@ import pandas as pd
 
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.missing import CLASSES
-from scenefuse.report.collected import ALONE, Collected, reason_of, status_of, why_missing
 from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.disk import disk_line
+from scenefuse.report.run_summary import ALONE, ObjectSummary, RunSummary, SceneSummary, why_missing
 from scenefuse.report.tables import number_in, plain, records
 from scenefuse.report.values import Fields, find, number, unit_of
 
@@ -40,18 +40,20 @@ REASONS = ("fine.reason", "fusion.reason", "alignment.reason")
 Cell = tuple[str, Any, str]
 
 
-def summary_text(
-    scenes: dict[str, Fields], objects: list[Collected], variants: list[str], tables: dict[str, pd.DataFrame]
-) -> str:
-    """The text, from the quantities of the scenes and objects and from their tables."""
+def summary_text(run: RunSummary, tables: dict[str, pd.DataFrame]) -> str:
+    """The text, from the summary of a run and its tables."""
     lines: list[str] = []
-    for name, row in zip(scenes, records(tables["scenes"])):
-        lines += _heading(f"scene {name}") + _scene_lines(scenes[name], row)
-        lines += _line("disk", disk_line(tables["disk"], f"scenes/{name}"))
-    for item, row in zip(objects, records(tables["objects"])):
-        lines += _heading(f"object {item.name}: {status_of(item, variants[0])}") + _object_lines(item, row, variants)
+    for scene, row in zip(run.scenes, records(tables["scenes"])):
+        lines += _heading(f"scene {scene.name}") + _scene_lines(scene, row)
+        lines += _line("disk", disk_line(tables["disk"], f"scenes/{scene.name}"))
+    for item, row in zip(run.objects, records(tables["objects"])):
+        lines += _heading(f"object {item.name}: {item.status(run.variants[0])}") + _object_lines(
+            item, row, run.variants
+        )
         lines += _line("disk", disk_line(tables["disk"], f"objects/{item.name}"))
-    lines += _heading(_count(objects, variants[0])) + _runtime_lines(tables["runtime"]) + _line("scenefuse", VERSION)
+    lines += (
+        _heading(_count(run.objects, run.variants[0])) + _runtime_lines(tables["runtime"]) + _line("scenefuse", VERSION)
+    )
     return "\n".join(lines) + "\n"
 
 
@@ -79,9 +81,9 @@ def _three(item: float) -> str:
     return f"{item:.1e}" if 0 < abs(item) < 1e-4 else f"{item:.3g}"
 
 
-def _count(objects: list[Collected], variant: str) -> str:
+def _count(objects: list[ObjectSummary], variant: str) -> str:
     """How many objects are done."""
-    statuses = [status_of(item, variant) for item in objects]
+    statuses = [item.status(variant) for item in objects]
     joined, alone = sum(not item.alone for item in objects), [item.name for item in objects if item.alone]
     parts = [f"{statuses.count('registered')} of {joined} objects registered and fused"] if joined else []
     parts += [f"in no scene: {', '.join(alone)}"] if alone or not joined else []
@@ -89,9 +91,10 @@ def _count(objects: list[Collected], variant: str) -> str:
     return "; ".join(parts) + unchecked
 
 
-def _scene_lines(fields: Fields, row: dict[str, Any]) -> list[str]:
+def _scene_lines(scene: SceneSummary, row: dict[str, Any]) -> list[str]:
+    fields = scene.fields
     unit = find(fields, "georeference.length_unit") or "scene units"
-    if find(fields, "dense.points") is None:
+    if scene.missing:
         return _line("missing", f"no dense cloud: {row['error']}")
     lines = _line("given", _given(fields, "dense")) + _line("cameras", _cameras(row, "photos"))
     lines += _line("frame", _pairs(("unit", unit, ""), ("GPS residual (median)", row["gps_residual_median_m"], "m")))
@@ -159,11 +162,11 @@ def _completed(fields: Fields) -> str:
     return ", ".join(parts)
 
 
-def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> list[str]:
-    fields, status = item.variants[variants[0]], status_of(item, variants[0])
+def _object_lines(item: ObjectSummary, row: dict[str, Any], variants: list[str]) -> list[str]:
+    fields, status = item.variants[variants[0]], item.status(variants[0])
     lines = _line("missing", item.missing) + _line("because", why_missing(item.failed) if item.missing else "")
     if find(fields, "fine.status"):
-        lines += _line("reason", str(reason_of(item, variants[0]) or ""))
+        lines += _line("reason", str(item.reason(variants[0]) or ""))
     for k, sentence in enumerate(diagnose(item)):
         lines += _line("" if k else "to improve" if status in ("registered", ALONE) else "likely why", sentence)
     lines += _line("given", _given(item.stages, "object")) + _line("cameras", _cameras(row, "frames"))
@@ -173,7 +176,7 @@ def _object_lines(item: Collected, row: dict[str, Any], variants: list[str]) -> 
     lines += _line("NeRF", _pairs(psnr, ("SSIM", row["stage4_ssim"], "")))
     lines += _line("cloud", _pairs(("points", row["points"], "")))
     lines += _line("alignment", _alignment(item.stages)) + _line("pose", _pose(fields))
-    others = (f"{variant} {status_of(item, variant)}" for variant in variants[1:])
+    others = (f"{variant} {item.status(variant)}" for variant in variants[1:])
     lines += _line("variants", "" if item.alone else ", ".join(others))
     added = ("points added", find(item.fusion, "fusion.added_points"), "")
     unconfirmed = ("of the object unconfirmed", find(item.fusion, "fusion.nerf_only_points"), "")
@@ -253,7 +256,7 @@ def _still_missing(fusion: Fields) -> str:
     return f"{text}; photos from {stations} stations ({where}) would show {shown}"
 
 
-def _object_truth(item: Collected, fields: Fields) -> str:
+def _object_truth(item: ObjectSummary, fields: Fields) -> str:
     """Errors against truth, where it is known; shares are of the object's diagonal."""
     pose = {
         "scale off": "scale_error_pct",

@@ -9,10 +9,9 @@ from typing import Any
 
 import pandas as pd
 
-from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.metrics.completion import MEASURES
 from scenefuse.metrics.scores import SCORES, THRESHOLDS
-from scenefuse.report.collected import Collected, reason_of, status_of, why_missing
+from scenefuse.report.run_summary import ObjectSummary, RunSummary, SceneSummary, why_missing
 from scenefuse.report.values import Fields, find, number
 
 # Columns of registration.tsv: name, and where its value stands.
@@ -40,30 +39,30 @@ SURVEYED = tuple(
 )
 
 
-def registration_table(objects: list[Collected], variants: list[str]) -> pd.DataFrame:
+def registration_table(run: RunSummary) -> pd.DataFrame:
     """One row an object and variant: status, reason, scores, errors against truth; lengths in the scene's unit."""
     rows: list[dict[str, Any]] = []
-    for item in objects:
-        for variant in variants:
+    for item in run.objects:
+        for variant in run.variants:
             fields = item.variants.get(variant, {})
             row = {
                 "object": item.name,
                 "variant": variant,
-                "status": status_of(item, variant),
-                "reason": reason_of(item, variant),
+                "status": item.status(variant),
+                "reason": item.reason(variant),
             }
             rows.append({**row, **{name: number_in(fields, key) for name, key in REGISTRATION.items()}})
     return pd.DataFrame(rows, columns=["object", "variant", "status", "reason", *REGISTRATION])
 
 
-def completion_table(objects: list[Collected], variant: str) -> pd.DataFrame:
+def completion_table(run: RunSummary) -> pd.DataFrame:
     """One row an object and measure: of what was added, of a random cloud in its place (null), before and after.
 
     Scores against truth (`scene_*`) are those of the scene around the object, before and after fusion.
     """
     rows: list[dict[str, Any]] = []
-    for item in objects:
-        fields = item.variants.get(variant, {})
+    for item in run.objects:
+        fields = item.variants[run.variants[0]]
         group = {k.split("completion.", 1)[1]: v for k, v in fields.items() if k.startswith("metrics.completion.")}
         of_measure: dict[str, dict[str, Any]] = {}
         for key, entry in group.items():
@@ -101,13 +100,14 @@ def runtime_table(benchmarks: Path) -> pd.DataFrame:
     return table
 
 
-def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
+def scenes_table(scenes: list[SceneSummary]) -> pd.DataFrame:
     """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth."""
     rows = []
-    for name, fields in scenes.items():
+    for scene in scenes:
+        fields = scene.fields
         added = find(fields, "completed.added_points")
         row: dict[str, Any] = {
-            "scene": name,
+            "scene": scene.name,
             "photos": number_in(fields, "sparse.total", "photos.count"),
             "registered": number_in(fields, "sparse.registered"),
             "reprojection_error_px": number_in(fields, "sparse.mean_reprojection_error_px"),
@@ -124,12 +124,12 @@ def scenes_table(scenes: dict[str, Fields], jobs: JobRecords) -> pd.DataFrame:
             if f"metrics.completion.{measure}" in fields:
                 row[measure] = number_in(fields, f"metrics.completion.{measure}")
         row |= {key.removeprefix("truth."): v["value"] for key, v in truth_numbers(fields).items()}
-        row["error"] = None if find(fields, "dense.points") is not None else why_missing(why_unfinished(jobs, name))
+        row["error"] = why_missing(scene.failed) if scene.missing else None
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def objects_table(objects: list[Collected]) -> pd.DataFrame:
+def objects_table(objects: list[ObjectSummary]) -> pd.DataFrame:
     """One row an object: cameras, masks, the four stages, the cloud against truth."""
     rows = []
     for item in objects:

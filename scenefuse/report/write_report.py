@@ -10,8 +10,8 @@ import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.paper.paper_section import paper_section
-from scenefuse.report.collected import ALONE
 from scenefuse.report.page import asset, document, embedded, figure, view_section
+from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import number
 from scenefuse.report.view import View, read_view, thin
 

@@ -32,7 +32,7 @@ from scenefuse.paper.chain import trajectory_error
 from scenefuse.paper.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
 from scenefuse.paper.published import OBJECTS, published
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.report.collected import Collected, collect
+from scenefuse.report.run_summary import ObjectSummary, summarise_object
 
 SCENE = "demo"
 SCORES = {"0.5": "05pct", "1": "1pct", "2": "2pct"}
@@ -64,9 +64,9 @@ class Run:
             workspace = self.folder / "undistorted"
             self.known = read_object_truth(workspace, truth / "scene", truth / name, SAMPLES, seed)
 
-    def collected(self) -> Collected:
+    def collected(self) -> ObjectSummary:
         """What the summary would know of the object."""
-        return collect(self.folder, list(VARIANTS), self.jobs, SCENE)
+        return summarise_object(self.folder, list(VARIANTS), self.jobs, SCENE)
 
     def measures(self) -> dict[str, Any]:
         """All measures, as far as the run came; lengths in % of the object's diagonal, errors against the truth."""

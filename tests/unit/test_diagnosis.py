@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from scenefuse.core.transforms import look_at
-from scenefuse.report.collected import Collected
 from scenefuse.report.diagnosis import diagnose, named
+from scenefuse.report.run_summary import ObjectSummary
 from scenefuse.sfm.undistort import largest_gap
 
 GOOD = {
@@ -27,12 +27,12 @@ GOOD = {
 def sentences(**changes):
     fields = GOOD | {name.replace("__", "."): item for name, item in changes.items()}
     stages = {name: {"value": item, "unit": ""} for name, item in fields.items()}
-    return diagnose(Collected("rock", stages, {}, {}, "", "", {}))
+    return diagnose(ObjectSummary("rock", stages, {}, {}, "", "", {}))
 
 
 def test_nothing_is_said_where_all_is_well_or_nothing_has_run():
     assert sentences() == []
-    assert diagnose(Collected("rock", {}, {}, {}, "", "", {})) == []
+    assert diagnose(ObjectSummary("rock", {}, {}, {}, "", "", {})) == []
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from scenefuse.paper.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
 from scenefuse.paper.published import OBJECTS, PUBLISHED, published
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.register.agreement import registration_metrics
-from scenefuse.report.collected import RunInputs
+from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.values import load
 from scenefuse.report.write_report import write_report
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.report.collected import RunInputs
+from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.tables import runtime_table
 from scenefuse.report.values import find, flatten, load, number
 from scenefuse.report.write_report import write_report
