@@ -8,7 +8,11 @@ from scipy.spatial import cKDTree
 
 from scenefuse.core.transforms import Array
 
+# Candidates of each kind in a round.
 CANDIDATES = 150
+Mask = NDArray[np.bool_]
+# Points and normals of candidates' two oriented points: p, q, u, v, each (K, 3).
+Pairs = tuple[Array, Array, Array, Array]
 
 
 def primitive_fitting_score(
@@ -52,24 +56,15 @@ def primitive_fitting_score(
 
 
 def _best_primitive(
-    points: Array,
-    normals: Array,
-    tolerance: float,
-    cosine: float,
-    link: float,
-    size: float,
-    rng: np.random.Generator,
+    points: Array, normals: Array, tolerance: float, cosine: float, link: float, size: float, rng: np.random.Generator
 ) -> NDArray[np.int64]:
     """Indices of the largest connected inlier set among one round of candidates."""
     first = rng.integers(0, len(points), CANDIDATES)
     # A partner from the neighbourhood lies on the same primitive far more often than one from anywhere.
     near = cKDTree(points).query(points[first], k=min(60, len(points)))[1]
     second = near[np.arange(CANDIDATES), rng.integers(min(10, len(points) - 1), near.shape[1], CANDIDATES)]
-    masks = [
-        _on_planes(points, normals, points[first], normals[first], tolerance, cosine),
-        _on_spheres(points, normals, first, second, tolerance, cosine, size),
-        _on_cylinders(points, normals, first, second, tolerance, cosine, size),
-    ]
+    pairs = points[first], points[second], normals[first], normals[second]
+    masks = [kind(points, normals, pairs, tolerance, cosine, size) for kind in (_on_planes, _on_spheres, _on_cylinders)]
     inliers = np.concatenate(masks)
     counts = inliers.sum(1)
     best = np.array([], dtype=np.int64)
@@ -81,24 +76,16 @@ def _best_primitive(
     return best
 
 
-def _on_planes(
-    points: Array, normals: Array, anchor: Array, normal: Array, tolerance: float, cosine: float
-) -> NDArray[np.bool_]:
+def _on_planes(points: Array, normals: Array, pairs: Pairs, tolerance: float, cosine: float, size: float) -> Mask:
+    """The plane through the first point; its size is not limited."""
+    anchor, _, normal, _ = pairs
     distance = np.abs(normal @ points.T - (normal * anchor).sum(1)[:, None])
     return (distance <= tolerance) & (np.abs(normal @ normals.T) >= cosine)
 
 
-def _on_spheres(
-    points: Array,
-    normals: Array,
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    tolerance: float,
-    cosine: float,
-    size: float,
-) -> NDArray[np.bool_]:
+def _on_spheres(points: Array, normals: Array, pairs: Pairs, tolerance: float, cosine: float, size: float) -> Mask:
     """The centre is where the two normals' lines come nearest."""
-    p, q, u, v = points[first], points[second], normals[first], normals[second]
+    p, q, u, v = pairs
     along = (u * v).sum(1)
     w = p - q
     a, b, bottom = (u * w).sum(1), (v * w).sum(1), 1 - along**2
@@ -115,17 +102,9 @@ def _on_spheres(
     return fine[:, None] & (np.abs(length - radius[:, None]) <= tolerance) & facing
 
 
-def _on_cylinders(
-    points: Array,
-    normals: Array,
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    tolerance: float,
-    cosine: float,
-    size: float,
-) -> NDArray[np.bool_]:
+def _on_cylinders(points: Array, normals: Array, pairs: Pairs, tolerance: float, cosine: float, size: float) -> Mask:
     """The axis is orthogonal to both normals; across it, the two normals' lines meet at the centre."""
-    p, q, u, v = points[first], points[second], normals[first], normals[second]
+    p, q, u, v = pairs
     axis = np.cross(u, v)
     length = np.linalg.norm(axis, axis=1)
     fine = length > 0.05
