@@ -14,7 +14,7 @@ from scenefuse.fuse.measure import NERF_ONLY
 from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.photos.workspace import read_views
-from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, upright
+from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, sides, upright
 from scenefuse.report.render import MAX_DRAWN, luminance, orbit_camera, point_radii, render
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
@@ -191,10 +191,9 @@ def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
     margin = 0.06 * float(np.linalg.norm(high - low)) * np.array([1.0, 1.0, 0.0])
     rows: list[list[Image | None]] = []
     for cloud, radii in clouds:
-        sides = [render(cloud, orbit_camera(join.framed, a, 22.0, tile), radii) for a in SIDES_DEG]
         near = ((cloud.points >= low - margin) & (cloud.points <= high + margin))[:, :2].all(1)
         from_below = orbit_camera(join.framed, SIDES_DEG[0], -14.0, tile)
-        rows.append([*sides, render(cloud[near], from_below, radii[near])])
+        rows.append([*sides(cloud, join.framed, radii, tile, 22.0), render(cloud[near], from_below, radii[near])])
     after = "after" if join.fused else "after (not fused)"
     columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG] + ["from below, surroundings cut away"]
     return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
@@ -208,9 +207,7 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = np.where(added[:, None], ORANGE, GREY)
     colors = (np.where(unconfirmed[:, None], PURPLE, colors) * shade).astype(np.uint8)
-    images: list[Image | None] = [
-        render(join.after, orbit_camera(join.framed, a, 22.0, tile), radii, colors) for a in SIDES_DEG
-    ]
+    images = sides(join.after, join.framed, radii, tile, 22.0, colors)
     note = (
         f"grey: {(~added).sum():,} points of the scene; orange: {(added & ~unconfirmed).sum():,} points added from the"
         f" object; purple: {unconfirmed.sum():,} of its points that no photo confirms"

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import StageError
@@ -16,6 +16,7 @@ from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import orbit_camera, point_radii, render
 from scenefuse.sfm.gravity import estimate_up
 
+# Azimuths of the four sides that a row of pictures shows.
 SIDES_DEG = (30.0, 120.0, 210.0, 300.0)
 
 
@@ -30,23 +31,35 @@ def object_sheet(name: str, cloud: Cloud, workspace: Path, masks: Path, stages: 
     cut_out = [_dim_outside(f, read_mask(masks / f"{p.stem}.png")) for f, p in zip(frames, chosen)]
     depths, shown = _depth_row(photos, masks, stages)
     renders, labels = _render_row(workspace, stages[-1])
-    radii = point_radii(cloud.points)
-    framed = inner(cloud.points)
-    sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
     captions = {(2, i): f"stage {i + 1}, {shown}" for i in range(4)} | {(3, i): t for i, t in enumerate(labels)}
     captions |= {(0, i): p.name for i, p in enumerate(chosen)}
     row_labels = ["frames", "masks", "depth", "renders", "cloud"]
-    rows: list[list[Image | None]] = [[*frames], [*cut_out], depths, renders, sides]
+    rows: list[list[Image | None]] = [[*frames], [*cut_out], depths, renders, _cloud_row(cloud, tile)]
     note = f"{len(photos)} frames with masks; cloud of {len(cloud):,} points; one depth scale, near bright, far dark"
     return draw_sheet(Sheet(f"{name}: the object by itself", note, rows, row_labels, [], captions, tile))
 
 
 def cloud_sheet(name: str, cloud: Cloud, has_photos: bool) -> Image:
     """The same of an object whose cloud was given: the cloud from four sides."""
-    radii, framed, tile = point_radii(cloud.points), inner(cloud.points), (320, 240)
-    sides: list[Image | None] = [render(cloud, orbit_camera(framed, a, 18.0, tile), radii) for a in SIDES_DEG]
+    tile = (320, 240)
     note = f"given as a cloud of {len(cloud):,} points: no stages, {'its own' if has_photos else 'no'} photos"
-    return draw_sheet(Sheet(f"{name}: the object by itself", note, [sides], ["cloud"], [], {}, tile))
+    return draw_sheet(Sheet(f"{name}: the object by itself", note, [_cloud_row(cloud, tile)], ["cloud"], [], {}, tile))
+
+
+def sides(
+    cloud: Cloud,
+    framed: Array,
+    radii: ArrayLike,
+    tile: tuple[int, int],
+    elevation_deg: float,
+    colors: ArrayLike | None = None,
+) -> list[Image | None]:
+    """A cloud from four sides, all of `framed` in each picture."""
+    return [render(cloud, orbit_camera(framed, a, elevation_deg, tile), radii, colors) for a in SIDES_DEG]
+
+
+def _cloud_row(cloud: Cloud, tile: tuple[int, int]) -> list[Image | None]:
+    return sides(cloud, inner(cloud.points), point_radii(cloud.points), tile, 18.0)
 
 
 def _depth_row(photos: list[Path], masks: Path, stages: list[Path]) -> tuple[list[Image | None], str]:
@@ -68,9 +81,7 @@ def _render_row(workspace: Path, stage: Path) -> tuple[list[Image | None], list[
     """Two of the photos that stage 4 was measured on and their renders, and the captions."""
     row: list[Image | None] = []
     labels = []
-    by_stem = {p.stem: p for p in (workspace / "images").iterdir()} | {
-        p.name: p for p in (workspace / "images").iterdir()
-    }
+    by_stem = {name: path for path in (workspace / "images").iterdir() for name in (path.stem, path.name)}
     files = sorted(p for p in (stage / "renders").glob("*.png") if p.stem in by_stem)
     for path in files[:: max(1, len(files) // 2)][:2]:
         photo = by_stem[path.stem]
