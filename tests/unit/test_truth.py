@@ -19,7 +19,7 @@ from scenefuse.metrics import truth as tr
 from scenefuse.metrics.evaluate_object import EvaluationInputs, evaluate_object
 from scenefuse.metrics.evaluate_scene import evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
-from scenefuse.metrics.scores import f_score
+from scenefuse.metrics.scores import f_score, scores_at
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 from scenefuse.photos.maps import write_depth
 from scenefuse.photos.pictures import read_gray
@@ -227,7 +227,7 @@ def test_a_perfect_object_and_a_planted_scale_error(planted: Path, tmp_path: Pat
 
 
 def test_scores_at_each_threshold_by_hand() -> None:
-    found = tr.scores_at(np.array([0.02, 0.04, 0.09, 0.3]), np.array([0.02, 0.3, 0.3, 0.3]), 10.0)
+    found = scores_at(np.array([0.02, 0.04, 0.09, 0.3]), np.array([0.02, 0.3, 0.3, 0.3]), 10.0)
     assert list(found) == ["025pct", "05pct", "1pct", "2pct"]
     assert [scores["precision"] for scores in found.values()] == [0.25, 0.5, 0.75, 0.75]
     assert [scores["recall"] for scores in found.values()] == [0.25] * 4
