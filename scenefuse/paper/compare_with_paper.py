@@ -11,6 +11,7 @@ import pandas as pd
 from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import StageError, atomic_file, read_json, setting
 from scenefuse.core.transforms import Sim3, fit_sim3
+from scenefuse.paper.paper_section import paper_section
 from scenefuse.paper.paper_tables import (
     COMMON,
     HERE,
@@ -23,9 +24,9 @@ from scenefuse.paper.paper_tables import (
     null_of,
     on_crop_of,
     paper_rows,
+    published,
     without,
 )
-from scenefuse.paper.published import published
 from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import find, load
@@ -43,7 +44,7 @@ class ComparisonSettings:
     `paper` only). Without such a run there the column is empty, and paper.tsv says why."""
 
 
-def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: Path, seed: int) -> None:
+def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: Path, section: Path, seed: int) -> None:
     """Write the paper's Tables 2 to 4 (He et al. 2026) for the objects that lie in a scene.
 
     The definition in a row is that of this run's number, the shipped recipe's and the null; the published numbers are
@@ -55,6 +56,7 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         run: this run; see RunInputs.
         settings: see ComparisonSettings.
         table: output, TSV: one row an object, table, variant and measure.
+        section: output, HTML: the same as a section of the report page.
         seed: of the random clouds that give the null.
 
     Raises:
@@ -88,6 +90,9 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         rows += paper_rows(item.name, columns)
     with atomic_file(table) as temporary:
         pd.DataFrame(rows).to_csv(temporary, sep="\t", index=False, na_rep="-", float_format="%.6g")
+    written = pd.read_csv(table, sep="\t", dtype=str, keep_default_na=False)
+    with atomic_file(section) as temporary:
+        temporary.write_text(paper_section(written.to_dict("records")), encoding="utf-8")
     for note in dict.fromkeys(f"{row['object']}: {row['note']}" for row in rows if row["note"]):
         print(note, flush=True)
 

@@ -9,7 +9,6 @@ from typing import Any
 import yaml
 
 from scenefuse.core.stage import StageError, atomic_file
-from scenefuse.paper.paper_section import paper_section
 from scenefuse.report.page import asset, document, embedded, figure, view_section
 from scenefuse.report.run_summary import ALONE
 from scenefuse.report.values import number
@@ -40,7 +39,7 @@ def write_report(
         summary: folder with the summary's TSV files and summary.txt; an absent table is left out.
         scenes: result folders of the scenes; scene.png and the 3D view in it are shown.
         objects: result folders of the objects; figures/ in it is shown. One without figures is named as such.
-        paper: table that compares the run with the paper, which only recipe `paper` has; it may be missing.
+        paper: section that compares the run with the paper, HTML, which only recipe `paper` has; it may be missing.
         title: heading of the page.
         report: output, one HTML file.
 
@@ -65,7 +64,7 @@ def write_report(
         "<nav>" + " ".join(f'<a href="#{escape(to)}">{escape(name)}</a>' for to, name in links.items()) + "</nav>",
         *(_object_section(f, of_object.get(f.name, {}), views.get(f / "figures"), texts) for f in objects),
         *(_scene_section(f, of_scene.get(f.name, {}), views.get(f), texts) for f in drawn),
-        *([] if paper is None else [paper_section(_read_table(paper))]),
+        *([] if paper is None else [_paper_section(paper)]),
         *(_table_section(name, rows, **texts["tables"][name]) for name, rows in tables.items()),
         f"<h2>Summary</h2><pre>{escape(text.read_text().strip())}</pre>",
     ]
@@ -73,6 +72,13 @@ def write_report(
     with atomic_file(report) as temporary:
         temporary.write_text(page, encoding="utf-8")
     print(f"{report}: {len(page) / 1e6:.1f} MB", flush=True)
+
+
+def _paper_section(path: Path) -> str:
+    """The section of the paper as it was written, or that it is missing."""
+    if path.is_file():
+        return path.read_text(encoding="utf-8")
+    return f'<h2 id="paper">The paper</h2><p>{path.name} is missing; results/logs/compare_with_paper/ says why.</p>'
 
 
 def _views(folders: list[Path]) -> dict[Path, View]:

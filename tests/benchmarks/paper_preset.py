@@ -29,8 +29,17 @@ from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.object_truth import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
 from scenefuse.paper.chain import trajectory_error
-from scenefuse.paper.paper_tables import COMMON, NULL, PAPER, SCENEFUSE, VARIANTS, column_of, null_of
-from scenefuse.paper.published import OBJECTS, published
+from scenefuse.paper.paper_tables import (
+    COMMON,
+    NULL,
+    OBJECTS,
+    PAPER,
+    SCENEFUSE,
+    VARIANTS,
+    column_of,
+    null_of,
+    published,
+)
 from scenefuse.photos.workspace import read_workspace
 from scenefuse.report.run_summary import ObjectSummary, summarise_object
 

@@ -15,8 +15,7 @@ from scenefuse.core.stage import quantity, value, write_json
 from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.paper.compare_with_paper import ComparisonSettings, between_scenes, compare_with_paper
 from scenefuse.paper.paper_section import paper_section
-from scenefuse.paper.paper_tables import COMMON, HERE, NULL, PAPER, SCENEFUSE
-from scenefuse.paper.published import OBJECTS, PUBLISHED, published
+from scenefuse.paper.paper_tables import COMMON, HERE, NULL, OBJECTS, PAPER, PUBLISHED, SCENEFUSE, published
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.register.agreement import registration_metrics
 from scenefuse.report.run_summary import RunInputs
@@ -124,7 +123,8 @@ def compared(folder, compared_with=SHIPPED):
         scene_of=("yard",) * len(NAMES),
     )
     table = results / "summary/paper.tsv"
-    compare_with_paper(run=run, settings=ComparisonSettings(str(folder / compared_with)), table=table, seed=0)
+    settings = ComparisonSettings(str(folder / compared_with))
+    compare_with_paper(run=run, settings=settings, table=table, section=table.with_suffix(".html"), seed=0)
     read = pd.read_csv(table, sep="\t", na_values=["-"], keep_default_na=False)
     return read.set_index(["object", "table", "variant", "measure"])
 
@@ -347,7 +347,7 @@ def page_of(folder, paper):
 def test_the_page_shows_the_tables_with_definitions_reasons_and_figures(folder):
     fail(folder / OWN, "house", "no <volume>")
     compared(folder)
-    page = page_of(folder, folder / OWN / "summary/paper.tsv")
+    page = page_of(folder, folder / OWN / "summary/paper.html")
     text = re.sub(r"<[^>]+>", " ", page)
     assert '<a href="#paper">' in page and all(f"Table {number}: " in text for number in (2, 3, 4))
     assert "no &lt;volume&gt;" in page and "<volume>" not in page
@@ -361,8 +361,8 @@ def test_the_page_of_another_recipe_shows_no_table_of_before(folder):
     assert "Table 2" not in page_of(folder, None)
 
 
-def test_the_page_says_that_the_table_could_not_be_made(folder):
-    assert "paper.tsv is missing" in page_of(folder, folder / OWN / "summary/paper.tsv")
+def test_the_page_says_that_the_section_could_not_be_made(folder):
+    assert "paper.html is missing" in page_of(folder, folder / OWN / "summary/paper.html")
 
 
 def test_the_page_says_which_rows_a_note_is_about():

@@ -13,7 +13,6 @@ LIBRARY = ROOT / "scenefuse"
 PACKAGES = ["core", "cloud", "photos", "marks", "geometry", "sfm", "georef", "mvs", "masks", "nerf", "crop"]
 PACKAGES += ["register", "fuse", "metrics", "report", "paper", "pick", "two_clouds"]
 MAY_IMPORT = {name: set(PACKAGES[: PACKAGES.index(name) + 1]) for name in PACKAGES}
-MAY_IMPORT["report"] |= {"paper.paper_section"}
 # The demo is outside the library: it writes captures and their truth, and no package imports it.
 MAY_IMPORT |= {"demo": {"core", "cloud", "photos", "metrics", "demo"}, "config": {*PACKAGES, "demo"}}
 MAY_IMPORT |= {"new_project": {"core", "cloud", "photos"}, "command_line": {*PACKAGES, "new_project"}}

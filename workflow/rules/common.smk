@@ -64,8 +64,8 @@ CLOUD_SCENES, CLOUD_OBJECTS, POSED_SCENES, POSED_OBJECTS = (
     for rows in (SCENES, OBJECTS)
 )
 # What compares the paper's recipe with the paper (rules/paper.smk); nothing where another recipe runs.
-PAPER_TABLE = (
-    ["results/summary/paper.tsv"]
+PAPER = (
+    ["results/summary/paper.tsv", "results/summary/paper.html"]
     if config["object"]["recipe"] == "paper" and JOINED
     else []
 )

@@ -5,7 +5,7 @@
 # OUTPUTS   results/objects/{object}/stage1/ to stage4/, their JSON, object.ply, registration/{variant}/
 #           results/objects/{object}/poses/, poses.json                     poses after stage 1: the pose network's chain, or SfM's
 #           results/objects/{object}/refined_poses/, refined_poses.json     the same after stage 3
-#           results/summary/paper.tsv    the paper's Tables 2 to 4, beside the run that config names: evaluation.paper
+#           results/summary/paper.tsv, paper.html    the paper's Tables 2 to 4, beside the run that config names: evaluation.paper
 
 
 ruleorder: estimate_as_paper > train_depth
@@ -236,11 +236,12 @@ rule compare_with_paper:
     input:
         "results/summary/summary.txt",
     output:
-        report(
+        table=report(
             "results/summary/paper.tsv",
             category="Tables",
             caption="../report/paper.rst",
         ),
+        section="results/summary/paper.html",
     log:
         "results/logs/compare_with_paper/all.log",
     benchmark:
@@ -260,4 +261,5 @@ rule compare_with_paper:
     message:
         "Summary: the paper's tables"
     shell:
-        "exec python {params.script} {params.run} {params.options} --table {output} --seed {params.seed} &> {log}"
+        "exec python {params.script} {params.run} {params.options} --table {output.table} --section {output.section}"
+        " --seed {params.seed} &> {log}"

@@ -212,7 +212,7 @@ rule write_report:
         scenes=expand("results/scenes/{scene}/scene.png", scene=SCENES),
         views=expand("results/scenes/{scene}/view.json", scene=SCENES),
         figures=expand("results/objects/{object}/figures", object=OBJECTS),
-        paper=PAPER_TABLE,
+        paper=PAPER,
     output:
         "results/summary/report.html",
     log:
@@ -226,7 +226,7 @@ rule write_report:
         runtime=10,
     params:
         folders=result_folders,
-        paper=flags({"paper": PAPER_TABLE[0]} if PAPER_TABLE else {}),
+        paper=flags({"paper": PAPER[1]} if PAPER else {}),
         script=script("report/write_report.py"),
         code=code("report/write_report.py"),
     message:
@@ -275,7 +275,8 @@ onerror:
     )
     for job in held_up("compare_with_paper") if keep_going else []:
         # If it fails, the page may not show one of before.
-        Path(*job.output).unlink(missing_ok=True)
+        for output in job.output:
+            Path(output).unlink(missing_ok=True)
         run_anyway(job)
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
