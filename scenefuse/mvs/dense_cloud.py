@@ -23,18 +23,17 @@ from scenefuse.photos.maps import read_depth, write_depth
 from scenefuse.photos.workspace import View, read_views
 from scenefuse.sfm.interrupt import cancellable
 
-FEW_FUSED = 0.01
-"""Share of the measured pixels below which the cameras or the limits are probably wrong."""
+# Share of the measured pixels below which the cameras or the limits are probably wrong.
+MIN_FUSED_SHARE = 0.01
+# Steps from photo to photo in one point's search for agreement: COLMAP's own limit.
 MAX_TRAVERSAL_DEPTH = 100
-"""Steps from photo to photo in one point's search for agreement: COLMAP's own limit."""
+# Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50.
 CACHED_MAPS = 64
-"""Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50."""
+# A pixel of a photo's depth and normal map; a pixel of the photo, which COLMAP keeps at its own size.
 MAP_BYTES, PHOTO_BYTES = 16, 3
-"""A pixel of a photo's depth and normal map; a pixel of the photo, which COLMAP keeps at its own size."""
-OUTLIER_NEIGHBOURS = 8
-"""Neighbours whose mean distance tells a point far from all others."""
-OUTLIER_RATIO = 4.0
-"""Such a point is dropped when that distance is more than so many times the cloud's median."""
+# Neighbours whose mean distance shows a point far from all others; it is dropped when that is more than so many times
+# the cloud's median.
+OUTLIER_NEIGHBOURS, OUTLIER_RATIO = 8, 4.0
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def _path(folder: Path, part: str, name: str) -> Path:
 def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, Any]], unit: str) -> dict[str, Any]:
     """The cloud in numbers, with a note where it holds few of the measured pixels; and how its depth maps were made."""
     share, notes = float(cloud.fields["views"].sum() / max(measured, 1)), []
-    if share < FEW_FUSED:
+    if share < MIN_FUSED_SHARE:
         notes.append(
             f"only {share:.2%} of the pixels with a depth are in the cloud: the photos' depths disagree; look at"
             " the cameras, or raise max_depth_error, max_reprojection_px or max_normal_error_deg"

@@ -1,5 +1,7 @@
 """Depth maps of an undistorted COLMAP workspace, in chunks."""
 
+import os
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,11 +13,13 @@ import torch
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, atomic_directory, manifest, quantity, threads, write_json
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
-from scenefuse.mvs.temporary_workspace import MAPS, collect_maps, linked_workspace
+from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.mvs.view_selection import Reference, select_views
 from scenefuse.photos.maps import read_depth, write_depth, write_normals
 from scenefuse.photos.workspace import View, Workspace, read_workspace
 from scenefuse.sfm.interrupt import cancellable
+
+MAPS = ("depth_maps", "normal_maps")
 
 
 def estimate_depth_maps(
@@ -147,3 +151,24 @@ def run_patch_match(
         cancellable(pycolmap.patch_match_stereo, temporary, "COLMAP", "option-all", options)
         kind = "geometric" if settings.geometric else "photometric"
         collect_maps(stereo, [r.view.name for r in references], kind, folder)
+
+
+def collect_maps(stereo: Path, names: Iterable[str], kind: str, output: Path) -> None:
+    """Move the depth and normal maps of photos from a workspace's stereo/ to output/{depth,normal}_maps/{photo}.bin.
+
+    Args:
+        stereo: folder that COLMAP wrote its maps to, on the file system of `output`.
+        names: of photos, perhaps in subfolders.
+        kind: of the maps, "photometric" or "geometric".
+        output: folder of the maps.
+
+    Raises:
+        StageError: COLMAP made no map of a photo.
+    """
+    for name in names:
+        for part in MAPS:
+            source, target = stereo / part / f"{name}.{kind}.bin", output / part / f"{name}.bin"
+            if not source.is_file():
+                raise StageError(f"COLMAP's patch-match left no {name}.{kind}.bin in {part}; look at the log")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(source, target)

@@ -14,13 +14,13 @@ from scenefuse.mvs.plane_sweep import refine_by_matching
 from scenefuse.photos.views import Views
 from scenefuse.photos.workspace import View
 
+# Photos that a photo is matched with, and of these the ones that count: others may not see the place.
 SOURCES, BEST_SOURCES = 8, 3
-"""Photos that a photo is matched with, and of these the ones that count: others may not see the place."""
+# Between two photos: enough baseline to measure, little enough to look alike.
 BEST_ANGLE_DEG = 15.0
-"""Between two photos: enough baseline to measure, little enough to look alike."""
-PLACES, HIDDEN = 200, 0.05
-"""Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
-place is hidden there."""
+# Places of a photo's depth map that other photos are chosen by; behind another's surface by this share of its depth, a
+# place is hidden there.
+PLACES, HIDDEN_SHARE = 200, 0.05
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ def choose_sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> N
         view = replace(views.view(index), cam_from_world=np.linalg.inv(poses[index]))
         shown, pixels, away = view.visible(places.reshape(-1, 3))
         there = depth[pixels[:, 1], pixels[:, 0]]
-        shown = shown[(there == 0) | (away <= (1 + HIDDEN) * there)]
+        shown = shown[(there == 0) | (away <= (1 + HIDDEN_SHARE) * there)]
         share = np.bincount(shown // PLACES, minlength=len(depths)) / PLACES
         off = np.abs(_angles_deg(centres - middles, centres[index] - middles) - BEST_ANGLE_DEG)
         worth[:, index] = share / (1 + off / BEST_ANGLE_DEG)

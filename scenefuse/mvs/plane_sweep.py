@@ -19,19 +19,26 @@ from torch import Tensor
 
 from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.matcher import Matcher, box
-from scenefuse.mvs.measured import is_measured
+from scenefuse.geometry.matcher import Matcher, box, support_weights, supported_mean
 from scenefuse.photos.workspace import View
 
+# Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
+# pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things.
 PLANE_PX, NORMAL_PX = 9, 11
-"""Side of the windows that planes are fitted in, for depths and for normals: windows of 5 let the depths of single
-pixels, off by half a step, turn normals by 12 degrees; larger ones lose small things."""
+# The same where depths are already nearly right: smaller, since objects are curved.
 KNOWN_PLANE_PX = 7
-"""The same where depths are already nearly right: smaller, since objects are curved."""
+# Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere.
 MIN_GAIN = 0.02
-"""Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere."""
-TEXTURE = 2 / 255
-"""Windows whose grey values deviate by this much (two of 255 levels) have a texture that must match somewhere."""
+# Windows whose grey values deviate by this much (two of 255 levels) have a texture that must match somewhere.
+MIN_TEXTURE = 2 / 255
+# A match must be worse this far beside it, in pixels of the middle one of the source photos: a high correlation alone
+# says little, as a shaded wall matches at all depths.
+PEAK_DISTANCE_PX = 1.5
+# By how much, in NCC, and how much more for noise as strong as the texture: in that ratio noise changes NCC.
+MIN_PEAK, MIN_PEAK_PER_NOISE = 0.02, 0.25
+# Largest share of blank pixels among those around that look alike, in windows of this side, twice over: the glow beside
+# an edge lies at the rim of a blank sky.
+MAX_BLANK_SHARE, SUPPORT_PX = 0.25, 11
 
 
 @dataclass(frozen=True)
@@ -139,7 +146,7 @@ def refine_by_matching(
     before = matcher.score(first[None])[0]
     moved = (score >= min_score) & (score - before >= MIN_GAIN) & ((inverse - first).abs() <= step)
     moved &= torch.from_numpy(known).to(device)
-    testable = (matcher.variance >= TEXTURE**2) & (matcher.seen_by(first) >= matcher.best)
+    testable = (matcher.variance >= MIN_TEXTURE**2) & (matcher.seen_by(first) >= matcher.best)
     inconsistent = ~moved & (before < min_score) & testable
     refined = torch.where(moved, 1 / inverse.clamp(min=1e-12), torch.from_numpy(depth).to(device))
     return refined.cpu().numpy(), moved.cpu().numpy(), inconsistent.cpu().numpy() & known
@@ -283,3 +290,29 @@ def _median3(values: Tensor) -> Tensor:
     height, width = values.shape
     padded = F.pad(values[None, None], (1, 1, 1, 1), mode="replicate")[0, 0]
     return torch.stack([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)]).median(0).values
+
+
+def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: float, pixel: float) -> Tensor:
+    """Where an inverse depth (h, w) is a measurement, (h, w) bool.
+
+    Args:
+        matcher: that found it.
+        inverse: (h, w) inverse depths.
+        score: (h, w) their mean NCC.
+        min_score: smallest score of a match, -1..1.
+        pixel: difference of inverse depth that moves a pixel by one in the middle one of the source photos.
+    """
+    away = PEAK_DISTANCE_PX * pixel
+    beside = matcher.score(torch.stack([inverse - away, inverse + away])).amax(0)
+    noise = matcher.flat / matcher.variance.clamp(min=1e-12)
+    measured = (score >= min_score) & (score - beside >= MIN_PEAK + MIN_PEAK_PER_NOISE * noise)
+    return measured & ~_among_blank(matcher, measured)
+
+
+def _among_blank(matcher: Matcher, measured: Tensor) -> Tensor:
+    """True (h, w) where of the pixels around that look alike too many have neither texture nor a measurement."""
+    weights = support_weights(matcher.reference, SUPPORT_PX)
+    known, blank = measured.float(), (~measured & (matcher.variance < matcher.flat)).float()
+    for _ in range(2):
+        known, blank = (supported_mean(values, weights) for values in (known, blank))
+    return blank > MAX_BLANK_SHARE * (known + blank)

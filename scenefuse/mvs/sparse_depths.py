@@ -8,14 +8,14 @@ from scipy.spatial import Delaunay, QhullError
 from scenefuse.core.transforms import Array
 from scenefuse.photos.views import Views
 
-LONGEST_SIDE = 0.06
-"""Of a triangle between sparse points, over the photo's longer side; farther apart they need not be one surface."""
-FROM_MASK_PX = 2
-"""Sparse points off the mask, but this near to it, may be the object's: they are left out."""
-LEAST_ON, SURE = 3, 0.8
-"""Photos that have a sparse point of the object on their masks, and their share of all that observe it."""
-BEFORE = 0.02
-"""What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge."""
+# Longest side of a triangle between sparse points, over the photo's; farther apart they need not be one surface.
+MAX_TRIANGLE_SIDE = 0.06
+# Sparse points off the mask, but this near to it, may be the object's: they are left out.
+MASK_REACH_PX = 2
+# Photos that have a sparse point of the object on their masks, and their share of all that observe it.
+CONFIRMING_PHOTOS, MIN_ON_MASK_SHARE = 3, 0.8
+# What hides a point of the object is this much nearer, as a share of its depth: between such points it may bulge.
+BULGE_SHARE = 0.02
 
 
 def sparse_depths(views: Views) -> NDArray[np.float32]:
@@ -37,7 +37,7 @@ def own_points(views: Views) -> NDArray[np.bool_]:
         rows, on_mask, _ = _beside_mask(views, index, views.tracks[index])[:3]
         seen[rows] += 1
         on[rows[on_mask]] += 1
-    return (on >= LEAST_ON) & (on >= SURE * seen)
+    return (on >= CONFIRMING_PHOTOS) & (on >= MIN_ON_MASK_SHARE * seen)
 
 
 def _beside_mask(
@@ -48,7 +48,7 @@ def _beside_mask(
     view = views.view(index)
     mask = views.masks[index, : view.height, : view.width]
     shown, pixels, depth = view.visible(views.sparse[rows])
-    size, at = 2 * FROM_MASK_PX + 1, (pixels[:, 1], pixels[:, 0])
+    size, at = 2 * MASK_REACH_PX + 1, (pixels[:, 1], pixels[:, 0])
     off = cv2.dilate(mask.astype(np.uint8), np.ones((size, size), np.uint8))[at] == 0
     return rows[shown], mask[at], off, view.project(views.sparse[rows[shown]])[0], depth
 
@@ -63,7 +63,7 @@ def _depths_of(views: Views, index: int, own: NDArray[np.bool_]) -> NDArray[np.f
     of_object = _interpolated(exact[on], 1 / depth[on], mask.shape)
     beside = _interpolated(
         np.concatenate([exact[off], there[hidden]]),
-        1 / np.concatenate([depth[off], (1 - BEFORE) * behind[hidden]]),
+        1 / np.concatenate([depth[off], (1 - BULGE_SHARE) * behind[hidden]]),
         mask.shape,
     )
     nearness = np.where(mask, of_object, beside)
@@ -80,7 +80,7 @@ def _interpolated(at: Array, values: Array, shape: tuple[int, ...]) -> Array:
     except (QhullError, ValueError):  # fewer than three points, or all on a line
         return np.zeros(shape)
     sides = np.linalg.norm(at[corners] - at[np.roll(corners, 1, axis=1)], axis=2)
-    corners = corners[sides.max(1) <= LONGEST_SIDE * max(shape)]
+    corners = corners[sides.max(1) <= MAX_TRIANGLE_SIDE * max(shape)]
     for label, triangle in enumerate(np.floor(at[corners]).astype(np.int32), start=1):
         cv2.fillConvexPoly(drawn, triangle, label)
     # Of each triangle the plane (a, b, c): value = a x + b y + c. Slivers have none.

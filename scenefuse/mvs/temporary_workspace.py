@@ -1,14 +1,11 @@
-"""The temporary workspace that COLMAP's dense stereo and fusion run in, and the maps that its stereo leaves there."""
+"""The temporary workspace that COLMAP's dense stereo and fusion run in."""
 
-import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
-from scenefuse.core.stage import StageError, scratch_directory
+from scenefuse.core.stage import scratch_directory
 from scenefuse.photos.workspace import posed_images, read_model
-
-MAPS = ("depth_maps", "normal_maps")
 
 
 @contextmanager
@@ -34,24 +31,3 @@ def linked_workspace(workspace: Path, beside: Path, map_widths: Mapping[str, int
         model.write_binary(folder / "sparse")
         (folder / "images").symlink_to((workspace / "images").resolve())
         yield folder
-
-
-def collect_maps(stereo: Path, names: Iterable[str], kind: str, output: Path) -> None:
-    """Move the depth and normal maps of photos from a workspace's stereo/ to output/{depth,normal}_maps/{photo}.bin.
-
-    Args:
-        stereo: folder that COLMAP wrote its maps to, on the file system of `output`.
-        names: of photos, perhaps in subfolders.
-        kind: of the maps, "photometric" or "geometric".
-        output: folder of the maps.
-
-    Raises:
-        StageError: COLMAP made no map of a photo.
-    """
-    for name in names:
-        for part in MAPS:
-            source, target = stereo / part / f"{name}.{kind}.bin", output / part / f"{name}.bin"
-            if not source.is_file():
-                raise StageError(f"COLMAP's patch-match left no {name}.{kind}.bin in {part}; look at the log")
-            target.parent.mkdir(parents=True, exist_ok=True)
-            os.replace(source, target)

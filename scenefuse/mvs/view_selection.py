@@ -8,12 +8,12 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.photos.workspace import View, Workspace
 
-LEAST_SHARED = 8
-"""Sparse points that a photo has to have, and to share with a source: fewer do not tell depths and angles."""
+# Sparse points that a photo has to have, and to share with a source: fewer do not determine depths and angles.
+MIN_SHARED_POINTS = 8
+# Between two rays to a point: below there is little baseline to measure with, above surfaces look different.
 GOOD_ANGLES_DEG = (8, 25)
-"""Between two rays to a point: below there is little baseline to measure with, above surfaces look different."""
-WORTH_BELOW_DEG, WORTH_ABOVE_DEG = 4.0, 10.0
-"""Standard deviations with which a point's weight falls off on both sides."""
+# Standard deviations with which a point's weight falls off below and above them.
+FALLOFF_DEG = (4.0, 10.0)
 
 
 @dataclass(frozen=True)
@@ -54,12 +54,12 @@ def select_views(workspace: Workspace, sources: int, min_angle_deg: float) -> di
     seen = [np.unique(rows) for rows in workspace.seen]
     found = {}
     for k, view in enumerate(workspace.views):
-        if len(seen[k]) < LEAST_SHARED:
+        if len(seen[k]) < MIN_SHARED_POINTS:
             continue
         worth = []
         for j, other in enumerate(workspace.views):
             shared = np.intersect1d(seen[k], seen[j], assume_unique=True) if j != k else np.empty(0)
-            if len(shared) < LEAST_SHARED:
+            if len(shared) < MIN_SHARED_POINTS:
                 continue
             angles = _angles_deg(workspace.points[shared], view.centre, other.centre)
             if np.median(angles) >= min_angle_deg:
@@ -93,6 +93,6 @@ def _angles_deg(points: Array, a: Array, b: Array) -> Array:
 
 def _angle_weight(angles_deg: Array) -> Array:
     """Worth of a point seen at these angles, (N,) in 0..1."""
-    low, high = GOOD_ANGLES_DEG
-    width = np.where(angles_deg < low, WORTH_BELOW_DEG, np.where(angles_deg > high, WORTH_ABOVE_DEG, 1.0))
+    (low, high), (below, above) = GOOD_ANGLES_DEG, FALLOFF_DEG
+    width = np.where(angles_deg < low, below, np.where(angles_deg > high, above, 1.0))
     return np.exp(-0.5 * ((angles_deg - np.clip(angles_deg, low, high)) / width) ** 2)
