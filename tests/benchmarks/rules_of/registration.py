@@ -1,0 +1,256 @@
+"""The rules of registration by clouds, on planted trials: the pose is right, refused, or wrong and accepted.
+
+Trials are of four kinds in turn: with all evidence, by shape alone (no gravity, colours or depth maps), with all
+evidence where the scene shows more, and another object's scene, in which every pose is wrong.
+"""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from registration import ROTATION_DEG, SCALE_PCT, SHIFT, planted
+from rules import Rule
+from support.planted import SHAPES, errors
+
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.core.transforms import Sim3
+from scenefuse.geometry.pairs import Pairs
+from scenefuse.register import decision, refinement
+from scenefuse.register.coarse import CoarseSettings, find_hypotheses
+from scenefuse.register.decision import FineSettings
+from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.scale import ScaleSettings, estimates, prior
+from scenefuse.register.score import Hypothesis
+from scenefuse.register.uncertainty import Uncertainty
+
+UP = np.array([0.0, 0.0, 1.0])
+NAMES = list(SHAPES)
+KINDS = ("all evidence, 30 % shown", "shape alone, 70 % shown", "all evidence, 50 % shown", "absent")
+TRIALS = len(KINDS) * len(NAMES)
+OBJECT_POINTS = 6000
+R, G = "scenefuse.register", "scenefuse.geometry"
+
+
+@cache
+def trial_of(number: int) -> tuple[Any, Cloud, str]:
+    """A planted trial, its crop, and its kind."""
+    kind, repeat = KINDS[number % len(KINDS)], number // len(KINDS)
+    name = NAMES[repeat % len(NAMES)]
+    coverage = {KINDS[0]: 0.3, KINDS[1]: 0.7, KINDS[2]: 0.5, KINDS[3]: 0.7}[kind]
+    trial, scene, _ = planted(name, coverage, repeat)
+    if kind == KINDS[3]:
+        other, scene, _ = planted(NAMES[(repeat + 3) % len(NAMES)], coverage, repeat)
+        trial = replace(trial, free_space=other.free_space)
+    return trial, scene, kind
+
+
+def evaluate(number: int, rule: Rule | None) -> dict[str, Any]:
+    """Register one trial. The gate alone is decided again on the pose found with all rules."""
+    if rule is not None and rule.name.startswith("gate"):
+        args = _registered(number)[1]
+        settings = FineSettings()
+        return _rated(number, args[0][0].pose, args[1], decision.decide(*args[:5], settings, *args[6:]))
+    later = rule is not None and rule.where.removeprefix(f"{R}.").split(".")[0] in (
+        "certain",
+        "refinement",
+        "uncertainty",
+    )
+    return _outcome(number, _candidates(number) if later else find_hypotheses(_problem(number), CoarseSettings()))[0]
+
+
+def _problem(number: int) -> Problem:
+    trial, scene, kind = trial_of(number)
+    cloud, evidence = trial.object, Evidence((trial.up_in_object, UP), trial.free_space)
+    if kind == KINDS[1]:
+        cloud, scene, evidence = Cloud(cloud.points, cloud.normals), Cloud(scene.points, scene.normals), Evidence()
+    scales = prior(estimates(cloud, scene, evidence.ups), ScaleSettings())
+    return Problem(cloud, scene, scales, evidence)
+
+
+@cache
+def _candidates(number: int) -> list[Hypothesis]:
+    """With all rules; only rules of what follows are switched off around this."""
+    return find_hypotheses(_problem(number), CoarseSettings())
+
+
+@cache
+def _registered(number: int) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """With all rules, and what the gate was given."""
+    return _outcome(number, _candidates(number))
+
+
+def _outcome(number: int, found: list[Hypothesis]) -> tuple[dict[str, Any], tuple[Any, ...]]:
+    """What the fine registration of candidates gives, and what its gate was given."""
+    given: list[tuple[Any, ...]] = []
+
+    def gate(*args: Any) -> decision.Decision:
+        given.append(args)
+        return decision.decide(*args)
+
+    before, refinement.decide = refinement.decide, gate  # type: ignore[attr-defined]
+    try:
+        starts = [(h.pose, h.source) for h in found]
+        outcome = refinement.refine_hypotheses(_problem(number), starts, FineSettings()) if starts else None
+    finally:
+        refinement.decide = before  # type: ignore[attr-defined]
+    if outcome is None:
+        return _measured(number, False, False, "no hypothesis"), ()
+    return _rated(number, outcome.ranked[0].pose, outcome.stated, outcome.decision), given[0]
+
+
+def _rated(number: int, pose: Sim3, stated: Uncertainty | None, found: decision.Decision) -> dict[str, Any]:
+    """A pose and its decision beside the truth."""
+    trial, _, kind = trial_of(number)
+    axis = UP if SHAPES[NAMES[number // len(KINDS) % len(NAMES)]].round else trial.axis
+    scale, angle, shift = errors(pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal, axis)
+    if kind == KINDS[3] or abs(scale) > SCALE_PCT or angle > ROTATION_DEG or shift > SHIFT:
+        return _measured(number, False, found.registered, found.reason)
+    over = np.nan if stated is None else abs(np.log(1 + scale / 100)) / max(stated.scale_sd_log, 1e-9)
+    return _measured(number, True, found.registered, found.reason, abs(scale), angle, 100 * shift, over)
+
+
+def _measured(number: int, right: bool, accepted: bool, reason: str, *numbers: float) -> dict[str, Any]:
+    names = ("scale_pct", "rotation_deg", "shift_pct", "scale_over_sd")
+    counts = {"right": right and accepted, "refused": not accepted, "wrong": accepted and not right, "found": right}
+    return {
+        "kind": trial_of(number)[2],
+        **{name: int(count) for name, count in counts.items()},
+        **dict(zip(names, numbers or (np.nan,) * 4)),
+        "reason": reason,
+    }
+
+
+def nothing(_: Any) -> Any:
+    """In the place of a function that proposes something."""
+    return lambda *args, **kwargs: []
+
+
+def constant(value: Any) -> Any:
+    """In the place of a number."""
+    return lambda _: value
+
+
+def same(_: Any) -> Any:
+    """In the place of a function that changes its only argument."""
+    return lambda x: x
+
+
+def _one_side(both: Any) -> Any:
+    """Half-sampling on one thinning only."""
+    return lambda surfaces, *args, **kwargs: both(surfaces[:1], *args, **kwargs)
+
+
+def _without_second_turns(turned: Any) -> Any:
+    """Turned copies of the rough poses only."""
+    return lambda self, leaders: turned(self, leaders) if len(leaders) > 1 else []
+
+
+def _even(_: Any) -> Any:
+    """No Tukey weights: each direction sums to a half."""
+
+    def weights(pairs: Pairs, tau: float) -> Any:
+        ahead, count = pairs.forward, len(pairs.distance)
+        return np.where(np.arange(count) < ahead, 0.5 / max(ahead, 1), 0.5 / max(count - ahead, 1))
+
+    return weights
+
+
+def _own_area(score: Any) -> Any:
+    """Precision as a share of the object's own area."""
+    return lambda obj, scene, pose, tau, usual, free_space=None: score(obj, scene, pose, tau, pose.scale, free_space)
+
+
+def _blind(score: Any) -> Any:
+    """A score that knows no free space."""
+
+    def blind(obj: Any, scene: Any, pose: Sim3, tau: float, usual: float, free_space: Any = None) -> Any:
+        found = score(obj, scene, pose, tau, usual)
+        if free_space is None:
+            return found
+        return replace(found, free_space_violation=free_space.violation(pose.apply(obj.points[obj.queries])))
+
+    return blind
+
+
+def _median(prior_of: Any) -> Any:
+    """The prior about the median of the estimates."""
+
+    def about(ledger: Any, settings: ScaleSettings) -> Any:
+        found = prior_of(ledger, settings)
+        return replace(found, centre=float(np.exp(np.median([np.log(e.scale) for e in ledger if e.used]))))
+
+    return about
+
+
+def _extent_only(estimates_of: Any) -> Any:
+    """Only the RMS of the evened clouds."""
+    return lambda *args: estimates_of(*args)[:2]
+
+
+def _setting(**changed: float) -> Any:
+    """Another value of a setting of the gate."""
+    return lambda settings: lambda: replace(settings(), **changed)
+
+
+HERE = __name__
+RULES = [
+    # The scale.
+    Rule("prior: upper quartile of the estimates", f"{HERE}.prior", _median),
+    Rule("prior: footprint, height and hull beside the RMS", f"{HERE}.estimates", _extent_only),
+    Rule("refinement may leave the prior by 0.15", f"{R}.refinement.BEYOND_PRIOR", constant(0.0)),
+    # Candidates.
+    Rule("coarse: sweep of headings", f"{R}.coarse._upright", nothing),
+    Rule("coarse: features", f"{R}.coarse._from_features", nothing),
+    Rule("RANSAC: edges agree on one scale", f"{R}.candidates.LEAST_EDGE_RATIO", constant(0.0)),
+    Rule("sweep: level and upright surfaces apart", f"{R}.candidates._occupancy", lambda f: _one_channel(f)),
+    Rule("sweep: blurred target", f"{R}.candidates._blur", same),
+    Rule("sweep: candidates alike are one", f"{R}.candidates._alike", lambda _: lambda *args: False),
+    Rule("coarse: brief refinement", f"{R}.coarse.ROUNDS", constant(1)),
+    # Refinement.
+    Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
+    Rule("refine: turned copies of the polished", f"{R}.refinement._Work.turned", _without_second_turns),
+    Rule("refine: polish again from 6 % off", f"{R}.refinement.OFF_SCALE", constant(1.0)),
+    Rule("refine: polish that scores worse is dropped", f"{R}.refinement.ASTRAY", constant(0.0)),
+    Rule("refine: repetition", f"{R}.refinement.shifts_onto_itself", nothing),
+    # ICP.
+    Rule("ICP: no pairs beyond the rim", f"{G}.icp._without_overhang", lambda _: lambda *args: args[-1]),
+    Rule("ICP: point rows beside planes", f"{G}.icp.POINT_WEIGHT", constant(0.0)),
+    Rule("ICP: colour rows", f"{R}.refinement.COLOR_WEIGHT", constant(0.0)),
+    Rule("ICP: Tukey weights", f"{G}.icp._two_way_weights", _even),
+    # The most likely pose.
+    Rule("most likely pose", f"{R}.refinement.certified", lambda _: lambda *args: None),
+    Rule("most likely pose: corrected by planted copies", f"{R}.certain._off_on_copies",
+         lambda f: lambda *args: 0 * f(*args)),
+    Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.ASTRAY", constant(0.0)),
+    # The uncertainty.
+    Rule("half-sampling: starts 3 % off", f"{R}.uncertainty.OFF_SCALE", constant(1.0)),
+    Rule("half-sampling: two thinnings in turn", f"{R}.refinement.half_sampling", _one_side),
+    Rule("uncertainty: what surfaces have wrong alike", f"{R}.uncertainty.ALIKE", constant(0.0)),
+    # The score.
+    Rule("score: recall weighs more", f"{R}.score.RECALL_WEIGHT", constant(1.0)),
+    Rule("score: area at the usual scale", f"{R}.refinement.score", _own_area),
+    Rule("score: colours", f"{R}.score.color_agreement", lambda _: lambda *args: None),
+    Rule("score: free space", f"{R}.refinement.score", _blind),
+    # The gate.
+    Rule("gate: F-score", f"{HERE}.FineSettings", _setting(min_f_score=0.0)),
+    Rule("gate: recall", f"{R}.decision.MIN_RECALL", constant(0.0)),
+    Rule("gate: colours", f"{R}.decision.MIN_COLOR", constant(0.0)),
+    Rule("gate: tilt", f"{R}.decision.MAX_TILT_DEG", constant(180.0)),
+    Rule("gate: free space", f"{R}.decision.MAX_FREE_SPACE_VIOLATION", constant(1.0)),
+    Rule("gate: margin", f"{HERE}.FineSettings", _setting(min_margin=0.0)),
+    Rule("gate: uncertain scale", f"{HERE}.FineSettings", _setting(max_scale_sd_log=9.0)),
+    Rule("gate: uncertain rotation", f"{HERE}.FineSettings", _setting(max_rotation_sd_deg=360.0)),
+    Rule("gate: uncertain position", f"{HERE}.FineSettings", _setting(max_translation_sd_fraction=9.0)),
+    Rule("gate: scale at the prior's edge", f"{G}.icp.ScaleRange.at_edge", lambda _: lambda *args: False),
+    Rule("gate: rivals that turn onto itself", f"{R}.decision._turns_onto_itself", lambda _: lambda *args: False),
+]  # fmt: skip
+
+
+def _one_channel(occupancy: Any) -> Any:
+    """All surfaces in one channel of the sweep."""
+
+    def alike(points: Any, normals: Any, voxel: float, shape: Any) -> Any:
+        return occupancy(points, np.broadcast_to(UP, normals.shape), voxel, shape)
+
+    return alike
