@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -133,25 +132,6 @@ def fit_sim3_robust(
         fitted = fit_sim3(x_in_a[best], x_in_b[best])
         best = np.linalg.norm(fitted.apply(x_in_a) - x_in_b, axis=1) <= threshold
     return fitted, best
-
-
-def step_to_planes(points: Array, normals: Array, off: Array, weights: Array | None = None) -> Sim3:
-    """The small similarity that brings points to planes, by one step of Gauss-Newton (Chen and Medioni 1992).
-
-    Args:
-        points: (N, 3).
-        normals: (N, 3) unit normals of their planes.
-        off: (N,) distances from these, along the normals.
-        weights: (N,) of the rows; all alike without them. The scale changes by a tenth at most.
-    """
-    middle = points.mean(0)
-    lever = points - middle
-    along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
-    if weights is not None:
-        along, off = along * weights[:, None], off * weights
-    step = -np.linalg.lstsq(along, off, rcond=None)[0]
-    turn, scale = Rotation.from_rotvec(step[:3]).as_matrix(), float(np.exp(np.clip(step[6], -0.1, 0.1)))
-    return Sim3(scale, turn, middle + step[3:6] - scale * turn @ middle)
 
 
 def rotation_angle_deg(rotation: Array) -> float:

@@ -1,21 +1,30 @@
-"""ICP for similarities on two-way pairs: Tukey-weighted points first, then planes and colours."""
+"""ICP for similarities: two surfaces by Tukey-weighted points, then by planes and colours; sparse points on a cloud."""
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.pairs import Pairs, color_gain, pair
-from scenefuse.geometry.surface import Surface
+from scenefuse.geometry.surface import Pairs, Surface, color_gain, pair
 
 # Weight of point-to-point rows beside point-to-plane rows: enough to stop sliding, too little to hold planes back.
 POINT_WEIGHT = 0.1
 # A step that moves the points by less than this share of the pairing distance is the last.
-CONVERGED = 0.005
+MIN_STEP = 0.005
 # Weight of colour rows against geometry in the polish; both are in units of their own spread.
 COLOR_WEIGHT = 0.3
 # Fewer pairs than this in either direction fix no similarity.
 MIN_PAIRS = 10
+# A linearised step changes the scale by this at most (natural logarithm).
+MAX_SCALE_STEP = 0.05
+# Points of a model that are laid on a cloud.
+MAX_OWN_POINTS = 20_000
+# Of a model's points that are laid on a cloud, this share counts, those nearest: others are off its surface, or
+# mismatched.
+NEAREST_SHARE = 0.7
 
 
 @dataclass(frozen=True)
@@ -88,14 +97,66 @@ def refine_planes(
         rows = _rows(obj, scene, pose, tau, color_weight)
         if rows is None:
             return pose
-        system, right = rows.normal_equations()
+        system, right = rows.system.copy(), rows.right
         if scales.width == 0:
             system[6], system[:, 6], right[6], system[6, 6] = 0, 0, 0, 1
         step = -np.linalg.solve(system + 1e-9 * np.trace(system) / 7 * np.eye(7), right)
-        pose = _apply_step(pose, step, rows.centre, scales)
-        if _motion(step, rows) < CONVERGED * tau:
+        pose = moved_about(pose, step, rows.centre, scales)
+        if _motion(step, rows) < MIN_STEP * tau:
             break
     return pose
+
+
+def refine_on_cloud(own: Array, points: Array, steps: int = 20, neighbours: int = 8) -> Sim3:
+    """The similarity that lays a model's own points (M, 3) on a cloud (N, 3), both nearly in the same place.
+
+    Point to plane (Chen and Medioni 1992), of the nearest 70 % at each step (trimmed ICP, Chetverikov et al. 2005); a
+    plane is fitted to the neighbours in the cloud.
+    """
+    own, tree, found = own[:: max(1, len(own) // MAX_OWN_POINTS)], cKDTree(points), Sim3.identity()
+    for _ in range(steps):
+        moved = found.apply(own)
+        distance, near = tree.query(moved, neighbours, workers=threads())
+        rows = np.argsort(distance[:, 0])[: max(neighbours, int(NEAREST_SHARE * len(own)))]
+        around = points[near[rows]]
+        middle = around.mean(1)
+        normals = np.linalg.eigh(np.einsum("nki,nkj->nij", *[around - middle[:, None]] * 2))[1][:, :, 0]
+        found = step_to_planes(found, moved[rows], normals, ((moved[rows] - middle) * normals).sum(1))
+    return found
+
+
+def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array, weights: Array | None = None) -> Sim3:
+    """A pose after one step of Gauss-Newton that brings points to planes (Chen and Medioni 1992).
+
+    Args:
+        pose: of the points.
+        moved: (N, 3) the points at that pose.
+        normals: (N, 3) unit normals of their planes.
+        off: (N,) distances from these, along the normals.
+        weights: (N,) of the rows; all alike without them.
+    """
+    centre = moved.mean(0)
+    rows = similarity_rows(moved - centre, normals)
+    if weights is not None:
+        rows, off = rows * weights[:, None], off * weights
+    step = np.asarray(-np.linalg.lstsq(rows, off, rcond=None)[0], dtype=np.float64)
+    return moved_about(pose, step, centre, ScaleRange(1.0, np.inf))
+
+
+def similarity_rows(lever: Array, direction: Array) -> Array:
+    """(M, 7) how far points move along a direction (M, 3) by a small rotation, shift and log scale about a centre.
+
+    `lever` (M, 3) is from the centre to the points.
+    """
+    return np.concatenate([np.cross(lever, direction), direction, (lever * direction).sum(1, keepdims=True)], axis=1)
+
+
+def moved_about(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:
+    """A pose after a step (7,) of rotation vector, shift and log scale about a centre (3,) in the scene."""
+    rotation = Rotation.from_rotvec(step[:3]).as_matrix()
+    factor = float(np.exp(np.clip(step[6], -MAX_SCALE_STEP, MAX_SCALE_STEP)))
+    growth = scales.clamp(pose.scale * factor) / pose.scale
+    return Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre)) @ pose
 
 
 def _motion(step: Array, rows: "_Rows") -> float:
@@ -105,24 +166,19 @@ def _motion(step: Array, rows: "_Rows") -> float:
 
 @dataclass(frozen=True)
 class _Rows:
-    """The linearised fit at one pose: `jacobian` step + `residual` = 0, over rotation, translation and log scale.
+    """The linearised fit at one pose, over rotation, translation and log scale: `system` step + `right` = 0.
 
     Attributes:
-        jacobian: (M, 7).
-        residual: (M,).
-        weight: (M,).
+        system: (7, 7) of the normal equations.
+        right: (7,).
         centre: (3,) that the step turns and grows about.
         reach: RMS distance of the paired points from it.
     """
 
-    jacobian: Array
-    residual: Array
-    weight: Array
+    system: Array
+    right: Array
     centre: Array
     reach: float
-
-    def normal_equations(self) -> tuple[Array, Array]:
-        return self.jacobian.T @ (self.weight[:, None] * self.jacobian), self.jacobian.T @ (self.weight * self.residual)
 
 
 def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: float) -> _Rows | None:
@@ -137,21 +193,21 @@ def _rows(obj: Surface, scene: Surface, pose: Sim3, tau: float, color_weight: fl
     normals = pose.rotate(obj.normals[pairs.object_index])
     facing = np.abs((normals * scene.normals[pairs.scene_index]).sum(1))
     weights = _two_way_weights(pairs, tau) * np.sqrt(facing)
-    parts = [_weighted(p - centre, normals, ((p - q) * normals).sum(1), weights)]
+    lever, off = p - centre, p - q
+    parts = [_weighted(lever, normals, (off * normals).sum(1), weights)]
     for axis in np.eye(3):
-        along = np.broadcast_to(axis, p.shape)
-        parts.append(_weighted(p - centre, along, (p - q) @ axis, POINT_WEIGHT * weights))
+        parts.append(_weighted(lever, np.broadcast_to(axis, p.shape), off @ axis, POINT_WEIGHT * weights))
     if color_weight > 0 and obj.colors is not None and scene.colors is not None:
         gain, bias = color_gain(obj, scene, pairs)
         ahead = slice(0, pairs.forward)
         slopes = scene.color_slopes()[pairs.scene_index[ahead]]
         mine = gain * obj.colors[pairs.object_index[ahead]] + bias
-        theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, (p - q)[ahead])
+        theirs = scene.colors[pairs.scene_index[ahead]] + np.einsum("nck,nk->nc", slopes, off[ahead])
         for channel in range(3):
-            off = (theirs - mine)[:, channel]
-            parts.append(_weighted((p - centre)[ahead], slopes[:, channel], off, color_weight / 3 * weights[ahead]))
-    jacobian, residual, weight = (np.concatenate(kind) for kind in zip(*parts))
-    return _Rows(jacobian, residual, weight, centre, float(np.sqrt(((p - centre) ** 2).sum(1).mean())))
+            change = (theirs - mine)[:, channel]
+            parts.append(_weighted(lever[ahead], slopes[:, channel], change, color_weight / 3 * weights[ahead]))
+    systems, rights = zip(*parts)
+    return _Rows(sum(systems), sum(rights), centre, float(np.sqrt((lever**2).sum(1).mean())))
 
 
 def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pairs: Pairs) -> Pairs:
@@ -162,7 +218,8 @@ def _without_overhang(obj: Surface, scene: Surface, pose: Sim3, tau: float, pair
     more than half of `tau` away.
     """
     ahead = slice(0, pairs.forward)
-    own = obj.nearest(pose.inverse().apply(scene.points[pairs.scene_index[ahead]]), np.inf)[1]
+    partners, of_pair = np.unique(pairs.scene_index[ahead], return_inverse=True)
+    own = obj.nearest(pose.inverse().apply(scene.points[partners]), np.inf)[1][of_pair]
     aside = np.linalg.norm(obj.points[own] - obj.points[pairs.object_index[ahead]], axis=1) * pose.scale
     keep = np.concatenate([aside < tau / 2, np.ones(len(pairs.distance) - pairs.forward, dtype=bool)])
     kept = int(keep[ahead].sum())
@@ -177,29 +234,13 @@ def _two_way_weights(pairs: Pairs, tau: float) -> Array:
     return 0.5 * weights * share
 
 
-def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array, Array]:
-    """Rows direction . (rotation x lever + translation + growth lever) + residual, and their Huber weights.
+def _weighted(lever: Array, direction: Array, residual: Array, weight: Array) -> tuple[Array, Array]:
+    """Normal equations of direction . (rotation x lever + translation + growth lever) + residual, by Huber weights.
 
     Residuals are divided by their robust spread, so that kinds of rows can be added.
     """
     spread = 1.4826 * np.median(np.abs(residual - np.median(residual))) + 1e-12
     weight = weight * np.minimum(1, 2 * spread / np.maximum(np.abs(residual), 1e-12)) / spread**2
-    jacobian = np.concatenate(
-        [np.cross(lever, direction), direction, (lever * direction).sum(1, keepdims=True)], axis=1
-    )
-    return jacobian, residual, weight
-
-
-def _apply_step(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:
-    """Rotate and grow about `centre`, shift, and keep the scale in its prior."""
-    angle = np.linalg.norm(step[:3])
-    rotation = np.eye(3)
-    if angle > 0:
-        x, y, z = step[:3] / angle
-        k = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-        rotation = np.eye(3) + np.sin(angle) * k + (1 - np.cos(angle)) * k @ k
-    scale = scales.clamp(pose.scale * float(np.exp(np.clip(step[6], -0.05, 0.05))))
-    growth = scale / pose.scale
-    about = Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre))
-    moved = about @ pose
-    return Sim3(scale, moved.rotation, moved.translation)
+    jacobian = similarity_rows(lever, direction)
+    weighted = weight[:, None] * jacobian
+    return weighted.T @ jacobian, weighted.T @ residual

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, rotation_angle_deg
-from scenefuse.geometry.offset import cloud_from_own
+from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.photos.workspace import View, posed_images, view_of
 
 # So many photos have to frame a point for it to count as seen; fewer confirm none (method F4).
@@ -47,7 +47,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     content = {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
     if seen < LEAST_SEEN or len(own) < LEAST_POINTS or met > USUALLY_MET:
         return content
-    moved = cloud_from_own(points, own)
+    moved = refine_on_cloud(own, points)
     middle = own.mean(0)
     off = float(np.linalg.norm(moved.apply(middle) - middle))
     return content | {

@@ -16,7 +16,7 @@ from scenefuse.cloud.formats import check_projected, readable
 from scenefuse.cloud.import_cloud import crs_of
 from scenefuse.core.stage import StageError, quantity, threads
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
-from scenefuse.geometry.offset import cloud_from_own
+from scenefuse.geometry.icp import refine_on_cloud
 from scenefuse.georef.cloud_fit import FIT, fit_to_cameras, misfit
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference
@@ -143,7 +143,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
     for _ in range(ROUNDS):
         here = moved.apply(own)
         here = here[_over(cloud, here, name)]
-        step = cloud_from_own(cloud, here)
+        step = refine_on_cloud(here, cloud)
         moved = step @ moved
         if np.linalg.norm(step.apply(here) - here, axis=1).max() < stays:
             break

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
-from scenefuse.register.certain import certified
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import (
     MAX_FREE_SPACE_VIOLATION,
@@ -20,10 +19,10 @@ from scenefuse.register.decision import (
     decide,
     unless_torn,
 )
-from scenefuse.register.overlap import multiples, shifted, undecided_shift
+from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import Problem
+from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
 from scenefuse.register.score import SAME_ANGLE_DEG, SAME_SHIFT, Hypothesis, Score, best_distinct, score
-from scenefuse.register.shifts import shifts_onto_itself
 from scenefuse.register.uncertainty import Uncertainty, alike, half_sampling, with_bending
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.

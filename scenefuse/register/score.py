@@ -7,8 +7,7 @@ import numpy as np
 
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.free_space import FreeSpace
-from scenefuse.geometry.pairs import Pairs, pair
-from scenefuse.geometry.surface import Surface
+from scenefuse.geometry.surface import Pairs, Surface, pair
 
 # Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.
 RECALL_WEIGHT = 2.0

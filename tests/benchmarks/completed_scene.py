@@ -23,12 +23,13 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.core.stage import StageError, read_json, run, threads, value
-from scenefuse.core.transforms import Array, Sim3, step_to_planes
+from scenefuse.core.transforms import Array, Sim3
 from scenefuse.fuse.evidence import around, fuse_by_evidence
 from scenefuse.fuse.fuse_object import uncertainty_on_scene
 from scenefuse.fuse.measure import MEASURED
 from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
 from scenefuse.fuse.write import FROM_OBJECT, together
+from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
 from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
 from scenefuse.metrics.scores import THRESHOLDS
@@ -312,7 +313,7 @@ def surface_alignment(points: Array, known: ObjectTruth) -> Sim3:
         normals = _normals_there(moved, known)
         off = (_to_surface(moved, known) * normals).sum(1)
         weights = 1 / np.sqrt(np.maximum(1, np.abs(off) / (1.5 * np.median(np.abs(off)))))
-        found = step_to_planes(moved, normals, off, weights) @ found
+        found = step_to_planes(found, moved, normals, off, weights)
     return found
 
 

@@ -33,7 +33,7 @@ def mutants(function: Callable[..., Any]) -> Iterator[tuple[int, str, str, types
     lines, first = inspect.getsourcelines(function)
     tree = ast.parse(inspect.cleandoc("\n" + "".join(lines)) if lines[0][0].isspace() else "".join(lines))
     for k, node in enumerate(ast.walk(tree)):
-        if not isinstance(node, (ast.Compare, ast.BoolOp)) and not _is_not(node):
+        if not (isinstance(node, (ast.Compare, ast.BoolOp, ast.UnaryOp)) and _is_condition(node)):
             continue
         changed = copy.deepcopy(tree)
         target = list(ast.walk(changed))[k]
@@ -42,8 +42,8 @@ def mutants(function: Callable[..., Any]) -> Iterator[tuple[int, str, str, types
         yield first + node.lineno - 1, ast.unparse(node), ast.unparse(target), _body(code, function)
 
 
-def _is_not(node: ast.AST) -> bool:
-    return isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.Not)
+def _is_condition(node: ast.expr) -> bool:
+    return not isinstance(node, ast.UnaryOp) or isinstance(node.op, ast.Not)
 
 
 def _invert(node: ast.AST) -> None:

@@ -1,7 +1,7 @@
 """What each rule is worth: rules are switched off one at a time, and the trials of a part are run without each.
 
-PYTHONPATH=tests python tests/benchmarks/rules.py run --part registration --trials 0 1 2
-PYTHONPATH=tests python tests/benchmarks/rules.py table --part registration --table docs/results/rules_registration.tsv
+PYTHONPATH=tests python tests/benchmarks/rules.py run --part clouds --trials 0 1 2
+PYTHONPATH=tests python tests/benchmarks/rules.py table --part clouds --table docs/results/rules_registration.tsv
 
 A part is a module `rules_of.PART` with `RULES`, a list of `Rule`, `TRIALS`, how many there are, and `evaluate(trial,
 rule)`, which returns what it measures by name, the rule being switched off already: counts (integers) are added up over

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from support.planted import deviations, errors, plant
 
-from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.icp import ScaleRange, moved_about
 from scenefuse.geometry.surface import prepare, with_queries
 from scenefuse.register import mixture, refinement
-from scenefuse.register.certain import certified
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.mixture import explain, most_likely, moved_about
+from scenefuse.register.likelihood import certified, explain, most_likely
 from scenefuse.register.problem import Problem
 from scenefuse.register.uncertainty import Uncertainty
 

@@ -14,8 +14,7 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.free_space import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
-from scenefuse.geometry.pairs import pair
-from scenefuse.geometry.surface import prepare
+from scenefuse.geometry.surface import pair, prepare
 from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.photos.maps import write_depth
 from scenefuse.register.candidates import match, ransac_similarities, upright_candidates

@@ -16,7 +16,7 @@ from scenefuse.geometry.surface import prepare
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Alignment, Evidence, Problem
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.shifts import shifts_onto_itself
+from scenefuse.register.repetition import shifts_onto_itself
 from scenefuse.register.uncertainty import Uncertainty
 
 STEP, BAY = np.array([0.3, 0.0, 0.17]), np.array([2.0, 0.0, 0.0])

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from registration import ROTATION_DEG, SCALE_PCT, SHIFT, planted
-from rules import Rule
+from rules import Rule, without
 from support.planted import SHAPES, errors
 
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.pairs import Pairs
+from scenefuse.geometry.surface import Pairs
 from scenefuse.register import decision, refinement
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
@@ -28,8 +28,12 @@ UP = np.array([0.0, 0.0, 1.0])
 NAMES = list(SHAPES)
 KINDS = ("all evidence, 30 % shown", "shape alone, 70 % shown", "all evidence, 50 % shown", "absent")
 TRIALS = len(KINDS) * len(NAMES)
-OBJECT_POINTS = 6000
+# Less work than by default, so that many rules can be tried.
+COARSE = CoarseSettings(ransac_samples=10000, scale_steps=9, yaw_steps=16, candidates=12, keep=4)
+LITTLE: dict[str, Any] = {"voxel_fraction": 0.012, "turn_steps": 12}
 R, G = "scenefuse.register", "scenefuse.geometry"
+# Rules of these modules leave the candidates as they are.
+AFTER_CANDIDATES = tuple(f"{R}.{name}." for name in ("refinement", "likelihood", "uncertainty"))
 
 
 @cache
@@ -48,15 +52,15 @@ def trial_of(number: int) -> tuple[Any, Cloud, str]:
 def evaluate(number: int, rule: Rule | None) -> dict[str, Any]:
     """Register one trial. The gate alone is decided again on the pose found with all rules."""
     if rule is not None and rule.name.startswith("gate"):
-        args = _registered(number)[1]
-        settings = FineSettings()
-        return _rated(number, args[0][0].pose, args[1], decision.decide(*args[:5], settings, *args[6:]))
-    later = rule is not None and rule.where.removeprefix(f"{R}.").split(".")[0] in (
-        "certain",
-        "refinement",
-        "uncertainty",
-    )
-    return _outcome(number, _candidates(number) if later else find_hypotheses(_problem(number), CoarseSettings()))[0]
+        row, (ranked, uncertainty, decided_by, shape, problem, _, repetition) = _registered(number)
+        found = decision.decide(ranked, uncertainty, decided_by, shape, problem, FineSettings(**LITTLE), repetition)
+        return row | _counts(bool(row["found"]), found.registered) | {"reason": found.reason}
+    later = rule is not None and rule.where.startswith(AFTER_CANDIDATES)
+    return _outcome(number, _candidates(number) if later else _searched(number))[0]
+
+
+def _searched(number: int) -> list[Hypothesis]:
+    return find_hypotheses(_problem(number), COARSE)
 
 
 def _problem(number: int) -> Problem:
@@ -71,7 +75,7 @@ def _problem(number: int) -> Problem:
 @cache
 def _candidates(number: int) -> list[Hypothesis]:
     """With all rules; only rules of what follows are switched off around this."""
-    return find_hypotheses(_problem(number), CoarseSettings())
+    return _searched(number)
 
 
 @cache
@@ -88,12 +92,9 @@ def _outcome(number: int, found: list[Hypothesis]) -> tuple[dict[str, Any], tupl
         given.append(args)
         return decision.decide(*args)
 
-    before, refinement.decide = refinement.decide, gate  # type: ignore[attr-defined]
-    try:
-        starts = [(h.pose, h.source) for h in found]
-        outcome = refinement.refine_hypotheses(_problem(number), starts, FineSettings()) if starts else None
-    finally:
-        refinement.decide = before  # type: ignore[attr-defined]
+    starts = [(h.pose, h.source) for h in found]
+    with without(Rule("", f"{R}.refinement.decide", lambda _: gate)):
+        outcome = refinement.refine_hypotheses(_problem(number), starts, FineSettings(**LITTLE)) if starts else None
     if outcome is None:
         return _measured(number, False, False, "no hypothesis"), ()
     return _rated(number, outcome.ranked[0].pose, outcome.stated, outcome.decision), given[0]
@@ -112,13 +113,17 @@ def _rated(number: int, pose: Sim3, stated: Uncertainty | None, found: decision.
 
 def _measured(number: int, right: bool, accepted: bool, reason: str, *numbers: float) -> dict[str, Any]:
     names = ("scale_pct", "rotation_deg", "shift_pct", "scale_over_sd")
-    counts = {"right": right and accepted, "refused": not accepted, "wrong": accepted and not right, "found": right}
     return {
         "kind": trial_of(number)[2],
-        **{name: int(count) for name, count in counts.items()},
+        **_counts(right, accepted),
         **dict(zip(names, numbers or (np.nan,) * 4)),
         "reason": reason,
     }
+
+
+def _counts(right: bool, accepted: bool) -> dict[str, int]:
+    counts = {"right": right and accepted, "refused": not accepted, "wrong": accepted and not right, "found": right}
+    return {name: int(count) for name, count in counts.items()}
 
 
 def nothing(_: Any) -> Any:
@@ -190,7 +195,7 @@ def _extent_only(estimates_of: Any) -> Any:
 
 def _setting(**changed: float) -> Any:
     """Another value of a setting of the gate."""
-    return lambda settings: lambda: replace(settings(), **changed)
+    return lambda settings: lambda **own: replace(settings(**own), **changed)
 
 
 HERE = __name__
@@ -220,7 +225,7 @@ RULES = [
     Rule("ICP: Tukey weights", f"{G}.icp._two_way_weights", _even),
     # The most likely pose.
     Rule("most likely pose", f"{R}.refinement.certified", lambda _: lambda *args: None),
-    Rule("most likely pose: corrected by planted copies", f"{R}.certain._off_on_copies",
+    Rule("most likely pose: corrected by planted copies", f"{R}.likelihood._off_on_copies",
          lambda f: lambda *args: 0 * f(*args)),
     Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.ASTRAY", constant(0.0)),
     # The uncertainty.
