@@ -32,10 +32,10 @@ from scenefuse.paper.compare_with_paper import ComparisonSettings
 from scenefuse.paper.monocular import MonocularSettings
 from scenefuse.photos.frames import FrameSettings
 from scenefuse.register.agreement import AgreementSettings
+from scenefuse.register.align_models import AlignmentSettings
 from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.scale import ScaleSettings
-from scenefuse.register.shared_features.align_models import AlignmentSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.pairs import MatchSettings

@@ -193,8 +193,6 @@ def scale_ledger(
         otherwise = "none: its pose lies in free space" if decided_by == "near" else "confirms"
         use = f"taken: less uncertain than the clouds; {relation}" if by_photos else otherwise
         rows.append(ledger_row("shared points", alignment.pose.scale, alignment.uncertainty.scale_sd_log, use))
-        if alignment.scale_from_centres is not None:
-            rows.append(ledger_row("camera centres", alignment.scale_from_centres, None, "none"))
     if not by_photos:
         agrees = ", and the photos agree" if decided_by == "both" else ""
         own = None if uncertainty is None else uncertainty.scale_sd_log

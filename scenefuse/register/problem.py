@@ -68,14 +68,10 @@ class Alignment:
     Attributes:
         pose: scene_from_object.
         uncertainty: of the pose.
-        shared_points: points seen by photos of both sides that support it.
-        scale_from_centres: scale from the camera centres alone, or None.
     """
 
     pose: Sim3
     uncertainty: Uncertainty
-    shared_points: int
-    scale_from_centres: float | None
 
     def agrees(self, pose: Sim3, centre: Array, diagonal: float, times: float = 1.0) -> bool:
         """Whether a pose lies within `times` three standard deviations, or 3 %, 3 degrees and 3 % of the diagonal."""
@@ -158,6 +154,4 @@ def read_alignment(path: Path | None) -> Alignment | None:
     return Alignment(
         Sim3.from_matrix(np.array(value(content, "scene_from_object"))),
         Uncertainty.even(*(value(content, name) for name in ("scale_sd_log", "rotation_sd_deg", "translation_sd"))),
-        value(content, "shared_points"),
-        value(content, "scale_from_centres"),
     )

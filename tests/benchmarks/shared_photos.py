@@ -18,8 +18,8 @@ from support.planted_photos import PhotoTrial, Truth, truth
 
 from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Sim3
+from scenefuse.register.align_models import AlignmentSettings, align_landmarks
 from scenefuse.register.decision import MOST_BENT, FineSettings
-from scenefuse.register.shared_features.align_models import AlignmentSettings, align_landmarks
 from scenefuse.register.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm.spread import Spread, spread_of
 

@@ -12,9 +12,9 @@ from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.stage import run, value
 from scenefuse.core.transforms import Sim3, rotation_angle_deg
 from scenefuse.geometry.alignment_picture import draw_alignment
+from scenefuse.register.align_models import AlignmentSettings, align_landmarks
+from scenefuse.register.landmarks import read_landmarks
 from scenefuse.register.register import RegistrationSettings, register_clouds
-from scenefuse.register.shared_features.align_models import AlignmentSettings, align_landmarks
-from scenefuse.register.shared_features.landmarks import read_landmarks
 
 PAIRS = {"south_building": ("walk2", "walk1"), "rock": ("boulder_section", "boulder")}
 UP = np.array([0.0, 0.0, 1.0])

@@ -20,7 +20,7 @@ from support.photographed_place import (
 )
 
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.register.shared_features.landmarks import Landmarks, landmarks_of
+from scenefuse.register.landmarks import Landmarks, landmarks_of
 from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust, drop_outliers
 from scenefuse.sfm.lens import HELD, Choice, choose_lens
 

@@ -294,7 +294,7 @@ def test_an_object_that_lies_upside_down_in_the_scene_is_refused_where_gravity_i
     lying, truth = house.scene.transformed(over), over @ house.scene_from_object
     with_gravity = registered(house.object, lying, house.up_in_object)
     assert not with_gravity.decision.registered
-    sure = Alignment(truth, Uncertainty.even(1e-4, 0.01, 1e-4), 40, None)
+    sure = Alignment(truth, Uncertainty.even(1e-4, 0.01, 1e-4))
     by_photos = registered(house.object, lying, house.up_in_object, [(truth, "planted")], sure).decision
     assert not by_photos.registered and "would lean by 1" in by_photos.reason
     without = registered(house.object, lying, None, [(truth, "planted")])

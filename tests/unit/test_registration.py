@@ -305,7 +305,7 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
 
 
 def shared(pose: Sim3) -> Alignment:
-    return Alignment(pose, Uncertainty.even(0.005, 0.3, 0.02), 40, None)
+    return Alignment(pose, Uncertainty.even(0.005, 0.3, 0.02))
 
 
 def test_photos_that_agree_settle_the_pose(house):
@@ -323,7 +323,7 @@ def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house
     truth = house.scene_from_object
     near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
     for sd, by_photos in ((1e-4, True), (0.02, False)):
-        alignment = Alignment(near, Uncertainty.even(sd, 100 * sd, 10 * sd), 40, None)
+        alignment = Alignment(near, Uncertainty.even(sd, 100 * sd, 10 * sd))
         outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), None, alignment))
         assert outcome.decision.decided_by == "both"
         assert (outcome.ranked[0].pose.scale == near.scale) == by_photos
@@ -336,11 +336,11 @@ def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_t
     beside = Sim3(1.0, np.eye(3), np.array([apart, 0, 0])) @ truth
     # Half as certain as the clouds say, and yet less uncertain than what both differ by.
     sure = Uncertainty.even(*2 * alone.uncertainty.deviations)
-    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, sure, 40, None)))
+    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, sure)))
     assert outcome.ranked[0].pose is beside and outcome.uncertainty is sure
     # The photos are so uncertain that the difference is theirs.
     unsure = Uncertainty.even(*9 * alone.uncertainty.deviations)
-    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, unsure, 40, None)))
+    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, unsure)))
     assert outcome.ranked[0].pose is not beside
     np.testing.assert_allclose(outcome.uncertainty.deviations, alone.uncertainty.deviations)
 
@@ -359,7 +359,7 @@ def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_
     assert alike(obj, scene, truth, ScaleRange(truth.scale, 0.0), 5 * sigma)[6, 6] == 0
     by_clouds = refined(house, truth)
     assert (by_clouds.stated.deviations > by_clouds.uncertainty.deviations).all()
-    sure = Alignment(truth, Uncertainty.even(1e-5, 1e-3, 1e-4), 40, None)
+    sure = Alignment(truth, Uncertainty.even(1e-5, 1e-3, 1e-4))
     by_photos = refined(house, truth, evidence=Evidence(alignment=sure))
     assert by_photos.ranked[0].pose is truth and by_photos.stated is by_photos.uncertainty
 
@@ -370,7 +370,7 @@ def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncert
     centre, alone = house.object.points.mean(0), refined(house, truth)
     for share, by_photos in ((0.9, False), (0.05, True)):
         sd = share * alone.uncertainty.size(house.scene.diagonal) * house.scene.diagonal
-        evidence = Evidence(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd), 40, None))
+        evidence = Evidence(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd)))
         outcome = refined(house, truth, evidence=evidence)
         assert outcome.decision.decided_by == "both"
         assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
@@ -394,7 +394,7 @@ def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_th
     empty = SimpleNamespace(
         violation=lambda points: float(points[:, 2].min() > house.scene.points[:, 2].min() + up / 2)
     )
-    sure = Alignment(lifted, Uncertainty.even(1e-4, 0.01, 1e-4), 40, None)  # of models that are bent
+    sure = Alignment(lifted, Uncertainty.even(1e-4, 0.01, 1e-4))  # of models that are bent
     outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), empty, sure))
     assert outcome.decision.registered == registered, outcome.decision.reason
     assert outcome.decision.decided_by == ("near" if registered else "photos")

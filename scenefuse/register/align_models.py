@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, setting, write_json
-from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.register.shared_features.gps import CONTRADICTED, GpsPose, gps_quantities, pose_by_gps
-from scenefuse.register.shared_features.landmarks import Landmarks, match_landmarks, read_landmarks
-from scenefuse.register.shared_features.localise import Centres, localise
-from scenefuse.register.shared_features.reprojection import (
+from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.register.gps import CONTRADICTED, GpsPose, gps_quantities, pose_by_gps
+from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
+from scenefuse.register.reprojection import (
     Observations,
     bootstrap,
     match_errors,
@@ -87,16 +86,12 @@ class Found:
         inliers: observations of the shared points.
         uncertainty: of the pose.
         problem: why the pose is rejected, or None.
-        centres: the pose from the camera centres alone; None where the pose is rejected.
-        centre: (3,) middle of the object's points.
     """
 
     consensus: Consensus
     inliers: Observations
     uncertainty: Uncertainty
     problem: str | None
-    centres: Centres | None
-    centre: Array
 
 
 def align_models(
@@ -116,8 +111,6 @@ def align_models(
 
     Shared points: triangulated points of both models are matched by their SIFT descriptors, RANSAC over triples gives a
     similarity of free scale, and Gauss-Newton minimises the reprojection of each model's points in the other's photos.
-    Camera centres: each photo of the object is localised in the scene by itself, and a similarity is fitted to the
-    centres; it shares the matches but neither the object's points nor the minimiser, and is reported beside the first.
     GPS: where both sides have it, it gives one more estimate, which tells an object from its like elsewhere.
 
     Args:
@@ -165,8 +158,7 @@ def align_landmarks(
     uncertainty = drawn.with_difference(pose, consensus.pose, centre)
     consensus = replace(consensus, pose=pose)
     problem = rejection_reason(consensus, inliers, len(pairs), uncertainty, settings)
-    centres = None if problem else localise(obj, scene, pairs, pose, MAX_ERROR_PX, seed)
-    found = _report(Found(consensus, inliers, uncertainty, problem, centres, centre), len(pairs))
+    found = _report(Found(consensus, inliers, uncertainty, problem), len(pairs))
     return found | gps_quantities(gps, None if problem else pose, obj.looked_at())
 
 
@@ -297,23 +289,4 @@ def _report(found: Found | None, matches: int) -> dict[str, Any]:
         "scene_photos": quantity(photos[1], "1"),
         "reprojection_px": quantity(error, "px"),
         **uncertainty_quantities(uncertainty, "scene units"),
-        **_centres_quantities(found),
-    }
-
-
-def _centres_quantities(found: Found | None) -> dict[str, Any]:
-    """The pose from the camera centres alone, and how far it is from the pose from shared points."""
-    turn = shift = scale = None
-    photos = 0
-    if found is not None and found.centres is not None:
-        photos = len(found.centres.photos)
-        pose, other = found.consensus.pose, found.centres.pose
-        if other is not None:
-            turn, scale = rotation_angle_deg(other.rotation @ pose.rotation.T), other.scale
-            shift = float(np.linalg.norm(other.apply(found.centre) - pose.apply(found.centre)))
-    return {
-        "scale_from_centres": quantity(scale, PER_UNIT),
-        "centres_photos": quantity(photos, "1"),
-        "centres_rotation_deg": quantity(turn, "deg"),
-        "centres_shift": quantity(shift, "scene units"),
     }

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.register.shared_features.landmarks import Landmarks
+from scenefuse.register.landmarks import Landmarks
 from scenefuse.register.uncertainty import Uncertainty
 
 BEHIND_PX = 1e4

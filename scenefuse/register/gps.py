@@ -11,7 +11,7 @@ from scenefuse.core.transforms import Array, Sim3
 from scenefuse.georef.placement import MIN_GPS_PHOTOS, GeoreferenceSettings, place_by_gps
 from scenefuse.photos.geodesy import LocalFrame, scene_frame
 from scenefuse.photos.photos import gps_accuracies, gps_positions, read_photos
-from scenefuse.register.shared_features.landmarks import Landmarks
+from scenefuse.register.landmarks import Landmarks
 from scenefuse.sfm.gravity import estimate_up
 
 # Errors of GPS drift slowly: so many photos that follow each other err alike.
