@@ -32,7 +32,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities
-from scenefuse.register.problem import Evidence, Inputs, Problem
+from scenefuse.register.problem import Constraints, Inputs, Problem
 from scenefuse.register.refinement import FINE_POINTS
 from scenefuse.register.scale import Estimate, estimates, rms, scale_quantities
 from scenefuse.register.score import SCORE_FRACTION, Hypothesis, score
@@ -93,7 +93,7 @@ def register_as_paper(
         else:
             ledger = [Estimate(scale, matched, True), *ledger]
     held = 1.0 if scale == "none" else ledger[0].scale
-    problem = Problem(obj, scene, ScaleRange(held, 0.0), Evidence(ups), seed)
+    problem = Problem(obj, scene, ScaleRange(held, 0.0), Constraints(ups), seed)
     pose, notes = paper_coarse(problem)
     coarse = _rated(problem, pose, SCORE_FRACTION / 2, COARSE_POINTS)
     between = time.perf_counter()

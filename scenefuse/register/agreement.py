@@ -13,7 +13,7 @@ from scenefuse.core.transforms import Array, Sim3
 # Neighbours that a plane is fitted to for a normal.
 NORMAL_NEIGHBOURS = 16
 # Points at which the normals of both clouds together are compared with their neighbours'.
-MOST_TOGETHER = 20000
+MAX_COMPARED_POINTS = 20000
 
 
 @dataclass(frozen=True)
@@ -69,9 +69,9 @@ def registration_metrics(
 def self_consistency(points: Array) -> float:
     """Mean |n . n'| between points (N, 3) and their neighbours: how smooth a surface is, whatever it is of (method G1).
 
-    Measured at MOST_TOGETHER points at most; neighbours and normals are those of the whole cloud.
+    Measured at MAX_COMPARED_POINTS points at most; neighbours and normals are those of the whole cloud.
     """
-    tree, at = cKDTree(points), sampled(points, MOST_TOGETHER, seed=0)
+    tree, at = cKDTree(points), sampled(points, MAX_COMPARED_POINTS, seed=0)
     neighbours = tree.query(at, k=min(NORMAL_NEIGHBOURS, len(points)), workers=threads())[1]
     used, place = np.unique(neighbours, return_inverse=True)
     normals = _normals(points, points[used])[place.reshape(neighbours.shape)]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, setting, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.register.gps import CONTRADICTED, GpsPose, gps_quantities, pose_by_gps
+from scenefuse.register.gps import MAX_GPS_DEVIATIONS, GpsPose, gps_quantities, pose_by_gps
 from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
 from scenefuse.register.reprojection import (
     Observations,
@@ -26,16 +26,16 @@ from scenefuse.register.reprojection import (
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities
 
 # Random triples of matches drawn, those of them fitted, the matches that rank these, the best that are refined.
-RANSAC_SAMPLES, PROPOSALS, RANKED_ON, FINALISTS = 100_000, 2000, 300, 10
+RANSAC_SAMPLES, MAX_PROPOSALS, RANKING_MATCHES, FINALISTS = 100_000, 2000, 300, 10
 # How much the scales of a triple's three edges may differ, least over largest.
-LEAST_EDGE_RATIO = 0.8
+MIN_EDGE_RATIO = 0.8
 # Largest reprojection error of an inlier, RMS, in pixels of the coarser photos.
 MAX_ERROR_PX = 6.0
 ROUNDS = 20
 # The gate: inliers of the best pose among the other matches, over inliers; standard deviations of scale and rotation.
 MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
 # Places alike of which GPS may settle one.
-MOST_ALIKE = 10
+MAX_PLACES = 10
 # Draws of photos and points for the standard deviations.
 BOOTSTRAP_DRAWS = 200
 PER_UNIT = "scene units per object unit"
@@ -184,13 +184,13 @@ def _by_gps(seen: Observations, consensus: Consensus, gps: GpsPose, at: Array, s
     """Of a consensus and its strong rivals the one that GPS does not contradict, if there is just one."""
     poses, least = [consensus.pose], MAX_RIVAL_SHARE * consensus.inliers.sum()
     other, rival = consensus.other, consensus.rival
-    while other is not None and rival > least and len(poses) < MOST_ALIKE:
+    while other is not None and rival > least and len(poses) < MAX_PLACES:
         poses.append(other)
         rest = seen.subset(np.min([match_errors(seen, pose) for pose in poses], axis=0) > 3 * MAX_ERROR_PX)
         other = _most_supported(rest, seed)
         rival = 0 if other is None else int((match_errors(rest, other) <= MAX_ERROR_PX).sum())
-    allowed = [pose for pose in poses if gps.miss(pose, at) <= CONTRADICTED]
-    if len(poses) == 1 or len(allowed) != 1 or len(poses) == MOST_ALIKE:
+    allowed = [pose for pose in poses if gps.miss(pose, at) <= MAX_GPS_DEVIATIONS]
+    if len(poses) == 1 or len(allowed) != 1 or len(poses) == MAX_PLACES:
         return consensus
     print(f"GPS settles which of {len(poses)} poses it is", flush=True)
     return Consensus(allowed[0], match_errors(seen, allowed[0]) <= MAX_ERROR_PX, 0, settled_by_gps=True)
@@ -204,14 +204,14 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
     triples = rng.integers(0, len(seen.x), (RANSAC_SAMPLES, 3))
     edges = [np.linalg.norm(p[triples] - p[np.roll(triples, 1, axis=1)], axis=2) for p in (seen.x, seen.y)]
     ratio = edges[1] / np.maximum(edges[0], 1e-300)
-    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > LEAST_EDGE_RATIO * ratio.max(1))
+    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > MIN_EDGE_RATIO * ratio.max(1))
     proposed = []
-    for triple in triples[fair][:PROPOSALS]:
+    for triple in triples[fair][:MAX_PROPOSALS]:
         with contextlib.suppress(ValueError):
             proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
     if not proposed:
         return None
-    few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKED_ON]))
+    few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKING_MATCHES]))
     finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:FINALISTS]
     polished = [_polished(seen, p, MAX_ERROR_PX) for p in finalists]
     return min(polished, key=lambda p: _cost(seen, p, MAX_ERROR_PX))

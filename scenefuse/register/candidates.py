@@ -11,9 +11,9 @@ from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import RECALL_WEIGHT
 
 # Triples that pass the checks and are tried on all matches: as many as fit into memory at once.
-MOST_TRIPLES = 2000
+MAX_TRIPLES = 2000
 # How much the scales of a triple's three edges may differ, least over largest.
-LEAST_EDGE_RATIO = 0.9
+MIN_EDGE_RATIO = 0.9
 
 
 def fpfh(surface: Surface, radius: float) -> Array:
@@ -69,7 +69,7 @@ def ransac_similarities(
     edges_y = np.stack([np.linalg.norm(y[triples[:, i]] - y[triples[:, i - 1]], axis=1) for i in range(3)])
     ratio = edges_y / np.maximum(edges_x, 1e-12)
     middle = np.exp(np.log(np.maximum(ratio, 1e-12)).mean(0))
-    good = (edges_y.min(0) > 3 * tau) & (ratio.min(0) > LEAST_EDGE_RATIO * ratio.max(0))
+    good = (edges_y.min(0) > 3 * tau) & (ratio.min(0) > MIN_EDGE_RATIO * ratio.max(0))
     good &= np.abs(np.log(np.maximum(middle, 1e-12) / scales.centre)) <= scales.width + 0.05
     triples, middle = triples[good], middle[good]
     if len(triples) == 0:
@@ -78,7 +78,7 @@ def ransac_similarities(
     if ups is not None:
         upright = (rotations @ ups[0]) @ ups[1] >= np.cos(np.radians(max_tilt_deg))
         triples, middle, rotations = triples[upright], middle[upright], rotations[upright]
-    triples, middle, rotations = triples[:MOST_TRIPLES], middle[:MOST_TRIPLES], rotations[:MOST_TRIPLES]
+    triples, middle, rotations = triples[:MAX_TRIPLES], middle[:MAX_TRIPLES], rotations[:MAX_TRIPLES]
     if len(triples) == 0:
         return []
     middle = np.array([scales.clamp(s) for s in middle])

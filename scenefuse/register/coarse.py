@@ -14,7 +14,7 @@ from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.geometry.icp import refine_points
 from scenefuse.geometry.surface import prepare, with_grid, with_queries
 from scenefuse.register.candidates import fpfh, match, ransac_similarities, upright_candidates
-from scenefuse.register.problem import Evidence, Inputs, Problem
+from scenefuse.register.problem import Constraints, Inputs, Problem
 from scenefuse.register.scale import ScaleSettings, estimates, prior, scale_quantities
 from scenefuse.register.score import SCORE_FRACTION, Hypothesis, best_distinct, score
 
@@ -26,10 +26,10 @@ QUERY_POINTS = 1200
 # Voxel of the upright sweep, as a share of the scene crop's diagonal: a fast Fourier transform of some 50^3 cells.
 SWEEP_VOXEL_FRACTION = 0.045
 # RANSAC's best poses at each voxel and feature scale.
-KEPT_BY_RANSAC = 8
+RANSAC_POSES = 8
 # How far the grids of nearest points reach around the clouds, as a share of the diagonal.
-GRID_REACH = 0.1
-ROUNDS = 12
+GRID_MARGIN = 0.1
+BRIEF_ROUNDS = 12
 
 
 @dataclass(frozen=True)
@@ -77,14 +77,14 @@ def register_coarsely(
     start = time.perf_counter()
     (obj, scene), ups = inputs.clouds(), inputs.ups()
     ledger = estimates(obj, scene, ups)
-    problem = Problem(obj, scene, prior(ledger, scale), Evidence(ups), seed)
+    problem = Problem(obj, scene, prior(ledger, scale), Constraints(ups), seed)
     write_json(scale_report, scale_quantities(ledger, problem.scales, scale.method))
     found, notes = find_hypotheses(problem, settings), []
     if not found:
         notes.append("no feature or heading gave a pose; the clouds' centres were laid on each other instead")
         print(notes[-1], flush=True)
         found = [_centred(problem)]
-    write_json(report, coarse_quantities(found, problem.evidence.ups is not None, notes, time.perf_counter() - start))
+    write_json(report, coarse_quantities(found, problem.known.ups is not None, notes, time.perf_counter() - start))
 
 
 def coarse_quantities(
@@ -109,7 +109,7 @@ def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothes
     scales, diagonal, seed = problem.scales, problem.scene.diagonal, problem.seed
     tau = SCORE_FRACTION * diagonal
     obj, target = problem.surfaces(scales.centre, SCORE_FRACTION / 2, COARSE_POINTS)
-    cell, reach = SCORE_FRACTION / 2 * diagonal, GRID_REACH * diagonal
+    cell, reach = SCORE_FRACTION / 2 * diagonal, GRID_MARGIN * diagonal
     both = (
         with_queries(with_grid(obj, cell / scales.centre, reach / scales.centre), QUERY_POINTS, seed),
         with_queries(with_grid(target, cell, reach), QUERY_POINTS, seed),
@@ -123,14 +123,14 @@ def find_hypotheses(problem: Problem, settings: CoarseSettings) -> list[Hypothes
 
     refined = []
     for start, source in best(upright) + best(by_features)[:room]:
-        pose = refine_points(*both, start, scales, (3 * tau, tau), ROUNDS)
+        pose = refine_points(*both, start, scales, (3 * tau, tau), BRIEF_ROUNDS)
         refined.append(Hypothesis(pose, source, score(*both, pose, tau, scales.centre)))
     return best_distinct(refined, obj.points.mean(0), diagonal, settings.keep)
 
 
 def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     """The sweep of yaw, scale and shift; nothing where gravity is not known."""
-    ups, scales, voxel = problem.evidence.ups, problem.scales, SWEEP_VOXEL_FRACTION * problem.scene.diagonal
+    ups, scales, voxel = problem.known.ups, problem.scales, SWEEP_VOXEL_FRACTION * problem.scene.diagonal
     if ups is None:
         return []
     level = Sim3(1.0, rotation_between(ups[1], np.array([0.0, 0.0, 1.0])), np.zeros(3))
@@ -142,7 +142,7 @@ def _upright(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
 
 def _from_features(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
     """Similarity RANSAC on mutual FPFH matches at every voxel of the pyramid and every feature scale."""
-    scales, ups, seed = problem.scales, problem.evidence.ups, problem.seed
+    scales, ups, seed = problem.scales, problem.known.ups, problem.seed
     count = settings.feature_scale_steps if scales.width else 1
     steps = np.linspace(-1, 1, count) if count > 1 else [0.0]
     found: list[Sim3] = []
@@ -156,14 +156,14 @@ def _from_features(problem: Problem, settings: CoarseSettings) -> list[Sim3]:
             pairs = match(fpfh(obj, 5 * voxel / scale), target_features)
             x, y = obj.points[pairs[:, 0]], target.points[pairs[:, 1]]
             found += ransac_similarities(
-                x, y, scales, 1.5 * voxel, settings.ransac_samples, KEPT_BY_RANSAC, seed, ups, settings.max_tilt_deg
+                x, y, scales, 1.5 * voxel, settings.ransac_samples, RANSAC_POSES, seed, ups, settings.max_tilt_deg
             )
     return found
 
 
 def _centred(problem: Problem) -> Hypothesis:
     """The clouds' centres on each other, upright where gravity is known: a last resort that the gate has to reject."""
-    ups, scale = problem.evidence.ups, problem.scales.centre
+    ups, scale = problem.known.ups, problem.scales.centre
     rotation = np.eye(3) if ups is None else rotation_between(*ups)
     shift = problem.scene.points.mean(0) - scale * (rotation @ problem.object.points.mean(0))
     pose = Sim3(scale, rotation, shift)

@@ -12,8 +12,8 @@ from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.problem import Problem
 from scenefuse.register.score import (
-    SAME_ANGLE_DEG,
-    SAME_SHIFT,
+    DISTINCT_ANGLE_DEG,
+    DISTINCT_SHIFT,
     SCORE_FRACTION,
     Hypothesis,
     color_agreement,
@@ -30,11 +30,11 @@ MIN_COLOR = 0.5  # agreement of the colours, where both clouds have colours that
 MAX_TILT_DEG = 8.0  # angle between the up directions
 MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
 # A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
-SAME_SHAPE, SAME_COLOR = 0.95, 0.9
+MIN_SELF_OVERLAP, MIN_SELF_COLOR = 0.95, 0.9
 # Where the object ends along an axis, as percentiles: strays do not count.
-ENDS = 1, 99
+END_PERCENTILES = 1, 99
 # A pose that may be so far off because the object's own model is bent (`Uncertainty.size`) is none: the model is torn.
-MOST_BENT = 0.1
+MAX_BENDING = 0.1
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ class Repetition:
         undecided: period, scene units, by which the object can be shifted and fits what both show as well; or None.
     """
 
-    same_shift: float = SAME_SHIFT
+    same_shift: float = DISTINCT_SHIFT
     undecided: float | None = None
 
 
@@ -148,11 +148,11 @@ def unless_torn(decision: Decision, with_bending: Uncertainty | None, diagonal: 
         with_bending: the uncertainty with how far the object's model may be bent (method M10); None if unknown.
         diagonal: of the scene crop.
     """
-    if with_bending is None or not decision.registered or with_bending.size(diagonal) <= MOST_BENT:
+    if with_bending is None or not decision.registered or with_bending.size(diagonal) <= MAX_BENDING:
         return decision
     reason = (
         f"the object's model may be bent so far that it lies off by {with_bending.size(diagonal):.0%} of the diagonal, "
-        f"more than {MOST_BENT:.0%}; take more photos between those of the object"
+        f"more than {MAX_BENDING:.0%}; take more photos between those of the object"
     )
     return replace(decision, registered=False, reason=reason)
 
@@ -188,7 +188,7 @@ def _freely(axis: Array | None) -> str:
 
 def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:
     """Why a pose may not be used, the first of which is told; free space and gravity count whatever decided on it."""
-    violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.evidence.ups)
+    violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.known.ups)
     if violation is not None and violation > MAX_FREE_SPACE_VIOLATION:
         yield (
             f"{violation:.0%} of the object would lie in free space, where the scene's photos measured surfaces behind"
@@ -262,13 +262,13 @@ def _turns_onto_itself(obj: Surface, motion: Sim3, tau: float) -> bool:
     Nearly every point must find another within `tau` (object units), both ways, and the object's middle must stay: a
     long row of equal parts that is shifted by one of them is elsewhere.
     """
-    if rotation_angle_deg(motion.rotation) <= SAME_ANGLE_DEG:
+    if rotation_angle_deg(motion.rotation) <= DISTINCT_ANGLE_DEG:
         return False
     axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
-    middle = np.percentile(obj.points @ axes.T, ENDS, axis=0).mean(0) @ axes
+    middle = np.percentile(obj.points @ axes.T, END_PERCENTILES, axis=0).mean(0) @ axes
     if np.linalg.norm(motion.apply(middle) - middle) > tau:
         return False
     pairs = pair(obj, obj, motion, tau)
     ahead, back = pairs.forward / len(obj.queries), (len(pairs.distance) - pairs.forward) / len(obj.queries)
     color = color_agreement(obj, obj, pairs)
-    return min(ahead, back) > SAME_SHAPE and (color is None or color > SAME_COLOR)
+    return min(ahead, back) > MIN_SELF_OVERLAP and (color is None or color > MIN_SELF_COLOR)

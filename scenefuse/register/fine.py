@@ -14,7 +14,7 @@ from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.free_space import FreeSpace, read_free_space
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
-from scenefuse.register.problem import Alignment, Evidence, Inputs, Problem, read_alignment, read_scales
+from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment, read_scales
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
@@ -22,11 +22,11 @@ from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, 
 # Photos whose depth maps give the free space; more look from sides that these have seen.
 FREE_SPACE_PHOTOS = 12
 # A measurement this far beyond a point, as a share of the diagonal, shows that nothing stands there.
-FREE_SPACE_FRACTION = 0.03
+FREE_SPACE_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
-class EvidenceFiles:
+class ConstraintFiles:
     """Files of what is known beside the clouds."""
 
     alignment_json: Path | None = None
@@ -52,7 +52,7 @@ class EvidenceFiles:
         """The free space around a scene crop, or None without depth maps."""
         if self.workspace is None:
             return None
-        tolerance = FREE_SPACE_FRACTION * scene.diagonal
+        tolerance = FREE_SPACE_TOLERANCE * scene.diagonal
         return read_free_space(self.workspace, self.depth, scene.points, FREE_SPACE_PHOTOS, tolerance)
 
 
@@ -61,7 +61,7 @@ def register_finely(
     inputs: Inputs,
     scale_json: Path,
     coarse_json: Path,
-    evidence: EvidenceFiles = EvidenceFiles(),
+    known: ConstraintFiles = ConstraintFiles(),
     report: Path,
     picture: Path | None = None,
     seed: int,
@@ -73,7 +73,7 @@ def register_finely(
         inputs: the two clouds and their reports.
         scale_json: JSON of the scale, of the coarse stage.
         coarse_json: JSON of the coarse stage.
-        evidence: what is known beside the clouds.
+        known: what is known beside the clouds.
         report: output JSON: `status`, `reason`, `scene_from_object`, `scale`, scores, `scale_ledger`, every hypothesis.
         picture: output PNG, the object on the scene crop from three sides.
         seed: of all random choices.
@@ -85,11 +85,11 @@ def register_finely(
     start = time.perf_counter()
     obj, scene = inputs.clouds()
     prior = read_json(scale_json)
-    alignment = read_alignment(evidence.alignment_json) if settings.use_alignment else None
-    known = Evidence(inputs.ups(), evidence.free_space(scene), alignment)
-    problem = Problem(obj, scene, read_scales(prior), known, seed)
+    alignment = read_alignment(known.alignment_json) if settings.use_alignment else None
+    constraints = Constraints(inputs.ups(), known.free_space(scene), alignment)
+    problem = Problem(obj, scene, read_scales(prior), constraints, seed)
     outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
-    bending = evidence.bending(outcome.ranked[0].pose, obj.points.mean(0))
+    bending = known.bending(outcome.ranked[0].pose, obj.points.mean(0))
     outcome = outcome.unless_torn(bending[0], scene.diagonal)
     seconds = time.perf_counter() - start
     if picture is not None:
@@ -109,7 +109,7 @@ def _report(
 ) -> dict[str, Any]:
     """The stage JSON; the decision is printed."""
     best, decision = outcome.ranked[0], outcome.decision
-    status, alignment = "registered" if decision.registered else "unregistered", problem.evidence.alignment
+    status, alignment = "registered" if decision.registered else "unregistered", problem.known.alignment
     print(f"{status}: {decision.reason}", flush=True)
     ledger = scale_ledger(prior, alignment, best, outcome.uncertainty, decision.decided_by)
     return {
@@ -118,10 +118,10 @@ def _report(
         **pose_quantities(best),
         "scale_over_prior": quantity(best.pose.scale / problem.scales.centre, "1"),
         "decided_by": quantity(decision.decided_by, ""),
-        "rests_on": quantity(rests_on(best, problem.evidence), ""),
+        "rests_on": quantity(rests_on(best, problem.known), ""),
         "margin": quantity(decision.margin, "1"),
         "free_axis": quantity(decision.free_axis, ""),
-        "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
+        "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         "scale_ledger": quantity(ledger, ""),
         "score_tau": quantity(settings.score_fraction * problem.scene.diagonal, length),
         "source": quantity(best.source, ""),
@@ -131,16 +131,16 @@ def _report(
     }
 
 
-def rests_on(best: Hypothesis, evidence: Evidence) -> list[str]:
-    """What spoke for or against a pose."""
-    known = {
+def rests_on(best: Hypothesis, known: Constraints) -> list[str]:
+    """What a decision on a pose rests on."""
+    used = {
         "shape": True,
         "colours": best.score.color is not None,
-        "gravity": evidence.ups is not None,
-        "free space": evidence.free_space is not None,
-        "shared features": evidence.alignment is not None,
+        "gravity": known.ups is not None,
+        "free space": known.free_space is not None,
+        "shared features": known.alignment is not None,
     }
-    return [name for name, there in known.items() if there]
+    return [name for name, there in used.items() if there]
 
 
 def _stated(outcome: Outcome, bending: tuple[Array | None, Array | None], length: str) -> dict[str, Any]:

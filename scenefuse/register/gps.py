@@ -15,9 +15,9 @@ from scenefuse.register.landmarks import Landmarks
 from scenefuse.sfm.gravity import estimate_up
 
 # Errors of GPS drift slowly: so many photos that follow each other err alike.
-ERR_ALIKE = 5
+CORRELATED_PHOTOS = 5
 # A pose farther off than so many standard deviations is another one.
-CONTRADICTED = 4.0
+MAX_GPS_DEVIATIONS = 4.0
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def pose_by_gps(
     off = placed.local_from_model.apply(centres[placed.inliers])[:, :2] - there
     each = max(sd_m, float(np.sqrt((off**2).mean())))
     of_scene = float(np.hypot(_accuracy_of(scene_photos, accuracy_m), _off_in_plane(scene_json)))
-    turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(ERR_ALIKE)
+    turn = np.hypot(each / _extent(there), of_scene / _extent(_cameras(scene)[1][:, :2])) * np.sqrt(CORRELATED_PHOTOS)
     # What all positions of a flight have in common is not averaged out by more photos.
     return GpsPose(placed.local_from_model, len(there), float(turn), float(np.hypot(each, of_scene)))
 
@@ -134,7 +134,7 @@ def gps_quantities(gps: GpsPose | None, pose: Sim3 | None, at: Array | None) -> 
         else:
             scale, heading, shift = gps.differences(pose, at)
             miss, heading = gps.miss(pose, at), float(np.degrees(heading))
-            if miss > CONTRADICTED:
+            if miss > MAX_GPS_DEVIATIONS:
                 notes.append(
                     f"{about} contradicts the pose: {np.expm1(abs(scale)):.1%} of scale, {abs(heading):.1f} degrees and"
                     f" {shift:.1f} m in the plane apart, and GPS is known to {gps.turn_sd:.1%},"

@@ -17,8 +17,8 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.workspace import posed_images, read_model
 
 # Points matched at once, and of each model at most: both bound memory.
-BLOCK = 4096
-MOST_POINTS = 100_000
+BLOCK_POINTS = 4096
+MAX_POINTS = 100_000
 # Views of a point whose descriptors are compared.
 DESCRIPTORS_PER_POINT = 3
 
@@ -78,7 +78,7 @@ class Landmarks:
 
 
 def read_landmarks(
-    model: Path, database: Path, most_points: int = MOST_POINTS, descriptors_per_point: int = DESCRIPTORS_PER_POINT
+    model: Path, database: Path, most_points: int = MAX_POINTS, descriptors_per_point: int = DESCRIPTORS_PER_POINT
 ) -> Landmarks:
     """Read a sparse model and the descriptors of its points.
 
@@ -109,7 +109,7 @@ def read_landmarks(
 def landmarks_of(
     reconstruction: pycolmap.Reconstruction,
     descriptors_of: Callable[[pycolmap.Image], NDArray[Any]],
-    most_points: int = MOST_POINTS,
+    most_points: int = MAX_POINTS,
     descriptors_per_point: int = DESCRIPTORS_PER_POINT,
 ) -> Landmarks:
     """The landmarks of a sparse model; `descriptors_of` a photo are (N, 128), one for each of its features."""
@@ -165,12 +165,12 @@ def match_landmarks(a: Landmarks, b: Landmarks, max_ratio: float) -> NDArray[np.
     """
     best_a, best_b = np.full((len(a.points), 2), -1.0, np.float32), np.full((len(b.points), 2), -1.0, np.float32)
     partner_a, partner_b = np.zeros(len(a.points), np.int64), np.zeros(len(b.points), np.int64)
-    for i in range(0, len(a.points), BLOCK):
-        ours = a.descriptors[i : i + BLOCK]
-        for j in range(0, len(b.points), BLOCK):
-            alike = _most_alike(ours, b.descriptors[j : j + BLOCK])
-            _update(best_a[i : i + BLOCK], partner_a[i : i + BLOCK], alike, j)
-            _update(best_b[j : j + BLOCK], partner_b[j : j + BLOCK], alike.T, i)
+    for i in range(0, len(a.points), BLOCK_POINTS):
+        ours = a.descriptors[i : i + BLOCK_POINTS]
+        for j in range(0, len(b.points), BLOCK_POINTS):
+            alike = _most_alike(ours, b.descriptors[j : j + BLOCK_POINTS])
+            _update(best_a[i : i + BLOCK_POINTS], partner_a[i : i + BLOCK_POINTS], alike, j)
+            _update(best_b[j : j + BLOCK_POINTS], partner_b[j : j + BLOCK_POINTS], alike.T, i)
     mine = np.arange(len(a.points))
     mutual = (partner_b[partner_a] == mine) & (best_a[:, 0] > 0) if len(b.points) else np.zeros(len(mine), bool)
     pairs = np.stack([mine[mutual], partner_a[mutual]], axis=1)

@@ -20,19 +20,19 @@ from scenefuse.register.uncertainty import MIN_PIECES, PIECES_ACROSS, Uncertaint
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24
 # A scene point this many standard deviations from the object, in place and colour, is as likely something else.
-FARTHEST = 4.0
+MAX_DEVIATIONS = 4.0
 # The noise begins at this share of the scene's diagonal; it never gets below this share of the object's spacing, nor
-# the noise of colours (0..1) below LEAST_COLOR: samples a spacing apart tell no more.
-FIRST_NOISE, LEAST_NOISE, LEAST_COLOR = 0.02, 0.75, 0.03
-# The noise settles in LEAST_ROUNDS; then a step that moves the points by less than this share of it is the last.
-ROUNDS, LEAST_ROUNDS, CONVERGED = 25, 5, 0.01
+# the noise of colours (0..1) below MIN_COLOR_NOISE: samples a spacing apart tell no more.
+START_NOISE, MIN_NOISE, MIN_COLOR_NOISE = 0.02, 0.75, 0.03
+# The noise settles in MIN_ROUNDS; then a step that moves the points by less than this share of it is the last.
+MAX_ROUNDS, MIN_ROUNDS, MIN_STEP = 25, 5, 0.01
 # Directions of which less is known than this share of the best known are not followed further in one step.
-WEAKEST = 1e-3
-HALVINGS = 5
+MIN_INFORMATION = 1e-3
+MAX_STEP_CUTS = 5
 # Copies of the scene that are drawn from the object, at a pose that is known.
-COPIES = 4
+PLANTED_COPIES = 4
 # Fewer scene points on the object determine nothing.
-LEAST_POINTS = 100
+MIN_POINTS = 100
 # Of a direction of which nothing is known: this share of the best known.
 NOTHING = 1e-9
 
@@ -109,16 +109,16 @@ def most_likely(
         spacing: of the object's points, scene units.
         diagonal: of the scene crop.
     """
-    pose, floor = start, LEAST_NOISE * spacing
-    noise = Noise(FIRST_NOISE * diagonal, 0.15, np.ones(3), np.zeros(3))
+    pose, floor = start, MIN_NOISE * spacing
+    noise = Noise(START_NOISE * diagonal, 0.15, np.ones(3), np.zeros(3))
     found = explain(obj, scene, pose, noise, spacing)
-    for step in range(ROUNDS):
+    for step in range(MAX_ROUNDS):
         noise = _measured_noise(obj, scene, found, floor)
         found = explain(obj, scene, pose, noise, spacing, found.partner)
         at = _derivatives(obj, scene, pose, noise, found)
         change = _newton_step(at, diagonal / 3, scales.width == 0)
         pose, found, moved = _climb(obj, scene, at, found, change, scales, spacing)
-        if step >= LEAST_ROUNDS - 1 and moved * diagonal / 3 < CONVERGED * noise.place:
+        if step >= MIN_ROUNDS - 1 and moved * diagonal / 3 < MIN_STEP * noise.place:
             break
     return _derivatives(obj, scene, pose, noise, found)
 
@@ -145,7 +145,7 @@ def explain(
         off += (_color_residual(obj, scene, partner, noise) ** 2).sum(2) / (2 * noise.color**2)
     likelihood = np.exp(-off)
     # As many object points lie within reach of a scene point on a plane.
-    other = np.exp(-(FARTHEST**2) / 2) * min(near, 2 * np.pi * (noise.place / spacing) ** 2)
+    other = np.exp(-(MAX_DEVIATIONS**2) / 2) * min(near, 2 * np.pi * (noise.place / spacing) ** 2)
     total = likelihood.sum(1) + other
     return Explanation(partner, likelihood / total[:, None], residual, float(np.log(total).sum()))
 
@@ -175,7 +175,7 @@ def _measured_noise(obj: Surface, scene: Surface, found: Explanation, floor: flo
     gain = np.clip(together / np.maximum(spread, 1e-9), 0.25, 4.0)
     noise = Noise(place, 1.0, gain, mean_theirs - gain * mean_mine)
     off = (_color_residual(obj, scene, found.partner, noise) ** 2).sum(2)
-    return Noise(place, max(LEAST_COLOR, float(np.sqrt((weight * off).sum() / (3 * total)))), gain, noise.bias)
+    return Noise(place, max(MIN_COLOR_NOISE, float(np.sqrt((weight * off).sum() / (3 * total)))), gain, noise.bias)
 
 
 def _derivatives(obj: Surface, scene: Surface, pose: Sim3, noise: Noise, found: Explanation) -> MostLikely:
@@ -205,7 +205,7 @@ def _newton_step(at: MostLikely, reach: float, hold_scale: bool) -> Array:
     if hold_scale:
         gradient[6], information[6], information[:, 6] = 0, 0, 0
     values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, WEAKEST * values[-1])
+    values = np.maximum(values, MIN_INFORMATION * values[-1])
     change = (vectors @ ((vectors.T @ gradient) / values)) / unit
     change[6] = np.clip(change[6], -MAX_SCALE_STEP, MAX_SCALE_STEP)
     return change
@@ -221,7 +221,7 @@ def _climb(
     spacing: float,
 ) -> tuple[Sim3, Explanation, float]:
     """The pose after a change, or a part of it, that is more likely, and how far it moves a point at the distance 1."""
-    for _ in range(HALVINGS):
+    for _ in range(MAX_STEP_CUTS):
         pose = moved_about(at.pose, change, at.centre, scales)
         then = explain(obj, scene, pose, at.noise, spacing)
         if then.log_likelihood > found.log_likelihood:
@@ -240,7 +240,7 @@ def certified(
     """
     found = most_likely(obj, scene, start, scales, spacing, diagonal)
     of_pieces = _covariance(scene, found, diagonal, scales.width == 0)
-    if of_pieces is None or np.count_nonzero(found.on_object > 0.5) < LEAST_POINTS:
+    if of_pieces is None or np.count_nonzero(found.on_object > 0.5) < MIN_POINTS:
         return None
     off = _off_on_copies(obj, scene, found, scales, spacing, diagonal, seed)
     bias, spread = off.mean(0), np.cov(off.T)
@@ -274,7 +274,7 @@ def _covariance(scene: Surface, found: MostLikely, diagonal: float, hold_scale: 
 def _off_on_copies(
     obj: Surface, scene: Surface, found: MostLikely, scales: ScaleRange, spacing: float, diagonal: float, seed: int
 ) -> Array:
-    """(COPIES, 7) how far the most likely poses of planted copies lie off: rotation vector, shift, log scale.
+    """(PLANTED_COPIES, 7) how far the most likely poses of planted copies lie off: rotation vector, shift, log scale.
 
     A copy has a point for every scene point on the object, drawn from one half of the object's points about the same
     place, with the noise; the other half is laid on it (parametric bootstrap, Efron 1979). What the object's own noise
@@ -282,7 +282,7 @@ def _off_on_copies(
     """
     rng, near = np.random.default_rng(seed), np.flatnonzero(found.on_object > 0.5)
     at, noise, off = scene.points[scene.queries[near]], found.noise, []
-    for _ in range(COPIES):
+    for _ in range(PLANTED_COPIES):
         order = rng.permutation(len(obj))
         mine, theirs = (_part(obj, np.sort(half)) for half in np.array_split(order, 2))
         drawn = theirs.tree.query(found.pose.inverse().apply(at + rng.normal(0, noise.place, at.shape)))[1]

@@ -86,7 +86,7 @@ class Alignment:
 
 
 @dataclass(frozen=True)
-class Evidence:
+class Constraints:
     """Everything known beside the clouds; each part is None where it is not known.
 
     Attributes:
@@ -108,14 +108,14 @@ class Problem:
         object: any frame and unit.
         scene: the scene's points around the object.
         scales: what the scale may be, scene units per object unit.
-        evidence: what is known beside the clouds.
+        known: what is known beside the clouds.
         seed: of all random choices.
     """
 
     object: Cloud
     scene: Cloud
     scales: ScaleRange
-    evidence: Evidence = Evidence()
+    known: Constraints = Constraints()
     seed: int = 0
 
     def surfaces(self, scale: float, fraction: float, most: int) -> tuple[Surface, Surface]:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import COLOR_WEIGHT, refine_planes, refine_points
 from scenefuse.geometry.surface import Surface, prepare, with_grid, with_queries
-from scenefuse.register.coarse import Candidate
+from scenefuse.register.coarse import QUERY_POINTS, Candidate
 from scenefuse.register.decision import (
     MAX_FREE_SPACE_VIOLATION,
     DecidedBy,
@@ -22,35 +22,42 @@ from scenefuse.register.decision import (
 from scenefuse.register.likelihood import certified
 from scenefuse.register.problem import Problem
 from scenefuse.register.repetition import multiples, shifted, shifts_onto_itself, undecided_shift
-from scenefuse.register.score import SAME_ANGLE_DEG, SAME_SHIFT, Hypothesis, Score, best_distinct, score
+from scenefuse.register.score import (
+    DISTINCT_ANGLE_DEG,
+    DISTINCT_SHIFT,
+    SCORE_FRACTION,
+    Hypothesis,
+    Score,
+    best_distinct,
+    score,
+)
 from scenefuse.register.uncertainty import Uncertainty, alike, half_sampling, with_bending
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
 FINE_POINTS = 12000
-QUERY_POINTS = 1200
 POLISH_QUERY_POINTS = 3000
 # Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
-START_FRACTION, END_FRACTION = 0.05, 0.02
+START_FRACTION = 0.05
 REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
 # Leading poses whose turned copies are tried, copies that are refined, and hypotheses, or copies, that are polished.
-TURNED, COPIES, POLISHED = 2, 6, 4
+TURNED_POSES, REFINED_COPIES, POLISHED_POSES = 2, 6, 4
 # Copies count as the best of their surroundings only: nearer ones would slide back to the pose that they are made of.
-COPY_ANGLE_DEG = 25
+COPY_SEPARATION_DEG = 25
 # Nearer to its place than a coarse pose, a copy is refined from a smaller pairing distance.
 COPY_START = 0.7
 # A valley that is flat in scale has several ends: the polish is repeated from both sides.
-OFF_SCALE = 1.06
+POLISH_SCALE_FACTOR = 1.06
 # Poses of an object that repeats itself differ when they lie more than this share of the shortest period apart.
-OF_PERIOD = 0.5
+MIN_PERIOD_SHARE = 0.5
 # Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
-OWN_SPACING = 0.005
+REPETITION_SPACING = 0.005
 # The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
-BEYOND_PRIOR = 0.15
+PRIOR_SLACK_LOG = 0.15
 # The score is too coarse to choose between two poses in one valley: below this share, the polish went astray.
-ASTRAY = 0.9
+MIN_SCORE_RATIO = 0.9
 # A refined pose beyond the alignment's uncertainty, which does not know how the models are bent, is near up to so many
 # times that.
-NEAR_ALIGNMENT = 2.0
+MAX_BENDING_FACTOR = 2.0
 # Halves of the surface that are registered again for the uncertainty.
 RESAMPLINGS = 8
 
@@ -102,17 +109,18 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     """
     work = _prepare(problem, candidates[0][0].scale, settings)
     refined = work.best_first([work.refine(pose, source, work.wide) for pose, source in candidates])
-    refined = work.best_first([*refined, *work.turned(refined[:TURNED])])
-    polished = work.best_first([work.polish(h) for h in refined[:POLISHED]])
-    both_sides = [work.polish(work.resized(polished[0], factor)) for factor in (1 / OFF_SCALE, OFF_SCALE)]
+    refined = work.best_first([*refined, *work.turned(refined[:TURNED_POSES])])
+    polished = work.best_first([work.polish(h) for h in refined[:POLISHED_POSES]])
+    factors = 1 / POLISH_SCALE_FACTOR, POLISH_SCALE_FACTOR
+    both_sides = [work.polish(work.resized(polished[0], factor)) for factor in factors]
     polished = work.best_first([*polished, *both_sides])
     # About the polished pose, whose axis is exact, rivals turn up that the copies of a rough one slid past.
-    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED])])
+    polished = work.best_first([*polished, *(work.polish(h) for h in work.turned(polished[:1])[:POLISHED_POSES])])
     polished = work.best_first([*polished, *work.shifted(polished[0])])
     ranked, uncertainty, decided_by = work.compared_with_photos(polished)
     shape = with_queries(work.obj, QUERY_POINTS, problem.seed)
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
-    pose, alignment = ranked[0].pose, problem.evidence.alignment
+    pose, alignment = ranked[0].pose, problem.known.alignment
     by_photos = alignment is not None and pose is alignment.pose
     return Outcome(
         ranked, decision, uncertainty, None if by_photos else alike(*work.scored, pose, problem.scales, work.narrow)
@@ -125,7 +133,7 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
     obj, scene = problem.surfaces(scale, fraction, FINE_POINTS)
     cell, reach = 2 * fraction * diagonal, 2 * START_FRACTION * diagonal
     return _Work(
-        replace(problem, scales=problem.scales.widened(BEYOND_PRIOR)),
+        replace(problem, scales=problem.scales.widened(PRIOR_SLACK_LOG)),
         settings,
         obj,
         (
@@ -141,7 +149,7 @@ def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
 def _shifts(problem: Problem, obj: Surface, spacing: float) -> list[Array]:
     """The shifts (3,) by which the object, thinned to a spacing, repeats itself; the scale may be wrong yet, and the
     spacing too large to tell."""
-    own = OWN_SPACING * problem.object.diagonal
+    own = REPETITION_SPACING * problem.object.diagonal
     if own < spacing:
         obj, spacing = prepare(problem.object, own, problem.seed, FINE_POINTS), own
     return shifts_onto_itself(with_queries(obj, QUERY_POINTS, problem.seed), spacing)
@@ -182,9 +190,9 @@ class _Work:
     @property
     def narrow(self) -> float:
         """Last pairing distance, scene units."""
-        return END_FRACTION * self.problem.scene.diagonal
+        return SCORE_FRACTION * self.problem.scene.diagonal
 
-    def best_first(self, hypotheses: list[Hypothesis], angle_deg: float = SAME_ANGLE_DEG) -> list[Hypothesis]:
+    def best_first(self, hypotheses: list[Hypothesis], angle_deg: float = DISTINCT_ANGLE_DEG) -> list[Hypothesis]:
         """Ranked by score, one of each valley."""
         diagonal = self.problem.scene.diagonal
         same = self.same_shift(min(h.pose.scale for h in hypotheses))
@@ -192,8 +200,8 @@ class _Work:
 
     def same_shift(self, scale: float) -> float:
         """Poses whose shift differs by less are one, as a share of the diagonal."""
-        lengths = [OF_PERIOD * scale * float(np.linalg.norm(s)) / self.problem.scene.diagonal for s in self.shifts]
-        return min([SAME_SHIFT, *lengths])
+        periods = [scale * float(np.linalg.norm(shift)) / self.problem.scene.diagonal for shift in self.shifts]
+        return min([DISTINCT_SHIFT, *(MIN_PERIOD_SHARE * period for period in periods)])
 
     def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
         """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""
@@ -202,24 +210,24 @@ class _Work:
 
     def turned(self, leaders: list[Hypothesis]) -> list[Hypothesis]:
         """The best of the leaders' turned copies, refined."""
-        ups = self.problem.evidence.ups
+        ups = self.problem.known.ups
         axis, steps = None if ups is None else ups[1], self.settings.turn_steps
         copies = [pose for h in leaders for pose in turned_copies(h.pose, self.obj, axis, steps)]
         scored = [Hypothesis(pose, "turned", self._score(pose, self.searched)) for pose in copies]
-        best = [h for h in self.best_first([*leaders, *scored], COPY_ANGLE_DEG) if h.source == "turned"]
-        return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:COPIES]]
+        best = [h for h in self.best_first([*leaders, *scored], COPY_SEPARATION_DEG) if h.source == "turned"]
+        return [self.refine(h.pose, "turned", COPY_START * self.wide) for h in best[:REFINED_COPIES]]
 
     def shifted(self, best: Hypothesis) -> list[Hypothesis]:
         """The best of a pose's copies shifted along the object's repetition, polished."""
         poses = [shifted(best.pose, step) for shift in self.shifts for step in multiples(self.obj, shift)]
         scored = [Hypothesis(pose, "shifted", self._score(pose, self.searched)) for pose in poses]
-        return [self.polish(h) for h in sorted(scored, key=lambda h: -h.score.total)[:POLISHED]]
+        return [self.polish(h) for h in sorted(scored, key=lambda h: -h.score.total)[:POLISHED_POSES]]
 
     def repetition(self, pose: Sim3) -> Repetition:
         """What the object's repetition leaves open of a pose."""
         if not self.shifts:
             return Repetition()
-        tau, free_space = self.settings.score_fraction * self.problem.scene.diagonal, self.problem.evidence.free_space
+        tau, free_space = self.settings.score_fraction * self.problem.scene.diagonal, self.problem.known.free_space
         period = undecided_shift(*self.scored, pose, self.shifts, tau, self.settings.min_margin, free_space)
         return Repetition(self.same_shift(pose.scale), period)
 
@@ -227,7 +235,7 @@ class _Work:
         """The hypothesis after the last refinement, by planes and colours."""
         pose = refine_planes(*self.scored, h.pose, self.problem.scales, self.narrow, POLISH_ROUNDS, COLOR_WEIGHT)
         after, before = (Hypothesis(p, h.source, self._score(p, self.scored)) for p in (pose, h.pose))
-        return after if after.score.total > ASTRAY * before.score.total else before
+        return after if after.score.total > MIN_SCORE_RATIO * before.score.total else before
 
     def resized(self, h: Hypothesis, factor: float) -> Hypothesis:
         """The hypothesis with the object grown about its centre."""
@@ -245,7 +253,7 @@ class _Work:
         if other is None or (own is not None and own.size(diagonal) <= other[1].size(diagonal)):
             return ranked, own
         likely = Hypothesis(other[0], best.source, self._score(other[0], self.scored))
-        if likely.score.total <= ASTRAY * best.score.total:
+        if likely.score.total <= MIN_SCORE_RATIO * best.score.total:
             return ranked, own
         return [likely, *ranked[1:]], other[1]
 
@@ -259,7 +267,7 @@ class _Work:
         alignment's valley is dropped, unless it stays near and the scene's photos refute the alignment's own pose: both
         models may be bent. Then it has to pass as a pose that no photos support.
         """
-        alignment, diagonal = self.problem.evidence.alignment, self.problem.scene.diagonal
+        alignment, diagonal = self.problem.known.alignment, self.problem.scene.diagonal
         if alignment is None:
             return *self.settled(ranked), "geometry"
         agree = alignment.agrees(ranked[0].pose, self.centre, diagonal)
@@ -269,10 +277,10 @@ class _Work:
         by_photos = Hypothesis(alignment.pose, "photos", self._score(alignment.pose, self.scored))
         worth = min(1.0, by_photos.score.total / max(ranked[0].score.total, 1e-12))
         strays = not alignment.agrees(ranked[0].pose, self.centre, diagonal)
-        near = alignment.agrees(ranked[0].pose, self.centre, diagonal, NEAR_ALIGNMENT)
+        near = alignment.agrees(ranked[0].pose, self.centre, diagonal, MAX_BENDING_FACTOR)
         if strays and near and _refuted(by_photos) and not _refuted(ranked[0]):
             return ranked, own, "near"
-        if own is not None and worth > ASTRAY:
+        if own is not None and worth > MIN_SCORE_RATIO:
             own = own.unless_apart(ranked[0].pose, alignment.pose, self.centre, alignment.uncertainty)
         if strays or own is None or alignment.uncertainty.size(diagonal) < worth * own.size(diagonal):
             ranked, own = [by_photos, *ranked], alignment.uncertainty
@@ -281,7 +289,7 @@ class _Work:
     def _score(self, pose: Sim3, surfaces: tuple[Surface, Surface]) -> Score:
         """How well a pose explains both clouds."""
         tau = self.settings.score_fraction * self.problem.scene.diagonal
-        return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.evidence.free_space)
+        return score(*surfaces, pose, tau, self.problem.scales.centre, self.problem.known.free_space)
 
 
 def _refuted(h: Hypothesis) -> bool:

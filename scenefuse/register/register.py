@@ -21,7 +21,7 @@ from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import pose_quantities
-from scenefuse.register.problem import Evidence, Problem, check_extent
+from scenefuse.register.problem import Constraints, Problem, check_extent
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import SCORE_FRACTION
@@ -30,10 +30,10 @@ from scenefuse.register.uncertainty import uncertainty_quantities
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
 # Points in which too few different ones are looked for before all are counted.
-SAMPLE = 20_000
+SAMPLED_POINTS = 20_000
 # Of `second_place`: what a found pose leaves of a scene, over the object, so that it may show it again; share of the
 # object that the coarse search finds there; distance of both places, over the object's diagonal.
-LEFT, SHOWN, APART = 0.3, 0.25, 0.4
+MIN_REST, MIN_PRECISION, MIN_DISTANCE = 0.3, 0.25, 0.4
 Direction = tuple[float, float, float]
 
 
@@ -158,7 +158,7 @@ def register_clouds(
     )
     if scales is None:
         scales = prior(estimates(near_obj, near_scene, ups), settings.scale)
-    problem = Problem(near_obj, near_scene, scales, Evidence(ups), seed)
+    problem = Problem(near_obj, near_scene, scales, Constraints(ups), seed)
     found = find_hypotheses(problem, settings.coarse)
     if not found:
         return Registration(False, "neither features nor gravity gave a pose", None, None, origins, scales, {})
@@ -193,23 +193,23 @@ def second_place(
     own = sampled(scene.points, SEARCHED_POINTS, seed)
     rest = own[cKDTree(moved).query(own, workers=threads())[0] > SCORE_FRACTION * scene.diagonal]
     voxel = SCORE_FRACTION * size
-    if len(rest) < MIN_POINTS or occupied_voxels(rest, voxel) < LEFT * occupied_voxels(moved, voxel):
+    if len(rest) < MIN_POINTS or occupied_voxels(rest, voxel) < MIN_REST * occupied_voxels(moved, voxel):
         return None
-    evidence = Evidence(None if ups is None else (ups[1], ups[1]))
-    problem = Problem(Cloud(moved - centre), Cloud(rest - centre), ScaleRange(1.0, 0.0), evidence, seed)
+    known = Constraints(None if ups is None else (ups[1], ups[1]))
+    problem = Problem(Cloud(moved - centre), Cloud(rest - centre), ScaleRange(1.0, 0.0), known, seed)
     there = find_hypotheses(problem, settings.coarse)
-    if not there or max(one.score.precision for one in there) < SHOWN:
+    if not there or max(one.score.precision for one in there) < MIN_PRECISION:
         return None
     outcome = refine_hypotheses(problem, [(one.pose, one.source) for one in there], settings.fine)
     place = outcome.ranked[0].pose.translation
-    if not outcome.decision.registered or np.linalg.norm(place) < APART * size:
+    if not outcome.decision.registered or np.linalg.norm(place) < MIN_DISTANCE * size:
         return None
     return np.asarray(place + centre)
 
 
 def _check_points(cloud: Cloud, name: str) -> None:
     """StageError where a cloud has too few different points, or where they span no surface."""
-    sample = np.unique(cloud.points[:: max(1, len(cloud) // SAMPLE)], axis=0)
+    sample = np.unique(cloud.points[:: max(1, len(cloud) // SAMPLED_POINTS)], axis=0)
     different = len(sample) if len(sample) >= MIN_POINTS else len(np.unique(cloud.points, axis=0))
     if different < MIN_POINTS:
         among = "" if different == len(cloud) else f" among its {len(cloud)} points"

@@ -16,22 +16,22 @@ from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import color_agreement, f_beta, worth
 
 # Edge of a voxel, and distance within which points agree, in spacings of the points.
-VOXEL, AGREEING = 4 / 3, 8 / 3
+VOXEL_SPACINGS, MATCH_SPACINGS = 4 / 3, 8 / 3
 # Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
-MOST_CELLS, LEAST_VOXELS = 1_000_000, 3
+MAX_CELLS, MIN_SHIFT_VOXELS = 1_000_000, 3
 # A shift is looked at when this share of the object's voxels meet, and so much less of them on the way to it: a plane
 # that slides along itself does not repeat.
-MEETING, DIP = 0.3, 0.02
+MIN_MEETING, MIN_DIP = 0.3, 0.02
 # Shifts that are looked at, directions kept, and rounds that refine a shift.
-LOOKED_AT, DIRECTIONS, ROUNDS = 8, 3, 20
+MAX_PEAKS, MAX_DIRECTIONS, ROUNDS = 8, 3, 20
 # It repeats when it meets its shifted self about as closely as points of one surface lie apart, and on the way there so
 # much less closely, within half the distance.
-SAME_SELF, CONTRAST = 0.96, 0.03
+MIN_SELF_AGREEMENT, MIN_CONTRAST = 0.96, 0.03
 # Where two clouds end along a direction, as percentiles: strays do not count.
-ENDS = 1, 99
+END_PERCENTILES = 1, 99
 # The part that both show must be so many periods long, and at least this share of what it is at the pose found: then
 # nothing distinctive in that can leave it unnoticed.
-LEAST_PERIODS, LEAST_LEFT = 2, 0.5
+MIN_PERIODS, MIN_OVERLAP_LEFT = 2, 0.5
 
 
 def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
@@ -44,7 +44,7 @@ def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
         spacing: of its points, in its own unit.
     """
     found: list[Array] = []
-    voxel, tau = VOXEL * spacing, AGREEING * spacing
+    voxel, tau = VOXEL_SPACINGS * spacing, MATCH_SPACINGS * spacing
     for shift in _peaks(obj, voxel):
         if any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
@@ -52,11 +52,11 @@ def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
         refined = refine_planes(obj, obj, start, ScaleRange(1.0, 0.0), 2 * voxel, ROUNDS, 0.0)
         shift = refined.apply(obj.points.mean(0)) - obj.points.mean(0)
         length = float(np.linalg.norm(shift))
-        if length < LEAST_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
+        if length < MIN_SHIFT_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
         if _repeats(obj, shift, tau):
             found.append(shift)
-        if len(found) == DIRECTIONS:
+        if len(found) == MAX_DIRECTIONS:
             break
     return found
 
@@ -66,29 +66,29 @@ def _repeats(obj: Surface, shift: Array, tau: float) -> bool:
     distance, nearest = obj.tree.query(obj.points[obj.queries], k=2, workers=threads())
     facing = np.abs((obj.normals[obj.queries] * obj.normals[nearest[:, 1]]).sum(1))
     usual = float((np.clip(1 - (distance[:, 1] / tau) ** 2, 0, 1) * facing).mean())
-    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < SAME_SELF * usual:
+    if overlap(obj, obj, Sim3(1.0, np.eye(3), shift), shift, tau).agreement < MIN_SELF_AGREEMENT * usual:
         return False
     there, half, quarter = (
         overlap(obj, obj, Sim3(1.0, np.eye(3), part * shift), shift, tau / 2).agreement for part in (1.0, 0.5, 0.25)
     )
-    return half < (1 - CONTRAST) * there or quarter < (1 - CONTRAST) * there
+    return half < (1 - MIN_CONTRAST) * there or quarter < (1 - MIN_CONTRAST) * there
 
 
 def _peaks(obj: Surface, voxel: float) -> list[Array]:
     """Shifts (3,) at which many of an object's voxels meet others, most first; of each and its reverse, one."""
     axes = np.linalg.svd(obj.points - obj.points.mean(0), full_matrices=False)[2]
     points, normals = obj.points @ axes.T, obj.normals @ axes.T
-    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / MOST_CELLS)))
+    voxel = max(voxel, float(np.cbrt(np.prod(2 * np.ptp(points, axis=0) + 4 * voxel) / MAX_CELLS)))
     meeting, share = _autocorrelation(np.floor((points - points.min(0)) / voxel).astype(np.int64), normals)
     size = np.array(meeting.shape)
-    high = np.argwhere((share == maximum_filter(share, 5, mode="wrap")) & (meeting > MEETING))
+    high = np.argwhere((share == maximum_filter(share, 5, mode="wrap")) & (meeting > MIN_MEETING))
     step = np.where(high > size // 2, high - size, high)
     ahead = (step[:, 0] > 0) | (step[:, 0] == 0) & ((step[:, 1] > 0) | (step[:, 1] == 0) & (step[:, 2] > 0))
-    step = step[ahead & (np.linalg.norm(step, axis=1) >= LEAST_VOXELS)]
+    step = step[ahead & (np.linalg.norm(step, axis=1) >= MIN_SHIFT_VOXELS)]
     way = step[:, None] * np.linspace(0.1, 0.9, 9)[:, None]
     least = map_coordinates(share, np.moveaxis(way, 2, 0), order=1, mode="grid-wrap").min(1)
-    step = step[share[tuple(step.T)] - least > DIP]
-    order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:LOOKED_AT]
+    step = step[share[tuple(step.T)] - least > MIN_DIP]
+    order = np.argsort(-meeting[tuple(step.T)], kind="stable")[:MAX_PEAKS]
     return [voxel * step[k] @ axes for k in order]
 
 
@@ -106,7 +106,7 @@ def _autocorrelation(cells: NDArray[np.int64], normals: Array) -> tuple[Array, A
         spectrum = spectrum + wave.real**2 + wave.imag**2
     meeting = fft.irfftn(_blurred(np.asarray(spectrum), shape), shape, workers=threads())
     meeting /= meeting[0, 0, 0]
-    return meeting, meeting / np.maximum(_of_both((filled > 0).reshape(shape), count), MEETING / 3)
+    return meeting, meeting / np.maximum(_of_both((filled > 0).reshape(shape), count), MIN_MEETING / 3)
 
 
 def _of_both(filled: NDArray[np.bool_], count: NDArray[np.int64]) -> Array:
@@ -188,7 +188,7 @@ def overlap(
 def multiples(obj: Surface, shift: Array) -> list[Array]:
     """A shift (3,) repeated both ways, as far as the object reaches, shortest first."""
     along = obj.points @ (shift / np.linalg.norm(shift))
-    most = int(np.ptp(np.percentile(along, ENDS)) / np.linalg.norm(shift))
+    most = int(np.ptp(np.percentile(along, END_PERCENTILES)) / np.linalg.norm(shift))
     return [sign * k * shift for k in range(1, most + 1) for sign in (1, -1)]
 
 
@@ -228,7 +228,7 @@ def undecided_shift(
         for step in multiples(obj, shift):
             moved = of_object + pose.scale * (step @ shift) / np.linalg.norm(shift)
             left = min(moved[1], of_scene[1]) - max(moved[0], of_scene[0])
-            if left < max(LEAST_PERIODS * period, LEAST_LEFT * found.length):
+            if left < max(MIN_PERIODS * period, MIN_OVERLAP_LEFT * found.length):
                 continue
             other = overlap(obj, scene, shifted(pose, step), shift, tau, free_space)
             if other.agreement > (1 - margin) * found.agreement:
@@ -240,4 +240,4 @@ def _places(obj: Surface, scene: Surface, pose: Sim3, shift: Array) -> tuple[Arr
     """Where along a direction of the object its points (N,) and the scene's (M,) lie, and both their ends (2, 2)."""
     along = pose.rotate(shift / np.linalg.norm(shift))
     places = pose.apply(obj.points) @ along, scene.points @ along
-    return *places, np.array([np.percentile(place, ENDS) for place in places])
+    return *places, np.array([np.percentile(place, END_PERCENTILES) for place in places])

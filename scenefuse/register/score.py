@@ -16,7 +16,7 @@ SCORE_FRACTION = 0.02
 # Colours that vary less (standard deviation, 0..1) say nothing about the pose.
 MIN_CONTRAST = 0.02
 # Poses that differ by less than these are one: an angle, the scale, the centre as a share of the diagonal.
-SAME_ANGLE_DEG, SAME_SCALE_LOG, SAME_SHIFT = 8.0, 0.06, 0.05
+DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT = 8.0, 0.06, 0.05
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ def best_distinct(
     centre: Array,
     diagonal: float,
     most: int,
-    angle_deg: float = SAME_ANGLE_DEG,
-    shift: float = SAME_SHIFT,
+    angle_deg: float = DISTINCT_ANGLE_DEG,
+    shift: float = DISTINCT_SHIFT,
 ) -> list[Hypothesis]:
     """At most `most` hypotheses, best first, without those that equal a better one; see `distinct`."""
     chosen: list[Hypothesis] = []
@@ -156,11 +156,11 @@ def distinct(
     b: Sim3,
     centre: Array,
     diagonal: float,
-    angle_deg: float = SAME_ANGLE_DEG,
-    shift: float = SAME_SHIFT,
+    angle_deg: float = DISTINCT_ANGLE_DEG,
+    shift: float = DISTINCT_SHIFT,
 ) -> bool:
     """Whether two poses differ by more than an angle, 6 % of scale or, at the object's centre, `shift` diagonals."""
     apart = np.linalg.norm(a.apply(centre) - b.apply(centre))
     turn = rotation_angle_deg(a.rotation @ b.rotation.T)
     scale_log = abs(np.log(a.scale / b.scale))
-    return bool(turn > angle_deg or scale_log > SAME_SCALE_LOG or apart > shift * diagonal)
+    return bool(turn > angle_deg or scale_log > DISTINCT_SCALE_LOG or apart > shift * diagonal)

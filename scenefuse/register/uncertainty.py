@@ -13,13 +13,13 @@ from scenefuse.geometry.icp import COLOR_WEIGHT, ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface
 
 # Halves begin this much too large or too small, so that a scale that stays where it is put shows itself.
-OFF_SCALE = 1.03
+START_SCALE_FACTOR = 1.03
 ROUNDS = 30
 # Pieces to the scene's diagonal: what errs together stays together.
 PIECES_ACROSS = 6
 MIN_PIECES = 8
 # What a surface has wrong alike all over, as a share of how far two surfaces scatter about each other.
-ALIKE = 0.2
+COMMON_ERROR = 0.2
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def alike(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: f
     distance, nearest = obj.tree.query(points, distance_upper_bound=reach / pose.scale, workers=threads())
     on_it = np.isfinite(distance)
     off = ((points[on_it] - obj.points[nearest[on_it]]) * obj.normals[nearest[on_it]]).sum(1)
-    shift = ALIKE * pose.scale * float(np.sqrt((off**2).mean())) if on_it.any() else 0.0
+    shift = COMMON_ERROR * pose.scale * float(np.sqrt((off**2).mean())) if on_it.any() else 0.0
     radius = pose.scale * float(np.sqrt(((obj.points - obj.points.mean(0)) ** 2).sum(1).mean()))
     of_scale = shift / radius if scales.width > 0 else 0.0
     return np.diag(np.square([shift / radius] * 3 + [shift] * 3 + [of_scale]))
@@ -184,7 +184,7 @@ def half_sampling(
         half = _half(*surfaces[k % len(surfaces)], pose, edge, rng)
         if half is None:
             return None
-        factor = OFF_SCALE if k // len(surfaces) % 2 else 1 / OFF_SCALE
+        factor = START_SCALE_FACTOR if k // len(surfaces) % 2 else 1 / START_SCALE_FACTOR
         start = Sim3(factor, np.eye(3), (1 - factor) * pose.apply(centre)) @ pose
         other = refine_planes(*half, start, scales, tau, ROUNDS, color_weight)
         deviations[k, :3] = Rotation.from_matrix(other.rotation @ pose.rotation.T).as_rotvec()

@@ -21,7 +21,7 @@ from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.fine import EvidenceFiles, register_finely
+from scenefuse.register.fine import ConstraintFiles, register_finely
 from scenefuse.register.problem import Inputs
 from scenefuse.register.scale import ScaleSettings
 
@@ -39,14 +39,14 @@ def one(results: Path, name: str, variant: str, seed: int, options: dict[str, An
             register_as_paper(inputs=inputs, scale_report=scale, coarse_report=coarse, report=fine, seed=seed)
         else:
             depth = tuple(p for p in sorted((scene / "depth").iterdir()) if p.is_dir())
-            evidence = EvidenceFiles(folder / "alignment.json", scene / "undistorted", depth)
+            evidence = ConstraintFiles(folder / "alignment.json", scene / "undistorted", depth)
             settings = build(CoarseSettings, options.get("coarse", {})), build(FineSettings, options.get("fine", {}))
             register_coarsely(
                 inputs=inputs, scale_report=scale, report=coarse, seed=seed,
                 scale=build(ScaleSettings, options.get("scale", {})), settings=settings[0],
             )  # fmt: skip
             register_finely(
-                inputs=inputs, scale_json=scale, coarse_json=coarse, evidence=evidence, report=fine, seed=seed,
+                inputs=inputs, scale_json=scale, coarse_json=coarse, known=evidence, report=fine, seed=seed,
                 settings=settings[1],
             )  # fmt: skip
         found = read_json(fine)

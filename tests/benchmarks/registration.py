@@ -24,7 +24,7 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.paper.register_as_paper import paper_coarse, paper_fine
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.problem import Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.uncertainty import Uncertainty
@@ -48,10 +48,10 @@ class Found:
 
 def scenefuse(trial: Trial, scene: Cloud, *, blind: bool = False) -> Found:
     """Our registration; `blind` hides gravity, colours and depth maps from it."""
-    cloud, evidence = trial.object, Evidence((trial.up_in_object, UP), trial.free_space)
+    cloud, evidence = trial.object, Constraints((trial.up_in_object, UP), trial.free_space)
     if blind:
         cloud, scene = Cloud(cloud.points, cloud.normals), Cloud(scene.points, scene.normals)
-        evidence = Evidence()
+        evidence = Constraints()
     scales = prior(estimates(cloud, scene, evidence.ups), ScaleSettings())
     problem = Problem(cloud, scene, scales, evidence)
     found = find_hypotheses(problem, CoarseSettings())

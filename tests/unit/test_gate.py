@@ -19,10 +19,10 @@ from scenefuse.geometry.surface import Surface
 from scenefuse.register import decision as gate
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_torn
-from scenefuse.register.problem import Alignment, Evidence, Problem
+from scenefuse.register.problem import Alignment, Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
-from scenefuse.register.score import SAME_ANGLE_DEG, SAME_SCALE_LOG, SAME_SHIFT, Hypothesis, Score
+from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT, Hypothesis, Score
 from scenefuse.register.uncertainty import Uncertainty
 
 X, Y, Z = np.eye(3)
@@ -104,7 +104,7 @@ def decided(case: Case, decided_by: str) -> Decision:
         scale, angle, step = case.sure
         sure = replace(Uncertainty.even(scale, angle, step * DIAGONAL), rotation_axis=case.axis)
     scene = Cloud(np.array([[0.0, 0, 0], [DIAGONAL, 0, 0]]))
-    problem = Problem(Cloud(case.obj.points), scene, case.scales, Evidence(case.ups))
+    problem = Problem(Cloud(case.obj.points), scene, case.scales, Constraints(case.ups))
     return decide(ranked, sure, decided_by, case.obj, problem, SETTINGS, case.repetition)
 
 
@@ -166,7 +166,7 @@ CASES = [
     *sides("position", "the position is uncertain by 0.5% of the diagonal",
            most=SETTINGS.max_translation_sd_fraction, sure=lambda v: (0.002, 0.2, v)),
     Case("nothing meets", "too little of the object meets the scene", sure=None),
-    Case("repeated along itself", "repeats itself every 0.7 units", repetition=Repetition(SAME_SHIFT, 0.7),
+    Case("repeated along itself", "repeats itself every 0.7 units", repetition=Repetition(DISTINCT_SHIFT, 0.7),
          decided_by=BY_CLOUDS),
     Case("repeated, but decided", None, repetition=Repetition(0.01, None)),
     Case("a scale held at the end of nothing", None, scales=ScaleRange(1.0, 0.0)),
@@ -182,17 +182,18 @@ CASES = [
          decided_by=BY_CLOUDS),
     Case("the first rival counts", None, rivals=((ELSEWHERE, 0.9), (shift(0, 3, 0), 0.99)), also={"margin": 1 - 0.9}),
     Case("a rival that scores more", "the margin is -0.200", rivals=((ELSEWHERE, 1.2),), decided_by=BY_CLOUDS),
-    Case("the same place", None, rivals=((shift(SAME_SHIFT * DIAGONAL - LITTLE, 0, 0), 1.0),), also={"rival": None}),
-    Case("just another place", "another pose", rivals=((shift(SAME_SHIFT * DIAGONAL + LITTLE, 0, 0), 1.0),),
+    Case("the same place", None, rivals=((shift(DISTINCT_SHIFT * DIAGONAL - LITTLE, 0, 0), 1.0),),
+         also={"rival": None}),
+    Case("just another place", "another pose", rivals=((shift(DISTINCT_SHIFT * DIAGONAL + LITTLE, 0, 0), 1.0),),
          decided_by=BY_CLOUDS),
     Case("another place of what repeats", "another pose", rivals=((shift(0.2, 0, 0), 1.0),),
          repetition=Repetition(0.01), decided_by=BY_CLOUDS),
-    Case("the same heading", None, rivals=((turn(Z, SAME_ANGLE_DEG - 0.01), 1.0),), also={"rival": None}),
-    Case("just another heading", "another pose", rivals=((turn(Z, SAME_ANGLE_DEG + 0.01), 1.0),),
+    Case("the same heading", None, rivals=((turn(Z, DISTINCT_ANGLE_DEG - 0.01), 1.0),), also={"rival": None}),
+    Case("just another heading", "another pose", rivals=((turn(Z, DISTINCT_ANGLE_DEG + 0.01), 1.0),),
          decided_by=BY_CLOUDS),
-    Case("the same size", None, rivals=((Sim3(np.exp(SAME_SCALE_LOG - LITTLE), np.eye(3), np.zeros(3)), 1.0),)),
+    Case("the same size", None, rivals=((Sim3(np.exp(DISTINCT_SCALE_LOG - LITTLE), np.eye(3), np.zeros(3)), 1.0),)),
     Case("just another size", "another pose",
-         rivals=((Sim3(np.exp(SAME_SCALE_LOG + LITTLE), np.eye(3), np.zeros(3)), 1.0),), decided_by=BY_CLOUDS),
+         rivals=((Sim3(np.exp(DISTINCT_SCALE_LOG + LITTLE), np.eye(3), np.zeros(3)), 1.0),), decided_by=BY_CLOUDS),
     # Turns onto itself, which are no rivals.
     Case("half a turn of an oblong tower", None, rivals=((HALF, 1.0),),
          also={"rival": None, "margin": 1.0, "free_axis": Z}),
@@ -265,7 +266,7 @@ def registered(obj, scene, up=None, starts=None, alignment=None, up_in_scene=Z):
     """The outcome of the registration of an object in a scene, from given poses or from all that the search finds."""
     ups = None if up is None else (up, up_in_scene)
     scales = prior(estimates(obj, scene, ups), ScaleSettings())
-    problem = Problem(obj, scene, scales, Evidence(ups, None, alignment), 0)
+    problem = Problem(obj, scene, scales, Constraints(ups, None, alignment), 0)
     starts = starts or [(h.pose, h.source) for h in find_hypotheses(problem, COARSE)]
     return refine_hypotheses(problem, starts, FINE)
 

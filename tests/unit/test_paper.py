@@ -14,7 +14,7 @@ from scenefuse.core.transforms import Sim3, rotation_angle_deg, rotation_between
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.paper import register_as_paper as paper
 from scenefuse.paper.register_as_paper import agreeing, matched_scale, paper_coarse, paper_fine, register_as_paper
-from scenefuse.register.problem import Evidence, Inputs, Problem
+from scenefuse.register.problem import Constraints, Inputs, Problem
 
 SCALE = 2.5
 
@@ -53,7 +53,7 @@ def thinned(points, voxel):
 def test_ransac_runs_on_voxels_of_4_percent_with_the_papers_distance_samples_and_confidence(clouds, calls):
     obj, scene = clouds
     voxel = 0.04 * diagonal(scene.points)
-    pose, _ = paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Evidence(), seed=0))
+    pose, _ = paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Constraints(), seed=0))
     args, registration = calls.pop("registration_ransac_based_on_feature_matching"), o3d.pipelines.registration
     assert not calls and pose.scale == SCALE
     source, target, _, _, mutual, distance, estimation, points, checkers, criteria = args
@@ -150,7 +150,7 @@ def test_too_few_matches_give_no_scale_and_say_so(copied, capsys):
 
 def test_the_papers_recipe_finds_the_pose_of_a_copy(copied):
     obj, scene, pose = copied
-    found, _ = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Evidence(), seed=0))
+    found, _ = paper_coarse(Problem(obj, scene, ScaleRange(pose.scale, 0.0), Constraints(), seed=0))
     found = paper_fine(obj, scene, found)
     assert rotation_angle_deg(found.rotation @ pose.rotation.T) < 3
     off = np.linalg.norm(found.apply(obj.points) - pose.apply(obj.points), axis=1)
@@ -178,4 +178,4 @@ def test_the_note_says_when_open3d_has_too_few_mutual_matches(clouds, calls, sha
     if shapes == "unlike":
         x, y = np.meshgrid(np.linspace(0, 9, 60), np.linspace(0, 9, 60))
         obj = Cloud(np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1))
-    assert len(paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Evidence(), seed=0))[1]) == notes
+    assert len(paper_coarse(Problem(obj, scene, ScaleRange(SCALE, 0.0), Constraints(), seed=0))[1]) == notes

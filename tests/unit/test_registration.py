@@ -22,11 +22,11 @@ from scenefuse.register.coarse import CoarseSettings, find_hypotheses, register_
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import register_finely, scale_ledger
 from scenefuse.register.frame_ledger import frame_ledger, round_trip
-from scenefuse.register.problem import Alignment, Evidence, Inputs, Problem
+from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import color_agreement, score
-from scenefuse.register.uncertainty import ALIKE, Uncertainty, alike, half_sampling
+from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, alike, half_sampling
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()
@@ -48,14 +48,15 @@ def register(trial, scene=None, settings=(COARSE, FINE), seed=0):
     scene = trial.scene if scene is None else scene
     ups = (trial.up_in_object, Z)
     scales = prior(estimates(trial.object, scene, ups), ScaleSettings())
-    problem = Problem(trial.object, scene, scales, Evidence(ups, trial.free_space), seed)
+    problem = Problem(trial.object, scene, scales, Constraints(ups, trial.free_space), seed)
     found = find_hypotheses(problem, settings[0])
     return refine_hypotheses(problem, [(h.pose, h.source) for h in found], settings[1])
 
 
 def refined(trial, start, *, evidence=None, settings=LITTLE[1]):
     """The outcome of the fine registration of a trial from one pose."""
-    problem = Problem(trial.object, trial.scene, ScaleRange(trial.scene_from_object.scale, 0.3), evidence or Evidence())
+    scales = ScaleRange(trial.scene_from_object.scale, 0.3)
+    problem = Problem(trial.object, trial.scene, scales, evidence or Constraints())
     return refine_hypotheses(problem, [(start, "planted")], settings)
 
 
@@ -299,7 +300,7 @@ def test_a_balloon_without_colours_has_a_free_axis_and_is_no_rival_to_itself():
     turned = Sim3(1.0, Rotation.from_euler("z", 70, degrees=True).as_matrix(), np.zeros(3))
     poses = [(Sim3.identity(), "one"), (turned, "other")]
     settings = replace(FINE, turn_steps=6, voxel_fraction=0.02, score_fraction=0.04)
-    outcome = refine_hypotheses(Problem(egg(0), egg(1), ScaleRange(1.0, 0.2), Evidence((Z, Z))), poses, settings)
+    outcome = refine_hypotheses(Problem(egg(0), egg(1), ScaleRange(1.0, 0.2), Constraints((Z, Z))), poses, settings)
     assert outcome.decision.registered, outcome.decision.reason
     assert abs(outcome.decision.free_axis @ Z) > 0.99
 
@@ -313,7 +314,7 @@ def test_photos_that_agree_settle_the_pose(house):
     settings = replace(LITTLE[1], min_margin=1.0)
     alone, linked = (
         refined(house, truth, evidence=evidence, settings=settings).decision
-        for evidence in (None, Evidence(alignment=shared(truth)))
+        for evidence in (None, Constraints(alignment=shared(truth)))
     )
     assert not alone.registered and "margin" in alone.reason
     assert linked.registered and linked.decided_by == "both"
@@ -324,7 +325,7 @@ def test_of_photos_and_clouds_that_agree_the_less_uncertain_gives_the_pose(house
     near = Sim3(1.004, np.eye(3), np.zeros(3)) @ truth
     for sd, by_photos in ((1e-4, True), (0.02, False)):
         alignment = Alignment(near, Uncertainty.even(sd, 100 * sd, 10 * sd))
-        outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), None, alignment))
+        outcome = refined(house, truth, evidence=Constraints((house.up_in_object, Z), None, alignment))
         assert outcome.decision.decided_by == "both"
         assert (outcome.ranked[0].pose.scale == near.scale) == by_photos
 
@@ -336,11 +337,11 @@ def test_clouds_that_fit_as_well_at_the_pose_of_the_photos_are_as_uncertain_as_t
     beside = Sim3(1.0, np.eye(3), np.array([apart, 0, 0])) @ truth
     # Half as certain as the clouds say, and yet less uncertain than what both differ by.
     sure = Uncertainty.even(*2 * alone.uncertainty.deviations)
-    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, sure)))
+    outcome = refined(house, truth, evidence=Constraints(None, None, Alignment(beside, sure)))
     assert outcome.ranked[0].pose is beside and outcome.uncertainty is sure
     # The photos are so uncertain that the difference is theirs.
     unsure = Uncertainty.even(*9 * alone.uncertainty.deviations)
-    outcome = refined(house, truth, evidence=Evidence(None, None, Alignment(beside, unsure)))
+    outcome = refined(house, truth, evidence=Constraints(None, None, Alignment(beside, unsure)))
     assert outcome.ranked[0].pose is not beside
     np.testing.assert_allclose(outcome.uncertainty.deviations, alone.uncertainty.deviations)
 
@@ -353,14 +354,14 @@ def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_
     scene = replace(scene, points=off)
     covariance = alike(obj, scene, truth, ScaleRange(truth.scale, 0.3), 5 * sigma)
     shift = np.sqrt(np.diag(covariance)[3:6])
-    np.testing.assert_allclose(shift, ALIKE * sigma, rtol=0.1)
+    np.testing.assert_allclose(shift, COMMON_ERROR * sigma, rtol=0.1)
     radius = truth.scale * np.linalg.norm(obj.points - obj.points.mean(0), axis=1)
     np.testing.assert_allclose(np.sqrt(covariance[6, 6]) * np.sqrt((radius**2).mean()), shift[0])
     assert alike(obj, scene, truth, ScaleRange(truth.scale, 0.0), 5 * sigma)[6, 6] == 0
     by_clouds = refined(house, truth)
     assert (by_clouds.stated.deviations > by_clouds.uncertainty.deviations).all()
     sure = Alignment(truth, Uncertainty.even(1e-5, 1e-3, 1e-4))
-    by_photos = refined(house, truth, evidence=Evidence(alignment=sure))
+    by_photos = refined(house, truth, evidence=Constraints(alignment=sure))
     assert by_photos.ranked[0].pose is truth and by_photos.stated is by_photos.uncertainty
 
 
@@ -370,7 +371,7 @@ def test_photos_at_whose_pose_the_clouds_lie_worse_must_be_that_much_less_uncert
     centre, alone = house.object.points.mean(0), refined(house, truth)
     for share, by_photos in ((0.9, False), (0.05, True)):
         sd = share * alone.uncertainty.size(house.scene.diagonal) * house.scene.diagonal
-        evidence = Evidence(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd)))
+        evidence = Constraints(None, None, Alignment(beside, Uncertainty.even(0.0, 0.0, sd)))
         outcome = refined(house, truth, evidence=evidence)
         assert outcome.decision.decided_by == "both"
         assert (errors(outcome.ranked[0].pose, truth, centre, house.diagonal)[2] > 0.02) == by_photos
@@ -380,7 +381,7 @@ def test_photos_overrule_geometry_and_clouds_do_not_carry_their_pose_off(house):
     truth, centre = house.scene_from_object, house.object.points.mean(0)
     half_turn, middle = np.diag([-1.0, -1.0, 1.0]), truth.apply(centre)
     turned = Sim3(1.0, half_turn, middle - half_turn @ middle) @ truth
-    evidence = Evidence((house.up_in_object, Z), None, shared(truth))
+    evidence = Constraints((house.up_in_object, Z), None, shared(truth))
     outcome = refined(house, turned, evidence=evidence, settings=replace(LITTLE[1], turn_steps=1))
     assert outcome.decision.registered and outcome.decision.decided_by == "photos"
     scale, angle, shift = errors(outcome.ranked[0].pose, truth, centre, house.diagonal)
@@ -395,7 +396,7 @@ def test_a_pose_of_photos_that_the_scene_refutes_gives_way_to_a_near_one_that_th
         violation=lambda points: float(points[:, 2].min() > house.scene.points[:, 2].min() + up / 2)
     )
     sure = Alignment(lifted, Uncertainty.even(1e-4, 0.01, 1e-4))  # of models that are bent
-    outcome = refined(house, truth, evidence=Evidence((house.up_in_object, Z), empty, sure))
+    outcome = refined(house, truth, evidence=Constraints((house.up_in_object, Z), empty, sure))
     assert outcome.decision.registered == registered, outcome.decision.reason
     assert outcome.decision.decided_by == ("near" if registered else "photos")
     if registered:
@@ -410,7 +411,7 @@ def test_an_object_in_the_scenes_free_space_is_refused(house):
     lifted = Sim3(truth.scale, truth.rotation, truth.translation + [0, 0, 0.5 * house.diagonal])
     assert house.free_space.violation(lifted.apply(house.object.points)) > 0.5
     decision = refined(
-        house, lifted, evidence=Evidence((house.up_in_object, Z), house.free_space, shared(lifted))
+        house, lifted, evidence=Constraints((house.up_in_object, Z), house.free_space, shared(lifted))
     ).decision
     assert not decision.registered and "free space" in decision.reason
 

@@ -14,13 +14,13 @@ from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import prepare
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Alignment, Evidence, Problem
+from scenefuse.register.problem import Alignment, Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.repetition import shifts_onto_itself
 from scenefuse.register.uncertainty import Uncertainty
 
 STEP, BAY = np.array([0.3, 0.0, 0.17]), np.array([2.0, 0.0, 0.0])
-NOTHING, NARROW = Evidence(), ScaleRange(1.0, 0.1)
+NOTHING, NARROW = Constraints(), ScaleRange(1.0, 0.1)
 # Coarser than by default, for speed.
 FINE = replace(FineSettings(), voxel_fraction=0.016, turn_steps=4)
 
@@ -126,6 +126,6 @@ def test_colours_tell_by_how_many_bays_a_row_is_shifted():
 def test_photos_tell_by_how_many_bays_a_row_is_shifted():
     obj, scene = between(row(12, 0), 8.5, 23.3), between(row(12, 1), 1, 14.8)
     alignment = Alignment(Sim3.identity(), Uncertainty.even(0.002, 0.1, 0.01))
-    outcome = registered(obj, scene, -4 * BAY, Evidence(alignment=alignment))
+    outcome = registered(obj, scene, -4 * BAY, Constraints(alignment=alignment))
     assert outcome.decision.registered, outcome.decision.reason
     assert is_true(outcome, obj)

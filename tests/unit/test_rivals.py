@@ -13,7 +13,7 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import Decision, FineSettings, unless_torn
-from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.problem import Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.uncertainty import Uncertainty
@@ -48,7 +48,7 @@ def hut(canopy, seed):
 def register(obj, scene):
     """Registered by shape and gravity alone."""
     ups = (TRUTH.inverse().rotate(UP), UP)
-    problem = Problem(obj, scene, prior(estimates(obj, scene, ups), ScaleSettings()), Evidence(ups), 0)
+    problem = Problem(obj, scene, prior(estimates(obj, scene, ups), ScaleSettings()), Constraints(ups), 0)
     found = find_hypotheses(problem, COARSE)
     return refine_hypotheses(problem, [(h.pose, h.source) for h in found], FINE)
 

@@ -19,7 +19,7 @@ from scenefuse.geometry.surface import Pairs
 from scenefuse.register import decision, refinement
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Evidence, Problem
+from scenefuse.register.problem import Constraints, Problem
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import Uncertainty
@@ -65,9 +65,9 @@ def _searched(number: int) -> list[Hypothesis]:
 
 def _problem(number: int) -> Problem:
     trial, scene, kind = trial_of(number)
-    cloud, evidence = trial.object, Evidence((trial.up_in_object, UP), trial.free_space)
+    cloud, evidence = trial.object, Constraints((trial.up_in_object, UP), trial.free_space)
     if kind == KINDS[1]:
-        cloud, scene, evidence = Cloud(cloud.points, cloud.normals), Cloud(scene.points, scene.normals), Evidence()
+        cloud, scene, evidence = Cloud(cloud.points, cloud.normals), Cloud(scene.points, scene.normals), Constraints()
     scales = prior(estimates(cloud, scene, evidence.ups), ScaleSettings())
     return Problem(cloud, scene, scales, evidence)
 
@@ -203,20 +203,20 @@ RULES = [
     # The scale.
     Rule("prior: upper quartile of the estimates", f"{HERE}.prior", _median),
     Rule("prior: footprint, height and hull beside the RMS", f"{HERE}.estimates", _extent_only),
-    Rule("refinement may leave the prior by 0.15", f"{R}.refinement.BEYOND_PRIOR", constant(0.0)),
+    Rule("refinement may leave the prior by 0.15", f"{R}.refinement.PRIOR_SLACK_LOG", constant(0.0)),
     # Candidates.
     Rule("coarse: sweep of headings", f"{R}.coarse._upright", nothing),
     Rule("coarse: features", f"{R}.coarse._from_features", nothing),
-    Rule("RANSAC: edges agree on one scale", f"{R}.candidates.LEAST_EDGE_RATIO", constant(0.0)),
+    Rule("RANSAC: edges agree on one scale", f"{R}.candidates.MIN_EDGE_RATIO", constant(0.0)),
     Rule("sweep: level and upright surfaces apart", f"{R}.candidates._occupancy", lambda f: _one_channel(f)),
     Rule("sweep: blurred target", f"{R}.candidates._blur", same),
     Rule("sweep: candidates alike are one", f"{R}.candidates._alike", lambda _: lambda *args: False),
-    Rule("coarse: brief refinement", f"{R}.coarse.ROUNDS", constant(1)),
+    Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
     Rule("refine: turned copies of the polished", f"{R}.refinement._Work.turned", _without_second_turns),
-    Rule("refine: polish again from 6 % off", f"{R}.refinement.OFF_SCALE", constant(1.0)),
-    Rule("refine: polish that scores worse is dropped", f"{R}.refinement.ASTRAY", constant(0.0)),
+    Rule("refine: polish again from 6 % off", f"{R}.refinement.POLISH_SCALE_FACTOR", constant(1.0)),
+    Rule("refine: polish that scores worse is dropped", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     Rule("refine: repetition", f"{R}.refinement.shifts_onto_itself", nothing),
     # ICP.
     Rule("ICP: no pairs beyond the rim", f"{G}.icp._without_overhang", lambda _: lambda *args: args[-1]),
@@ -227,11 +227,11 @@ RULES = [
     Rule("most likely pose", f"{R}.refinement.certified", lambda _: lambda *args: None),
     Rule("most likely pose: corrected by planted copies", f"{R}.likelihood._off_on_copies",
          lambda f: lambda *args: 0 * f(*args)),
-    Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.ASTRAY", constant(0.0)),
+    Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     # The uncertainty.
-    Rule("half-sampling: starts 3 % off", f"{R}.uncertainty.OFF_SCALE", constant(1.0)),
+    Rule("half-sampling: starts 3 % off", f"{R}.uncertainty.START_SCALE_FACTOR", constant(1.0)),
     Rule("half-sampling: two thinnings in turn", f"{R}.refinement.half_sampling", _one_side),
-    Rule("uncertainty: what surfaces have wrong alike", f"{R}.uncertainty.ALIKE", constant(0.0)),
+    Rule("uncertainty: what surfaces have wrong alike", f"{R}.uncertainty.COMMON_ERROR", constant(0.0)),
     # The score.
     Rule("score: recall weighs more", f"{R}.score.RECALL_WEIGHT", constant(1.0)),
     Rule("score: area at the usual scale", f"{R}.refinement.score", _own_area),
