@@ -1,4 +1,4 @@
-"""The ground under an object, fitted to what surrounds it: a parabolic height field."""
+"""The ground near an object: a parabolic height field, and its fit to what surrounds a box."""
 
 from dataclasses import dataclass
 
@@ -30,11 +30,15 @@ class Ground:
 
     coefficients: Array
     centre: Array
-    tolerance: float
+    tolerance: float = 0.0
 
     def height(self, xy: Array) -> Array:
         """Heights (N,) at (N, 2)."""
-        return _terms(xy - self.centre) @ self.coefficients
+        return quadratic_terms(xy - self.centre) @ self.coefficients
+
+    def height_of(self, points: Array) -> Array:
+        """Heights (N,) of (N, 3) points over the ground."""
+        return points[:, 2] - self.height(points[:, :2])
 
     def rise(self, xy: Array) -> Array:
         """Slopes (N,) at (N, 2): the tangent of the angle with the horizontal."""
@@ -76,7 +80,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
         return None
     coefficients = _height_field(lowest[:, :2] - centre, lowest[:, 2], plane, tolerance)
     # A noisy cloud's ground is thick: its own spread about the surface widens the tolerance.
-    off = around[:, 2] - _terms(around[:, :2] - centre) @ coefficients
+    off = around[:, 2] - quadratic_terms(around[:, :2] - centre) @ coefficients
     off = off[np.abs(off) < 4 * tolerance]
     if len(off):
         coefficients[0] += float(np.median(off))
@@ -87,7 +91,7 @@ def fit_ground(points: Array, low: Array, high: Array, ring: float, tolerance: f
 def _breadth(cells: Array, centre: Array, plane: Array, tolerance: float) -> float:
     """Breadth over length, as standard deviations seen from above, of the cells (M, 3) on a plane (3,)."""
     xy = cells[:, :2] - centre
-    xy = xy[np.abs(_terms(xy)[:, :3] @ plane - cells[:, 2]) <= tolerance]
+    xy = xy[np.abs(quadratic_terms(xy)[:, :3] @ plane - cells[:, 2]) <= tolerance]
     narrow, long = np.linalg.svd(xy - xy.mean(0), compute_uv=False)[[1, 0]]
     return float(narrow / long)
 
@@ -111,7 +115,7 @@ def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
 
     The parabola is kept only where it stays near the plane in the middle, of which a ring says little.
     """
-    terms, coefficients = _terms(xy), np.concatenate([plane, np.zeros(3)])
+    terms, coefficients = quadratic_terms(xy), np.concatenate([plane, np.zeros(3)])
     flat = coefficients
     for columns in (3, 6, 6):
         for _ in range(ROUNDS):
@@ -131,7 +135,7 @@ def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array
     """The (3,) plane a + b x + c y with most points within `tolerance`, or None."""
     rng = np.random.default_rng(seed)
     triples = rng.integers(0, len(xy), (TRIPLES, 3))
-    terms = _terms(xy)[:, :3]
+    terms = quadratic_terms(xy)[:, :3]
     matrices = terms[triples]
     good = np.abs(np.linalg.det(matrices)) > 1e-6 * np.ptp(xy, axis=0).max() ** 2
     if not good.any():
@@ -145,6 +149,7 @@ def _plane_by_triples(xy: Array, z: Array, tolerance: float, seed: int) -> Array
     return planes[best] if counts[best] >= MIN_SHARE * len(z) else None
 
 
-def _terms(xy: Array) -> Array:
+def quadratic_terms(xy: Array) -> Array:
+    """(N, 6) terms 1, x, y, x^2, x y, y^2 of (N, 2) coordinates."""
     x, y = xy[:, 0], xy[:, 1]
     return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)

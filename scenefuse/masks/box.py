@@ -1,13 +1,12 @@
 """Where the object is: an upright box around the prompts, and the ground it stands on."""
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.ground import Ground, quadratic_terms
 from scenefuse.geometry.visual_hull import Box
 
 REACH = 1.5
@@ -43,23 +42,6 @@ def upright_box(points: Array, up: Array, margin: float) -> Box:
     low, high = flat.min(0), flat.max(0)
     grow = margin * np.linalg.norm(high - low)
     return Box(np.column_stack([axes, np.zeros(3)]), low - grow, high + grow)
-
-
-@dataclass(frozen=True)
-class Ground:
-    """The ground near the object: a height over the box's two horizontal axes.
-
-    Attributes:
-        coefficients: (6,) of 1, a, b, a^2, a b, b^2, with a and b from `origin`, in object units.
-        origin: (2,) along the box's horizontal axes.
-    """
-
-    coefficients: Array
-    origin: Array
-
-    def height_of(self, points_in_box: Array) -> Array:
-        """Heights (N,) of (N, 3) points over the ground, all along the box's axes."""
-        return points_in_box[:, 2] - _quadratic(points_in_box[:, :2] - self.origin) @ self.coefficients
 
 
 def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int) -> tuple[Ground, bool]:
@@ -99,7 +81,7 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
         return nowhere, False
     slope = np.linalg.lstsq(design[best], beside[best, 2], rcond=None)[0]
     near = points_in_box[around & ~in_hull(points_in_box, span(prompts_in_box, tolerance))]
-    terms = _quadratic(near[:, :2] - centre[:2])
+    terms = quadratic_terms(near[:, :2] - centre[:2])
     fit = np.array([slope @ [*centre[:2], 1.0], slope[0], slope[1], 0, 0, 0])
     # Bending weighs as much as twenty points that are off by it at the edge of the box: few points cannot bend the
     # surface much.
@@ -128,9 +110,3 @@ def in_hull(points: Array, corners: Array) -> NDArray[np.bool_]:
     # Of many points few are near: distances to all faces take far more room than the points.
     near[near] = (points[near] @ hull.equations[:, :3].T + hull.equations[:, 3] <= 1e-9).all(1)
     return np.asarray(near)
-
-
-def _quadratic(flat: Array) -> Array:
-    """(N, 6) terms 1, a, b, a^2, a b, b^2 of (N, 2) coordinates."""
-    a, b = flat.T
-    return np.stack([np.ones_like(a), a, b, a * a, a * b, b * b], axis=1)

@@ -8,8 +8,9 @@ from scipy.spatial import Delaunay
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.ground import Ground
 from scenefuse.geometry.visual_hull import Box, Mask
-from scenefuse.masks.box import Ground, find_ground, in_hull, span, upright_box
+from scenefuse.masks.box import find_ground, in_hull, span, upright_box
 from scenefuse.photos.workspace import View, Workspace
 
 BOX_MARGIN = 0.15

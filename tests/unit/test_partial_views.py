@@ -9,9 +9,9 @@ from scipy import ndimage
 
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.vote import Masked, vote
+from scenefuse.geometry.ground import Ground
 from scenefuse.geometry.photo_check import covering
 from scenefuse.geometry.visual_hull import Box, Outline, least_framing
-from scenefuse.masks.box import Ground
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.mvs.photo_refinement import choose_sources
 from scenefuse.nerf.volume import find_volume
