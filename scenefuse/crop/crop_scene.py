@@ -14,8 +14,8 @@ from scenefuse.core.stage import StageError, quantity, read_json, threads, value
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
 from scenefuse.crop.one_photo import MOST_GROWTH, SceneClicks, crop_grown, locate_clicks
+from scenefuse.crop.parts import MIN_PART, parts
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
-from scenefuse.geometry.components import MIN_PART, parts
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame

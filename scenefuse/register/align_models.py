@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import quantity, setting, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
+from scenefuse.geometry.ransac import triples_of_one_scale
 from scenefuse.register.gps import MAX_GPS_DEVIATIONS, GpsPose, gps_quantities, pose_by_gps
 from scenefuse.register.landmarks import Landmarks, match_landmarks, read_landmarks
 from scenefuse.register.reprojection import (
@@ -201,12 +202,10 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
     if len(seen.x) < 4:
         return None
     rng = np.random.default_rng(seed)
-    triples = rng.integers(0, len(seen.x), (RANSAC_SAMPLES, 3))
-    edges = [np.linalg.norm(p[triples] - p[np.roll(triples, 1, axis=1)], axis=2) for p in (seen.x, seen.y)]
-    ratio = edges[1] / np.maximum(edges[0], 1e-300)
-    fair = (edges[0].min(1) > 0.1 * edges[0].max(1)) & (ratio.min(1) > MIN_EDGE_RATIO * ratio.max(1))
+    found = triples_of_one_scale(seen.x, seen.y, RANSAC_SAMPLES, MIN_EDGE_RATIO, rng)
+    wide = found.edges[0].min(1) > 0.1 * found.edges[0].max(1)
     proposed = []
-    for triple in triples[fair][:MAX_PROPOSALS]:
+    for triple in found.rows[wide][:MAX_PROPOSALS]:
         with contextlib.suppress(ValueError):
             proposed.append(fit_sim3(seen.x[triple], seen.y[triple]))
     if not proposed:

@@ -7,6 +7,7 @@ from scipy import fft
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.ransac import triples_of_one_scale
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import RECALL_WEIGHT
 
@@ -64,13 +65,9 @@ def ransac_similarities(
     """
     if len(x) < 3:
         return []
-    triples = np.random.default_rng(seed).integers(0, len(x), (samples, 3))
-    edges_x = np.stack([np.linalg.norm(x[triples[:, i]] - x[triples[:, i - 1]], axis=1) for i in range(3)])
-    edges_y = np.stack([np.linalg.norm(y[triples[:, i]] - y[triples[:, i - 1]], axis=1) for i in range(3)])
-    ratio = edges_y / np.maximum(edges_x, 1e-12)
-    middle = np.exp(np.log(np.maximum(ratio, 1e-12)).mean(0))
-    good = (edges_y.min(0) > 3 * tau) & (ratio.min(0) > MIN_EDGE_RATIO * ratio.max(0))
-    good &= np.abs(np.log(np.maximum(middle, 1e-12) / scales.centre)) <= scales.width + 0.05
+    rng = np.random.default_rng(seed)
+    triples, edges, middle = triples_of_one_scale(x, y, samples, MIN_EDGE_RATIO, rng)
+    good = (edges[1].min(1) > 3 * tau) & (np.abs(np.log(middle / scales.centre)) <= scales.width + 0.05)
     triples, middle = triples[good], middle[good]
     if len(triples) == 0:
         return []

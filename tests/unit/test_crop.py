@@ -14,9 +14,8 @@ from scenefuse.cloud.tiles import tiled_cloud, write_tiles
 from scenefuse.cloud.tiles.write_tiles import write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.crop.crop_cloud import CropSettings, crop_cloud
+from scenefuse.crop.crop_cloud import CropSettings, crop_cloud, in_wide_hull, least_footprint
 from scenefuse.crop.crop_scene import CropInputs, crop_scene
-from scenefuse.crop.shapes import in_wide_hull, least_footprint
 from scenefuse.crop.vote import count, read_masked_views, vote
 from scenefuse.geometry.ground import fit_ground
 

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.components import LINK_FRACTION, MIN_PART, parts
+from scenefuse.crop.parts import LINK_FRACTION, MIN_PART, parts
 from scenefuse.geometry.ground import Ground, fit_ground
 
 # Only what lies in or below the lowest tenth of the fiducials' height may be ground.
