@@ -125,7 +125,7 @@ def _report(best: Hypothesis, problem: Problem, length: str, scale: str, seconds
         "rests_on": quantity(["shape"], ""),
         "margin": quantity(None, "1"),
         "free_axis": quantity(None, ""),
-        "tilt_deg": quantity(tilt_deg(best.pose, problem.evidence.ups), "deg"),
+        "tilt_deg": quantity(tilt_deg(best.pose, problem.known.ups), "deg"),
         **uncertainty_quantities(None, length),
         "scale_ledger": quantity([ledger_row(scale, problem.scales.centre, None, "held by the paper's recipe")], ""),
         "score_tau": quantity(SCORE_FRACTION * problem.scene.diagonal, length),
