@@ -3,7 +3,7 @@ CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale docs clean
+.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale mutants docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -30,6 +30,10 @@ report: .venv/ready
 	snakemake --configfile config/demo.yaml --cores 1 --report results/summary/snakemake-report.html
 
 bench: bench-registration bench-nerf
+
+# Inverts each comparison of the registration's gate in turn: the rows of tests/unit/test_gate.py must catch every one; seconds.
+mutants: .venv/ready
+	PYTHONPATH=.:tests python tests/benchmarks/gate_mutants.py
 
 # Planted registrations: by clouds, beside the paper's recipe, FGR and KISS-Matcher; about half an hour on two cores. Then by features
 # that photos share; some minutes.

@@ -11,14 +11,14 @@ from scenefuse.cloud.clouds import Cloud, spacing
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, rotation_between
 from scenefuse.crop.ground import GROUND_FRACTION, ground_under, on_ground
-from scenefuse.crop.parts import LINK_FRACTION, MIN_PART, parts
+from scenefuse.crop.parts import LINK_FRACTION, MIN_PART_SHARE, parts
 from scenefuse.geometry.ground import Ground
 
 # Shares of the diagonal of the fiducials' box.
 MARGIN_FRACTION = 0.04  # widening of the box beside `margin`: two pairing distances of the registration
 REACH_FRACTION = 0.05  # a part this near to a fiducial belongs to the object
 # A step that would leave less than this share of the points in the box is left out: the object is there.
-LEAST_LEFT = 0.05
+MIN_LEFT = 0.05
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def crop_cloud(
     away = np.zeros(len(points), dtype=bool)
     if ground is not None and in_box.any():
         away = on_ground(points, marks, ground, in_box)
-        if away.sum() > (1 - LEAST_LEFT) * in_box.sum():
+        if away.sum() > (1 - MIN_LEFT) * in_box.sum():
             cut = crop_cloud(scene, fiducials, up, replace(settings, remove_ground=False), other)
             share = f"{away.sum()} of the {in_box.sum()} points in the box"
             return replace(cut, notes=[f"{share} would be ground: nothing was removed as ground", *cut.notes])
@@ -135,7 +135,7 @@ def _without_loose_parts(
     near = _parts_near(points[rows], marks, link, REACH_FRACTION * diagonal)
     if not near.any():
         return inside, ["no part in the box lies near a fiducial: all of them were kept"]
-    if near.mean() < LEAST_LEFT:
+    if near.mean() < MIN_LEFT:
         return inside, [f"parts near a fiducial have only {near.sum()} of {len(rows)} points in the box: all were kept"]
     keep = np.zeros(len(points), dtype=bool)
     keep[rows[near]] = True
@@ -152,7 +152,7 @@ def _parts_near(points: Array, marks: Array, link: float, reach: float) -> NDArr
     touched = np.bincount(part_of, cKDTree(marks).query(points, workers=threads())[0] <= reach) > 0
     low, high = marks.min(0)[:2], marks.max(0)[:2]
     between = np.bincount(part_of, ((points[:, :2] >= low) & (points[:, :2] <= high)).all(1))
-    wanted = (counts >= MIN_PART * len(points)) & (touched | (between >= 0.5 * counts))
+    wanted = (counts >= MIN_PART_SHARE * len(points)) & (touched | (between >= 0.5 * counts))
     return wanted[part_of]
 
 

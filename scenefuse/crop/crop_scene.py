@@ -13,8 +13,8 @@ from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
-from scenefuse.crop.one_photo import MOST_GROWTH, SceneClicks, crop_grown, locate_clicks
-from scenefuse.crop.parts import MIN_PART, parts
+from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
+from scenefuse.crop.parts import MIN_PART_SHARE, parts
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
@@ -25,11 +25,11 @@ UP = np.array([0.0, 0.0, 1.0])
 MIN_POINTS = 200
 MIN_FIDUCIALS = 4
 # Points of a scene in which an object is searched without any mark.
-MOST_WHOLE = 10_000_000
+MAX_WHOLE_POINTS = 10_000_000
 # How far from clicks a crop may reach, in their extents: it grows, and looks for ground around what it has become.
-GROWN_EXTENTS = 2 * MOST_GROWTH
+REACH_EXTENTS = 2 * MAX_GROWTH
 # Points of an object's own cloud that mark it, and the outermost share of them on each side, in percent, that does not.
-MOST_OWN, STRAY_PERCENT = 20_000, 0.5
+MAX_OWN_POINTS, STRAY_PERCENT = 20_000, 0.5
 
 
 @dataclass(frozen=True)
@@ -111,10 +111,10 @@ def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple
     found = alignment is not None and value(alignment, "found")
     unmarked = inputs.cloud is not None and not found and inputs.fiducials is None
     if settings.whole_scene or unmarked:
-        if len(scene) > MOST_WHOLE:
+        if len(scene) > MAX_WHOLE_POINTS:
             raise StageError(
                 f"nothing marks the object, and the scene has {len(scene)} points; without marks it is searched in at"
-                f" most {MOST_WHOLE}: mark it (column fiducials of the objects table)"
+                f" most {MAX_WHOLE_POINTS}: mark it (column fiducials of the objects table)"
             )
         near = scene.read(np.arange(len(scene.low)))[1]
         cut = whole(near)
@@ -150,7 +150,7 @@ def crop_by_file(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) 
     if clicks is None:
         near = scene.near(*around_marks(points, settings))[1]
         return near, crop_marked(near, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
-    near = scene.near(*around_marks(points, settings, GROWN_EXTENTS))[1]
+    near = scene.near(*around_marks(points, settings, REACH_EXTENTS))[1]
     cut = crop_grown(near, points, UP, replace(settings, minimal=False), clicks.other(near.points))
     cut = replace(cut, notes=[*clicks.left_out, *cut.notes])
     _announce(cut, str(inputs.fiducials))
@@ -238,7 +238,7 @@ def crop_by_cloud(scene: TiledCloud, inputs: CropInputs, settings: CropSettings)
     own = read_cloud(inputs.cloud).points
     low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
     own = own[((own >= low) & (own <= high)).all(1)]
-    marks = _alignment(inputs.alignment_json).apply(own[:: max(1, len(own) // MOST_OWN)])
+    marks = _alignment(inputs.alignment_json).apply(own[:: max(1, len(own) // MAX_OWN_POINTS)])
     near = scene.near(*around_marks(marks, settings))[1]
     cut = crop_cloud(near, marks, UP, settings)
     notes = ["marked by the object's own cloud through the alignment from shared features: it has no masks"]
@@ -292,7 +292,7 @@ def votes_of(near: Cloud, masked: Masked, pose: Sim3, settings: CropSettings, sc
     chosen = np.flatnonzero(votes.object)
     if len(chosen) > 1:
         part_of, counts = parts(near.points[chosen], 3 * spacing(near.points[chosen]))
-        chosen = chosen[(counts >= MIN_PART * len(chosen))[part_of]]
+        chosen = chosen[(counts >= MIN_PART_SHARE * len(chosen))[part_of]]
     print(f"{len(chosen)} of {scene_points} scene points by the votes of the masks", flush=True)
     return replace(votes, object=np.isin(np.arange(len(near)), chosen))
 

@@ -7,15 +7,15 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
-from scenefuse.crop.parts import LINK_FRACTION, MIN_PART, parts
+from scenefuse.crop.parts import LINK_FRACTION, MIN_PART_SHARE, parts
 from scenefuse.geometry.ground import Ground, fit_ground
 
 # Only what lies in or below the lowest tenth of the fiducials' height may be ground.
-LOWEST_SHARE = 0.1
+FOOT_SHARE = 0.1
 # Ground rises by 20 degrees at most.
 MAX_RISE = float(np.tan(np.radians(20)))
 # Of many marks, the votes of masks for instance, this share at either end does not count: strays.
-STRAYS = 0.01
+STRAY_SHARE = 0.01
 # Shares of the diagonal of the fiducials' box.
 RING_FRACTION = 0.5  # width of the ring around the box in which the ground is looked for
 GROUND_FRACTION = 0.015  # points lower than this above the ground are ground
@@ -36,7 +36,7 @@ def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[
         high: (3,) opposite corner.
     """
     foot, height = _foot(marks)
-    limit, diagonal = foot[2] + LOWEST_SHARE * height, float(np.linalg.norm(np.ptp(marks, axis=0)))
+    limit, diagonal = foot[2] + FOOT_SHARE * height, float(np.linalg.norm(np.ptp(marks, axis=0)))
     reached = points[points[:, 2] <= limit + MAX_RISE * np.hypot(*(points - foot).T[:2])]
     ground = fit_ground(reached, low, high, RING_FRACTION * diagonal, GROUND_FRACTION * diagonal)
     if ground is None:
@@ -79,7 +79,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     under = ground.height(marks[:, :2])
     uphill = np.maximum(surface - under.min(), 0)
     level = (z <= surface + ground.tolerance) & (ground.rise(xy) <= MAX_RISE)
-    level &= z <= foot[2] + LOWEST_SHARE * height + uphill
+    level &= z <= foot[2] + FOOT_SHARE * height + uphill
     buried = marks[(under - marks[:, 2] > ground.tolerance) & (marks[:, 2] >= foot[2])]
     if len(buried):
         level &= cKDTree(buried[:, :2]).query(xy, workers=threads())[0] > BESIDE_FRACTION * diagonal
@@ -88,7 +88,7 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
     found = np.zeros(len(points), dtype=bool)
     if around.any():
         part_of, counts = parts(points[rows], max(LINK_FRACTION * diagonal, 3 * spacing(points[rows])))
-        continued = np.bincount(part_of, around, len(counts)) >= MIN_PART * around.sum()
+        continued = np.bincount(part_of, around, len(counts)) >= MIN_PART_SHARE * around.sum()
         found[rows] = continued[part_of]
     return found & in_box
 
@@ -96,6 +96,6 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
 def _foot(marks: Array) -> tuple[Array, float]:
     """The lowest fiducial (3,), and how high the fiducials are."""
     order = np.argsort(marks[:, 2], kind="stable")
-    strays = int(STRAYS * len(marks))
+    strays = int(STRAY_SHARE * len(marks))
     foot = marks[order[strays]]
     return foot, float(marks[order[-1 - strays], 2] - foot[2])

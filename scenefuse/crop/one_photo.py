@@ -18,23 +18,23 @@ from scenefuse.photos.workspace import View, read_views
 
 # A click has the depth of the points within this many spacings of the cloud around its ray, or pixels, if these are
 # more; of points up to so many spacings behind the nearest that is no stray: so many lie within these.
-AROUND_SPACINGS, AROUND_PX, THICK_SPACINGS, LEAST_CROWD = 2, 3, 8, 3
-# What a click outside is on is flat where so many points around it have a surface variation below FLAT; then what is
-# farther from their plane than this share of the clicks' extent is not it.
-AROUND_POINTS, FLAT, FLAT_DEPTH = 8, 0.02, 0.03
+RAY_SPACINGS, RAY_PX, DEPTH_SPACINGS, MIN_NEIGHBOURS = 2, 3, 8, 3
+# What a click outside lies on is flat where this many points around it have at most this surface variation; then it is
+# what lies nearer to their plane than this share of the clicks' extent.
+PLANE_POINTS, MAX_VARIATION, PLANE_FRACTION = 8, 0.02, 0.03
 # Inside clicks with a depth that span an object.
-LEAST_INSIDE = 3
+MIN_INSIDE = 3
 # Rounds in which the crop grows along the object; each reaches farther by its margin.
-ROUNDS = 25
+MAX_ROUNDS = 25
 # A round that adds less than this share of the points is the last.
-LEAST_ADDED = 0.01
+MIN_GROWTH = 0.01
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
-MOST_GROWTH = 3.0
+MAX_GROWTH = 3.0
 # Which end of a box each of its corners has along x, y, z.
 CORNERS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)], dtype=bool)
 # The outermost share of the kept points on each side marks nothing.
-STRAYS = 0.005
+STRAY_SHARE = 0.005
 
 
 @dataclass(frozen=True)
@@ -72,10 +72,10 @@ class SceneClicks:
         extent = float(np.linalg.norm(np.ptp(self.inside, axis=0)))
         for k, click in enumerate(self.outside):
             own = (row == k) & (to_outside < to_inside)
-            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:AROUND_POINTS]]
+            around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:PLANE_POINTS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
-            if spread[0] < FLAT * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < FLAT_DEPTH * extent
+            if spread[0] < MAX_VARIATION * spread.sum():
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < PLANE_FRACTION * extent
             found |= own
         return found
 
@@ -112,10 +112,10 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
                 names += [name] * bool(inside)
         if clicks.box is not None:
             boxes.append((view, clicks))
-    if len(sides[1]) < LEAST_INSIDE:
+    if len(sides[1]) < MIN_INSIDE:
         about = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
-            f"{labels.path} has {len(sides[1])} clicks inside the object that meet points of the scene, {LEAST_INSIDE}"
+            f"{labels.path} has {len(sides[1])} clicks inside the object that meet points of the scene, {MIN_INSIDE}"
             f" are needed{about}: click on the object's ends, in a photo that shows it well"
         )
     return SceneClicks(names, np.array(sides[1]), np.array(sides[0]).reshape(-1, 3), boxes, left_out)
@@ -126,9 +126,7 @@ def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
     corners = np.where(CORNERS[:, None], scene.high, scene.low)
     at, depth = view.project(corners.reshape(-1, 3))
     at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
-    reach = np.maximum(
-        AROUND_PX, AROUND_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step)
-    )
+    reach = np.maximum(RAY_PX, RAY_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
     low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
     shown = ((pixels[:, None] >= low) & (pixels[:, None] <= high)).all(2).any(0)
     return np.flatnonzero((depth.max(0) > 0) & (shown | (depth.min(0) <= step)))
@@ -138,13 +136,13 @@ def _on_surface(points: Array, pixels: Array, depth: Array, pixel: Array, step: 
     """The middle (3,) of the nearest points (N, 3) that a photo shows about a pixel; None where there are none."""
     focal = float(view.intrinsics[0, 0])
     with np.errstate(divide="ignore"):
-        reach = np.maximum(AROUND_PX, AROUND_SPACINGS * step * focal / depth)
+        reach = np.maximum(RAY_PX, RAY_SPACINGS * step * focal / depth)
     rows = np.flatnonzero((depth > 0) & (np.abs(pixels - pixel).max(1) <= reach))
     if not len(rows):
         return None
     # A single point that floats before the surface does not say where it is.
-    ahead, thick = np.sort(depth[rows]), THICK_SPACINGS * step
-    crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= LEAST_CROWD
+    ahead, thick = np.sort(depth[rows]), DEPTH_SPACINGS * step
+    crowd = np.searchsorted(ahead, ahead + thick, side="right") - np.arange(len(ahead)) >= MIN_NEIGHBOURS
     nearest = ahead[crowd.argmax()]
     front = rows[(depth[rows] >= nearest) & (depth[rows] <= nearest + thick)]
     return np.median(points[front], axis=0)
@@ -172,21 +170,21 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
         other: (N,) points of the scene that are something else.
     """
     first = cut = crop_cloud(scene, inside, up, settings, other)
-    most = MOST_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
-    for _ in range(ROUNDS):
+    most = MAX_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
+    for _ in range(MAX_ROUNDS):
         own = scene.points[cut.keep]
         if not len(own):
             return cut
-        low, high = np.percentile(own, [100 * STRAYS, 100 * (1 - STRAYS)], axis=0)
+        low, high = np.percentile(own, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
         if np.linalg.norm(high - low) > most:
             break
         marks = np.concatenate([inside, own[((own >= low) & (own <= high)).all(1)]])
         grown = crop_cloud(scene, marks, up, settings, other)
-        if grown.keep.sum() <= (1 + LEAST_ADDED) * cut.keep.sum():
+        if grown.keep.sum() <= (1 + MIN_GROWTH) * cut.keep.sum():
             return grown
         cut = grown
     note = (
-        f"what the clicks lie on reaches more than {MOST_GROWTH:g} times as far as they do: only the box around them"
+        f"what the clicks lie on reaches more than {MAX_GROWTH:g} times as far as they do: only the box around them"
         " was cut out; click on the object's ends, and outside, on what it touches"
     )
     return replace(first, notes=[note, *first.notes])

@@ -11,7 +11,7 @@ from scenefuse.core.transforms import Array
 # Points closer than this belong to one part, as a share of the diagonal of the fiducials' box.
 LINK_FRACTION = 0.03
 # Parts with a smaller share of the points are left out.
-MIN_PART = 0.01
+MIN_PART_SHARE = 0.01
 
 
 def parts(points: Array, link: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -17,17 +17,17 @@ from scenefuse.photos.workspace import View, read_workspace, with_mask
 Columns = tuple[NDArray[np.float32], ...]
 
 # Photos used at most, spread evenly: more show the same sides again.
-MOST_PHOTOS = 60
+MAX_PHOTOS = 60
 # Masks are grown by this share of the photo's width, for what the similarity and the masks err by at outlines.
-SLACK = 0.005
+MASK_GROWTH = 0.005
 # A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
 CELL_SPACINGS, HIDDEN_CELLS = 4, 2
 # Photos that must show a point.
 MIN_SHOWN = 3
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
-FAR_EXTENTS = 4.0
+MAX_DISTANCE_EXTENTS = 4.0
 # How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
-NEAR_OWN, MIN_OWN = 0.15, 10
+MAX_OWN_DISTANCE, MIN_OWN = 0.15, 10
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,10 @@ class Masked:
     own: Array
 
     def sight(self, scene_from_object: Sim3) -> Array:
-        """(K + V, 3) the own points and the cameras in the scene; cameras farther away than FAR_EXTENTS come nearer."""
+        """(K + V, 3) the own points and the cameras in the scene, those too far away moved nearer."""
         own = scene_from_object.apply(self.own)
         eyes = scene_from_object.apply(np.array([view.centre for view in self.views]))
-        far = FAR_EXTENTS * float(np.linalg.norm(np.ptp(own, axis=0)))
+        far = MAX_DISTANCE_EXTENTS * float(np.linalg.norm(np.ptp(own, axis=0)))
         return np.concatenate([own, np.clip(eyes, own.min(0) - far, own.max(0) + far)])
 
 
@@ -86,7 +86,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     decided = shown >= MIN_SHOWN
     is_object = decided & (framed >= least) & (inside >= min_share * shown)
     rows = np.flatnonzero(is_object)
-    reach = NEAR_OWN * float(np.linalg.norm(np.ptp(own, axis=0)))
+    reach = MAX_OWN_DISTANCE * float(np.linalg.norm(np.ptp(own, axis=0)))
     is_object[rows] = cKDTree(own).query(in_object[rows], workers=threads())[0] <= reach
     return Votes(is_object, decided & (inside < 0.5 * shown), scene_from_object.apply(own))
 
@@ -114,7 +114,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         )
     observing, inside = (np.zeros(len(read.points), dtype=np.int32) for _ in range(2))
     found = []
-    chosen = np.unique(np.linspace(0, len(files) - 1, min(MOST_PHOTOS, len(files))).round().astype(int))
+    chosen = np.unique(np.linspace(0, len(files) - 1, min(MAX_PHOTOS, len(files))).round().astype(int))
     for path, view, seen in (files[k] for k in chosen):
         one = _with_grown_mask(view, path)
         found.append(one)
@@ -134,7 +134,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
 
 def _with_grown_mask(view: View, path: Path) -> View:
     """The view with its mask, grown on all sides."""
-    extent = 2 * int(np.ceil(SLACK * view.width)) + 1
+    extent = 2 * int(np.ceil(MASK_GROWTH * view.width)) + 1
     grown = cv2.dilate(with_mask(view, path).pixels, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (extent, extent)))
     return replace(view, pixels=grown > 0)
 

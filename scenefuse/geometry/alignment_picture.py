@@ -12,7 +12,7 @@ from scenefuse.photos.pictures import write_picture
 
 SIDE_PX = 460
 # An object that is more times as large as the part of the scene is not shown whole.
-MOST_LARGER = 3.0
+MAX_SIZE_RATIO = 3.0
 SCENE_RGB, OBJECT_RGB = (60, 60, 60), (214, 92, 30)
 
 
@@ -26,7 +26,7 @@ def draw_alignment(
     # Strays at either side do not count, and neither does an object where the pose is absurd.
     low, high = np.percentile(ground.points, [0.5, 99.5], axis=0)
     own = np.percentile(obj.points, [0.5, 99.5], axis=0)
-    if (np.ptp(own, axis=0) <= MOST_LARGER * (high - low).max()).all():
+    if (np.ptp(own, axis=0) <= MAX_SIZE_RATIO * (high - low).max()).all():
         low, high = np.minimum(low, own[0]), np.maximum(high, own[1])
     middle, half = (low + high) / 2, 0.62 * max(float((high - low).max()), 1e-9)
     points = np.concatenate([ground.points, obj.points]) - middle

@@ -18,11 +18,11 @@ from scenefuse.photos.workspace import View
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int32]
 
-BATCH = 4
+CARVED_PHOTOS = 4
 """Photos after which `carve` leaves out the voxels that are decided: most are, early."""
-LEAST_FRAMING, RARELY_FRAMED, LEAST_PHOTOS = 0.25, 10, 2
+MIN_FRAMING_SHARE, FRAMING_PERCENTILE, MIN_PHOTOS = 0.25, 10, 2
 """Of `least_framing`: the share; the percentile of the own points; never fewer photos."""
-LEAST_OWN, LEAST_WHOLE = 20, 1 / 3
+MIN_OWN_POINTS, MIN_WHOLE_SHARE = 20, 1 / 3
 """Own points that say how many photos have a part; else those with all of it, or so large a share of all photos."""
 NO_POINTS: Array = np.zeros((0, 3))
 
@@ -122,7 +122,7 @@ def count_silhouettes(points: NDArray[Any], outlines: Iterable[Outline], beyond:
     return counts
 
 
-def least_framing(views: Sequence[View], own: Array, share: float = LEAST_FRAMING) -> int:
+def least_framing(views: Sequence[View], own: Array, share: float = MIN_FRAMING_SHARE) -> int:
     """How many photos must have a place in their frame for it to be the object's, whatever they show there.
 
     A share of as many as have the places that the fewest have: of a long facade, or of a statue with many photos of its
@@ -133,14 +133,14 @@ def least_framing(views: Sequence[View], own: Array, share: float = LEAST_FRAMIN
         own: (N, 3) points on the object, of any number; where they are few, the photos that have it whole count.
         share: of these photos.
     """
-    if len(own) >= LEAST_OWN:
+    if len(own) >= MIN_OWN_POINTS:
         framed = np.zeros(len(own), dtype=np.int64)
         for view in views:
             framed[view.visible(own)[0]] += 1
-        usual = float(np.percentile(framed, RARELY_FRAMED))
+        usual = float(np.percentile(framed, FRAMING_PERCENTILE))
     else:
-        usual = max(sum(is_whole(view.pixels) for view in views), LEAST_WHOLE * len(views))
-    return max(LEAST_PHOTOS, int(np.ceil(share * usual)))
+        usual = max(sum(is_whole(view.pixels) for view in views), MIN_WHOLE_SHARE * len(views))
+    return max(MIN_PHOTOS, int(np.ceil(share * usual)))
 
 
 def is_whole(mask: Mask) -> bool:
@@ -174,8 +174,8 @@ def carve(
     centres = box.to_object(x_in_box).astype(np.float32)
     alive = np.flatnonzero(height_of(x_in_box) > 0)
     shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
-    for start in range(0, len(silhouettes), BATCH):
-        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + BATCH]))
+    for start in range(0, len(silhouettes), CARVED_PHOTOS):
+        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + CARVED_PHOTOS]))
         shown[alive] += counts.shown
         missed[alive] += counts.missed
         # A voxel outside more masks than all photos together could excuse is decided.

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.visual_hull import (
-    LEAST_OWN,
-    LEAST_WHOLE,
+    MIN_OWN_POINTS,
+    MIN_WHOLE_SHARE,
     NO_POINTS,
     Outline,
     count_silhouettes,
@@ -131,7 +131,7 @@ def _hides(outline: Outline, centres: Array, reach: float) -> NDArray[np.bool_]:
 def _rough_cube(views: list[View], own: Array) -> Sim3:
     """By the cameras where a third of the photos have the object whole; else around its own points, if there are some:
     what masks show of a facade has neither its middle nor its extent."""
-    if len(own) < LEAST_OWN or sum(is_whole(view.pixels) for view in views) >= LEAST_WHOLE * len(views):
+    if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_WHOLE_SHARE * len(views):
         return cube_from_cameras(views)
     low, high = np.percentile(own, [1, 99], axis=0)
     side = float((high - low).max() + 2 * REACH * np.linalg.norm(high - low))

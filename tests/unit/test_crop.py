@@ -113,7 +113,7 @@ def test_the_crop_of_a_large_scene_is_that_of_the_part_around_the_marks(tmp_path
 
 def test_a_large_scene_without_any_mark_is_one_sentence(tmp_path, monkeypatch):
     trial = plant("house", 2, noise=0.002, object_points=4000, density_ratio=1.0)
-    monkeypatch.setattr("scenefuse.crop.crop_scene.MOST_WHOLE", 1000)
+    monkeypatch.setattr("scenefuse.crop.crop_scene.MAX_WHOLE_POINTS", 1000)
     with pytest.raises(StageError, match="nothing marks the object, and the scene has .* mark it"):
         crop_scene(**stage_files(tmp_path, trial, trial.fiducials), settings=replace(SETTINGS, whole_scene=True))
 
