@@ -41,14 +41,14 @@ def shift(*by):
     return Sim3(1.0, np.eye(3), np.array(by, float))
 
 
-def tower(depth, colors=None, top=0.0):
-    """A tower of 2 x `depth` and 4 high about the origin, on a grid of points; `top` of its right side is longer."""
-    steps, rows = np.linspace(-1, 1, 11), np.linspace(-2, 2, 21)
-    sides = [[(x, depth / 2 * y, z) for x in steps for y in (-1, 1) for z in rows]]
-    sides += [[(x, depth / 2 * y, z) for x in (-1, 1) for y in steps[1:-1] for z in rows]]
-    sides += [[(1.0, 0.0, z) for z in np.arange(2.2, 2.2 + top, 0.05)]]
+def tower(depth, colors=None, fin=False):
+    """A tower of 4 x `depth` and 8 high about the origin, on a grid of points; a fin stands out of its right side."""
+    steps, rows = np.linspace(-1, 1, 21), np.linspace(-4, 4, 41)
+    sides = [[(2 * x, depth / 2 * y, z) for x in steps for y in (-1, 1) for z in rows]]
+    sides += [[(2 * x, depth / 2 * y, z) for x in (-1, 1) for y in steps[1:-1] for z in rows]]
+    sides += [[(x, 0.0, z) for x in np.linspace(2.2, 4.0, 10) for z in rows]] * fin
     points = np.concatenate([np.array(side).reshape(-1, 3) for side in sides])
-    normals = np.where(np.abs(points[:, :1]) == 1, X, Y)
+    normals = np.where(np.abs(points[:, :1]) == 2, X, Y)
     painted = None if colors is None else np.array([colors(p) for p in points])
     return Surface(points, normals, painted, cKDTree(points), np.arange(len(points)))
 
@@ -61,9 +61,8 @@ def striped(point):
     return (0.9, 0.1, 0.1) if point[2] < 0 else (0.1, 0.1, 0.9)
 
 
-SQUARE, OBLONG, WITH_SPIRE = tower(2.0), tower(1.2), tower(2.0, top=1.0)
-HALF_RED, STRIPED = tower(2.0, left_red), tower(2.0, striped)
-# Cut off at one height: turned upside down, nearly all of it meets itself elsewhere along its axis.
+SQUARE, OBLONG, WITH_FIN = tower(4.0), tower(2.4), tower(4.0, fin=True)
+HALF_RED, STRIPED = tower(4.0, left_red), tower(4.0, striped)
 OFF_CENTRE = replace(SQUARE, points=SQUARE.points + [0, 0, 5], tree=cKDTree(SQUARE.points + [0, 0, 5]))
 
 
@@ -126,7 +125,7 @@ def _is(found, value):
 
 
 LITTLE = 1e-6
-ELSEWHERE = shift(3, 0, 0)
+ELSEWHERE = shift(5, 0, 0)
 QUARTER, HALF = turn(Z, 90), turn(Z, 180)
 
 
@@ -180,7 +179,7 @@ CASES = [
     Case("the least lead", None, rivals=((ELSEWHERE, 0.9599),)),
     Case("no lead", "another pose is nearly as good: the margin is 0.040", rivals=((ELSEWHERE, 0.9601),),
          decided_by=BY_CLOUDS),
-    Case("the first rival counts", None, rivals=((ELSEWHERE, 0.9), (shift(0, 3, 0), 0.99)), also={"margin": 1 - 0.9}),
+    Case("the first rival counts", None, rivals=((ELSEWHERE, 0.9), (shift(0, 5, 0), 0.99)), also={"margin": 1 - 0.9}),
     Case("a rival that scores more", "the margin is -0.200", rivals=((ELSEWHERE, 1.2),), decided_by=BY_CLOUDS),
     Case("the same place", None, rivals=((shift(DISTINCT_SHIFT * DIAGONAL - LITTLE, 0, 0), 1.0),),
          also={"rival": None}),
@@ -199,12 +198,12 @@ CASES = [
          also={"rival": None, "margin": 1.0, "free_axis": Z}),
     Case("a quarter turn of an oblong tower", "another pose", rivals=((QUARTER, 1.0),), decided_by=BY_CLOUDS),
     Case("a quarter turn of a square tower", None, obj=SQUARE, rivals=((QUARTER, 1.0),), also={"free_axis": Z}),
-    Case("a square tower with a spire at one side", "another pose", obj=WITH_SPIRE, rivals=((HALF, 1.0),),
+    Case("a square tower with a fin at one side", "another pose", obj=WITH_FIN, rivals=((HALF, 1.0),),
          decided_by=BY_CLOUDS),
     Case("a square tower, red on one side", "another pose", obj=HALF_RED, rivals=((HALF, 1.0),),
          decided_by=BY_CLOUDS),
     Case("a square tower in stripes", None, obj=STRIPED, rivals=((QUARTER, 1.0),), also={"free_axis": Z}),
-    Case("a turn about another place", "another pose", rivals=((shift(3, 0, 0) @ HALF, 1.0),), decided_by=BY_CLOUDS),
+    Case("a turn about another place", "another pose", rivals=((shift(5, 0, 0) @ HALF, 1.0),), decided_by=BY_CLOUDS),
     Case("a turn about its middle, far from the origin", None, obj=OFF_CENTRE, rivals=((QUARTER, 1.0),)),
     Case("a turn that fits worse is no free axis", None, obj=SQUARE, rivals=((QUARTER, 0.95),),
          also={"free_axis": None, "rival": None}),
