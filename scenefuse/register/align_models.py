@@ -112,7 +112,7 @@ def align_models(
 
     Shared points: triangulated points of both models are matched by their SIFT descriptors, RANSAC over triples gives a
     similarity of free scale, and Gauss-Newton minimises the reprojection of each model's points in the other's photos.
-    GPS: where both sides have it, it gives one more estimate, which tells an object from its like elsewhere.
+    GPS: where both sides have it, it gives one more estimate, which distinguishes an object from its like elsewhere.
 
     Args:
         object_sparse: COLMAP model of the object's original photos; its frame is the object frame.
@@ -272,7 +272,7 @@ def _report(found: Found | None, matches: int) -> dict[str, Any]:
         pose = None if problem else consensus.pose
     words = (
         f"{count} of {matches} matched points agree, in {photos[0]} photos of the object and {photos[1]} of the scene"
-        + ("; GPS tells it from its like" if settled else "")
+        + ("; GPS distinguishes it from its like" if settled else "")
     )
     return {
         "found": quantity(problem is None, ""),

@@ -179,15 +179,15 @@ def _rivals(
 
 
 def _freely(axis: Array | None) -> str:
-    """What to say of an object that fits as well when it is turned."""
+    """What is reported of an object that fits as well when it is turned."""
     if axis is None:
         return ""
     about = ", ".join(f"{x:.2f}" for x in axis)
-    return f"; turned about ({about}) the object fits as well, and which turn is right its shape does not tell"
+    return f"; turned about ({about}) the object fits as well; its shape does not decide which turn is right"
 
 
 def _reasons(best: Hypothesis, of_clouds: Iterable[str], problem: Problem) -> Iterator[str]:
-    """Why a pose may not be used, the first of which is told; free space and gravity count whatever decided on it."""
+    """Why a pose may not be used; free space and gravity count whatever decided on it."""
     violation, tilt = best.score.free_space_violation, tilt_deg(best.pose, problem.known.ups)
     if violation is not None and violation > MAX_FREE_SPACE_VIOLATION:
         yield (
@@ -229,7 +229,7 @@ def _reasons_of_spread(
 ) -> Iterator[str]:
     """Why a pose is too uncertain to be used; `diagonal` of the scene crop, in its unit."""
     if uncertainty is None:
-        yield "too little of the object meets the scene to tell how certain the pose is"
+        yield "too little of the object meets the scene for an estimate of how certain the pose is"
         return
     scale, most = uncertainty.scale_sd_log, settings.max_scale_sd_log
     if scale > most:

@@ -31,7 +31,7 @@ from scenefuse.register.score import (
     best_distinct,
     score,
 )
-from scenefuse.register.uncertainty import Uncertainty, alike, half_sampling, with_bending
+from scenefuse.register.uncertainty import Uncertainty, common_error, half_sampling, with_bending
 
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
 FINE_POINTS = 12000
@@ -70,21 +70,21 @@ class Outcome:
         ranked: the hypotheses.
         decision: on the first.
         uncertainty: of the first, on the clouds as they are; the gate counts it.
-        alike: (7, 7) what the clouds have wrong alike, where the pose is theirs (see `alike`); None where it is the
+        common_error: (7, 7) of `common_error`, where the pose is the clouds'; None where it is the
             alignment's.
     """
 
     ranked: list[Hypothesis]
     decision: Decision
     uncertainty: Uncertainty | None
-    alike: Array | None = None
+    common_error: Array | None = None
 
     @property
     def stated(self) -> Uncertainty | None:
         """The uncertainty with what the clouds have wrong alike."""
-        if self.uncertainty is None or self.alike is None:
+        if self.uncertainty is None or self.common_error is None:
             return self.uncertainty
-        return self.uncertainty.plus(self.alike)
+        return self.uncertainty.plus(self.common_error)
 
     def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
         """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
@@ -122,9 +122,8 @@ def refine_hypotheses(problem: Problem, candidates: Sequence[Candidate], setting
     decision = decide(ranked, uncertainty, decided_by, shape, work.problem, settings, work.repetition(ranked[0].pose))
     pose, alignment = ranked[0].pose, problem.known.alignment
     by_photos = alignment is not None and pose is alignment.pose
-    return Outcome(
-        ranked, decision, uncertainty, None if by_photos else alike(*work.scored, pose, problem.scales, work.narrow)
-    )
+    common = None if by_photos else common_error(*work.scored, pose, problem.scales, work.narrow)
+    return Outcome(ranked, decision, uncertainty, common)
 
 
 def _prepare(problem: Problem, scale: float, settings: FineSettings) -> "_Work":
@@ -263,7 +262,7 @@ class _Work:
         Where the alignment differs from the clouds' pose, its own is refined on the clouds. Of the refined pose and the
         alignment's own the less uncertain one is taken; the worse the clouds score at the alignment's pose, the less
         uncertain that must be. Where they score as well there, what they differ by beyond the alignment's uncertainty
-        counts as theirs: surfaces err alike, which their scatter does not show. A refinement that leaves the
+        counts as theirs: surfaces err common_error, which their scatter does not show. A refinement that leaves the
         alignment's valley is dropped, unless it stays near and the scene's photos refute the alignment's own pose: both
         models may be bent. Then it has to pass as a pose that no photos support.
         """

@@ -111,8 +111,8 @@ def with_bending(local: Uncertainty, pose: Sim3, of_object: Array | None, of_sce
     return Uncertainty.of(total)
 
 
-def alike(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: float) -> Array:
-    """What a pose by clouds has wrong because their surfaces err alike, about the object's centre (method R12).
+def common_error(obj: Surface, scene: Surface, pose: Sim3, scales: ScaleRange, reach: float) -> Array:
+    """What a pose by clouds has wrong because their surfaces err common_error, about the object's centre (method R12).
 
     Stereo fattens, smooths and displaces whole surfaces; neither their scatter nor halves of them show it. It is taken
     as a fifth of the scatter: of the RMS distance, along the object's normals, of the scene's points that lie on it.

@@ -247,7 +247,7 @@ def test_gps_tells_an_object_from_its_twin(tmp_path, shift):
     found = aligned(tmp_path, obj, scene, **positions(tmp_path, (shift, 0, 0)))
     place = Sim3.from_matrix(np.array(value(found, "scene_from_object"))).apply(OBJECT_FROM_WORLD.apply(np.zeros(3)))
     assert value(found, "found") is True and np.linalg.norm(place - [shift, 0, 0]) < 0.1
-    assert value(found, "settled_by_gps") is True and "GPS tells it from its like" in value(found, "reason")
+    assert value(found, "settled_by_gps") is True and "GPS distinguishes it from its like" in value(found, "reason")
 
 
 def test_an_object_that_stands_there_twice_is_not_placed(tmp_path):

@@ -26,7 +26,7 @@ from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import color_agreement, score
-from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, alike, half_sampling
+from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, common_error, half_sampling
 
 Z = np.array([0.0, 0.0, 1.0])
 COARSE, FINE = CoarseSettings(), FineSettings()
@@ -352,12 +352,12 @@ def test_what_surfaces_have_wrong_alike_is_a_share_of_their_scatter_and_only_of_
     rng = np.random.default_rng(0)
     off = truth.apply(obj.points) + truth.rotate(obj.normals) * rng.normal(0, sigma, (len(obj), 1))
     scene = replace(scene, points=off)
-    covariance = alike(obj, scene, truth, ScaleRange(truth.scale, 0.3), 5 * sigma)
+    covariance = common_error(obj, scene, truth, ScaleRange(truth.scale, 0.3), 5 * sigma)
     shift = np.sqrt(np.diag(covariance)[3:6])
     np.testing.assert_allclose(shift, COMMON_ERROR * sigma, rtol=0.1)
     radius = truth.scale * np.linalg.norm(obj.points - obj.points.mean(0), axis=1)
     np.testing.assert_allclose(np.sqrt(covariance[6, 6]) * np.sqrt((radius**2).mean()), shift[0])
-    assert alike(obj, scene, truth, ScaleRange(truth.scale, 0.0), 5 * sigma)[6, 6] == 0
+    assert common_error(obj, scene, truth, ScaleRange(truth.scale, 0.0), 5 * sigma)[6, 6] == 0
     by_clouds = refined(house, truth)
     assert (by_clouds.stated.deviations > by_clouds.uncertainty.deviations).all()
     sure = Alignment(truth, Uncertainty.even(1e-5, 1e-3, 1e-4))

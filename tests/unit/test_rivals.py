@@ -85,7 +85,7 @@ def test_the_same_object_is_registered_where_the_scene_shows_its_distinctive_par
 def test_an_object_that_is_the_same_when_turned_is_registered_and_that_is_said():
     decision = register(hut(False, 0).transformed(TRUTH.inverse()), hut(False, 1)).decision
     assert decision.registered and abs(decision.free_axis @ UP) > 0.99
-    assert "the object fits as well, and which turn is right its shape does not tell" in decision.reason
+    assert "the object fits as well; its shape does not decide which turn is right" in decision.reason
 
 
 def test_colours_that_the_scene_does_not_have_do_not_choose_among_turns():
