@@ -144,11 +144,12 @@ def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array, weights
 
 
 def similarity_rows(lever: Array, direction: Array) -> Array:
-    """(M, 7) how far points move along a direction (M, 3) by a small rotation, shift and log scale about a centre.
+    """(..., 7) how far points move along a direction (..., 3) by a small rotation, shift and log scale about a centre.
 
-    `lever` (M, 3) is from the centre to the points.
+    `lever` (..., 3) is from the centre to the points.
     """
-    return np.concatenate([np.cross(lever, direction), direction, (lever * direction).sum(1, keepdims=True)], axis=1)
+    along = (lever * direction).sum(-1, keepdims=True)
+    return np.concatenate([np.cross(lever, direction), direction, along], axis=-1)
 
 
 def moved_about(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:
