@@ -12,11 +12,10 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
-from scenefuse.register.decision import Decision, FineSettings, unless_torn
+from scenefuse.register.decision import FineSettings
 from scenefuse.register.problem import Constraints, Problem
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.scale import ScaleSettings, estimates, prior
-from scenefuse.register.uncertainty import Uncertainty
 
 UP, DIAGONAL = np.array([0.0, 0.0, 1.0]), 14.0
 TRUTH = Sim3(0.3, Rotation.random(random_state=1).as_matrix(), np.array([3.0, -8.0, 5.0])).inverse()
@@ -93,13 +92,3 @@ def test_colours_that_the_scene_does_not_have_do_not_choose_among_turns():
     red = np.where(plain.points[:, :1] > 0, [[200, 30, 30]], [[30, 200, 30]]).astype(np.uint8)
     outcome = register(replace(plain, colors=red).transformed(TRUTH.inverse()), hut(False, 1))
     assert not outcome.decision.registered and outcome.decision.margin < FINE.min_margin
-
-
-def test_a_pose_is_refused_where_the_objects_own_model_may_be_bent_beyond_use():
-    decision = Decision(True, "good", "photos", 1.0, None, None)
-    assert unless_torn(decision, None, 10.0) is decision
-    assert unless_torn(decision, Uncertainty.even(0.03, 2.0, 0.1), 10.0) is decision
-    torn = unless_torn(decision, Uncertainty.even(0.2, 5.6, 1.7), 10.0)
-    assert not torn.registered and "20% of the diagonal" in torn.reason and "more photos" in torn.reason
-    refused = replace(decision, registered=False, reason="too little")
-    assert unless_torn(refused, Uncertainty.even(0.2, 5.6, 1.7), 10.0).reason == "too little"

@@ -151,6 +151,11 @@ def _without_second_turns(turned: Any) -> Any:
     return lambda self, leaders: turned(self, leaders) if len(leaders) > 1 else []
 
 
+def _without_first_turns(turned: Any) -> Any:
+    """Turned copies of the polished pose only."""
+    return lambda self, leaders: turned(self, leaders) if len(leaders) == 1 else []
+
+
 def _even(_: Any) -> Any:
     """No Tukey weights: each direction sums to a half."""
 
@@ -215,6 +220,7 @@ RULES = [
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
     Rule("refine: turned copies of the polished", f"{R}.refinement._Work.turned", _without_second_turns),
+    Rule("refine: turned copies of the rough", f"{R}.refinement._Work.turned", _without_first_turns),
     Rule("refine: polish again from 6 % off", f"{R}.refinement.POLISH_SCALE_FACTOR", constant(1.0)),
     Rule("refine: polish that scores worse is dropped", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     Rule("refine: repetition", f"{R}.refinement.shifts_onto_itself", nothing),
@@ -229,6 +235,7 @@ RULES = [
          lambda f: lambda *args: 0 * f(*args)),
     Rule("most likely pose: dropped where it scores worse", f"{R}.refinement.MIN_SCORE_RATIO", constant(0.0)),
     # The uncertainty.
+    Rule("half-sampling", f"{R}.refinement.half_sampling", lambda _: lambda *args: None),
     Rule("half-sampling: starts 3 % off", f"{R}.uncertainty.START_SCALE_FACTOR", constant(1.0)),
     Rule("half-sampling: two thinnings in turn", f"{R}.refinement.half_sampling", _one_side),
     Rule("uncertainty: what surfaces have wrong alike", f"{R}.uncertainty.COMMON_ERROR", constant(0.0)),
