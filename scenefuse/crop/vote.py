@@ -11,10 +11,9 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.depth_test import BEHIND, depth_buffer, depth_test
 from scenefuse.geometry.visual_hull import least_framing
 from scenefuse.photos.workspace import View, read_workspace, with_mask
-
-Columns = tuple[NDArray[np.float32], ...]
 
 # Photos used at most, spread evenly: more show the same sides again.
 MAX_PHOTOS = 60
@@ -119,7 +118,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         one = _with_grown_mask(view, path)
         found.append(one)
         observed = np.unique(seen)
-        rows, pixels, _ = _in_frame(_columns(read.points[observed]), one)
+        rows, pixels, _ = one.visible(read.points[observed])
         observing[observed[rows]] += 1
         inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
     own = read.points[(observing >= MIN_SHOWN) & (inside >= min_share * observing)]
@@ -146,45 +145,18 @@ def count(
 
     What hides is judged by the spacing of those that `least` photos frame.
     """
-    columns = _columns(in_object)
     framed, shown, inside = (np.zeros(len(in_object), dtype=np.int32) for _ in range(3))
     for one in views:
-        framed[_in_frame(columns, one)[0]] += 1
+        framed[one.visible(in_object)[0]] += 1
     around = np.flatnonzero(framed >= least)
     if len(around) < 2:
         return framed, shown, inside
-    step = spacing(in_object[around])
+    cell = CELL_SPACINGS * spacing(in_object[around])
     for one in views:
-        rows, pixels, depth = _in_frame(columns, one)
-        unhidden = ~_hidden(pixels, depth, step, one)
+        rows, pixels, _ = one.visible(in_object)
+        near = in_object[rows]
+        unhidden = depth_test(near, depth_buffer(near, one, cell), HIDDEN_CELLS * cell) != BEHIND
         rows, pixels = rows[unhidden], pixels[unhidden]
         shown[rows] += 1
         inside[rows] += one.pixels[pixels[:, 1], pixels[:, 0]]
     return framed, shown, inside
-
-
-def _columns(points: Array) -> Columns:
-    return tuple(np.ascontiguousarray(points.T, dtype=np.float32))
-
-
-def _in_frame(points: Columns, one: View) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float32]]:
-    """Rows of the points in a photo's frame, their pixels (K, 2) and depths (K,)."""
-    x, y, z = points
-    u, v, depth = (a * x + b * y + c * z + d for a, b, c, d in one.projection.astype(np.float32))
-    rows = np.flatnonzero((depth > 0) & (u >= 0) & (u < one.width * depth) & (v >= 0) & (v < one.height * depth))
-    depth = depth[rows]
-    pixels = np.stack([u[rows] / depth, v[rows] / depth], axis=1).astype(np.int64)
-    # A quotient may round up to the edge.
-    return rows, np.minimum(pixels, [one.width - 1, one.height - 1]), depth
-
-
-def _hidden(pixels: NDArray[np.int64], depth: NDArray[np.float32], step: float, one: View) -> NDArray[np.bool_]:
-    """Which points lie behind a nearer one in the same cell of a photo; a cell is four spacings of the points wide."""
-    if len(depth) == 0:
-        return np.zeros(0, dtype=bool)
-    size = CELL_SPACINGS * step
-    cell = max(1, int(np.ceil(size * np.linalg.norm(one.projection[0, :3]) / np.median(depth))))
-    key = (pixels[:, 1] // cell) * (one.width // cell + 1) + pixels[:, 0] // cell
-    nearest = np.full(key.max() + 1, np.inf, dtype=np.float32)
-    np.minimum.at(nearest, key, depth)
-    return depth > nearest[key] + HIDDEN_CELLS * size

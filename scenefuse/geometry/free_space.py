@@ -7,6 +7,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from scenefuse.core.transforms import Array
+from scenefuse.geometry.depth_test import IN_FRONT, depth_test
 from scenefuse.photos.maps import read_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 
@@ -38,11 +39,9 @@ class FreeSpace:
         """
         measured, beyond = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
         for view in self.views:
-            rows, pixels, depth = view.visible(points)
-            found = view.pixels[pixels[:, 1], pixels[:, 0]]
-            known = found > 0
-            measured[rows[known]] += 1
-            beyond[rows[known]] += (found > depth + self.tolerance)[known]
+            place = depth_test(points, view, self.tolerance)
+            measured += place >= IN_FRONT
+            beyond += place == IN_FRONT
         seen = measured > 0
         if seen.mean() < MIN_MEASURED:
             return None
