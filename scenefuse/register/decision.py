@@ -11,6 +11,7 @@ from scenefuse.core.stage import setting
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.problem import Problem
+from scenefuse.register.repetition import END_PERCENTILES
 from scenefuse.register.score import (
     DISTINCT_ANGLE_DEG,
     DISTINCT_SHIFT,
@@ -31,8 +32,6 @@ MAX_TILT_DEG = 8.0  # angle between the up directions
 MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
 # A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
 MIN_SELF_OVERLAP, MIN_SELF_COLOR = 0.95, 0.9
-# Where the object ends along an axis, as percentiles: strays do not count.
-END_PERCENTILES = 1, 99
 # A pose that may be so far off because the object's own model is bent (`Uncertainty.size`) is none: the model is torn.
 MAX_BENDING = 0.1
 

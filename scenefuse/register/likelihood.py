@@ -33,8 +33,6 @@ MAX_STEP_CUTS = 5
 PLANTED_COPIES = 4
 # Fewer scene points on the object determine nothing.
 MIN_POINTS = 100
-# Of a direction of which nothing is known: this share of the best known.
-NOTHING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -267,7 +265,7 @@ def _covariance(scene: Surface, found: MostLikely, diagonal: float, hold_scale: 
         information[6], information[:, 6], scatter[6], scatter[:, 6] = 0, 0, 0, 0
         information[6, 6] = 1
     values, vectors = np.linalg.eigh(information)
-    inverse = (vectors / np.maximum(values, NOTHING * values[-1])) @ vectors.T
+    inverse = (vectors / np.maximum(values, 1e-9 * values[-1])) @ vectors.T
     return (inverse @ scatter @ inverse) * count / (count - 1) / np.outer(unit, unit)
 
 

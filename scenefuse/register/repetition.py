@@ -15,8 +15,8 @@ from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import color_agreement, f_beta, worth
 
-# Edge of a voxel, and distance within which points agree, in spacings of the points.
-VOXEL_SPACINGS, MATCH_SPACINGS = 4 / 3, 8 / 3
+# Edge of a voxel in spacings of the points; points agree within two edges.
+VOXEL_SPACINGS = 4 / 3
 # Cells of the autocorrelation at most; of more, the voxels are larger. Shifts below so many voxels are not looked for.
 MAX_CELLS, MIN_SHIFT_VOXELS = 1_000_000, 3
 # A shift is looked at when this share of the object's voxels meet, and so much less of them on the way to it: a plane
@@ -44,7 +44,7 @@ def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
         spacing: of its points, in its own unit.
     """
     found: list[Array] = []
-    voxel, tau = VOXEL_SPACINGS * spacing, MATCH_SPACINGS * spacing
+    voxel = VOXEL_SPACINGS * spacing
     for shift in _peaks(obj, voxel):
         if any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
@@ -54,7 +54,7 @@ def shifts_onto_itself(obj: Surface, spacing: float) -> list[Array]:
         length = float(np.linalg.norm(shift))
         if length < MIN_SHIFT_VOXELS * voxel or any(_is_multiple(shift, of, 2 * voxel) for of in found):
             continue
-        if _repeats(obj, shift, tau):
+        if _repeats(obj, shift, 2 * voxel):
             found.append(shift)
         if len(found) == MAX_DIRECTIONS:
             break
