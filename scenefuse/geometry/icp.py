@@ -140,7 +140,7 @@ def step_to_planes(pose: Sim3, moved: Array, normals: Array, off: Array, weights
     if weights is not None:
         rows, off = rows * weights[:, None], off * weights
     step = np.asarray(-np.linalg.lstsq(rows, off, rcond=None)[0], dtype=np.float64)
-    return moved_about(pose, step, centre, ScaleRange(1.0, np.inf))
+    return moved_about(pose, step, centre, ScaleRange(1.0, np.inf), 2 * MAX_SCALE_STEP)
 
 
 def similarity_rows(lever: Array, direction: Array) -> Array:
@@ -152,10 +152,12 @@ def similarity_rows(lever: Array, direction: Array) -> Array:
     return np.concatenate([np.cross(lever, direction), direction, along], axis=-1)
 
 
-def moved_about(pose: Sim3, step: Array, centre: Array, scales: ScaleRange) -> Sim3:
+def moved_about(
+    pose: Sim3, step: Array, centre: Array, scales: ScaleRange, max_scale_step: float = MAX_SCALE_STEP
+) -> Sim3:
     """A pose after a step (7,) of rotation vector, shift and log scale about a centre (3,) in the scene."""
     rotation = Rotation.from_rotvec(step[:3]).as_matrix()
-    factor = float(np.exp(np.clip(step[6], -MAX_SCALE_STEP, MAX_SCALE_STEP)))
+    factor = float(np.exp(np.clip(step[6], -max_scale_step, max_scale_step)))
     growth = scales.clamp(pose.scale * factor) / pose.scale
     return Sim3(growth, rotation, centre + step[3:6] - growth * (rotation @ centre)) @ pose
 

@@ -63,7 +63,7 @@ def test_parts_far_from_every_fiducial_are_kept_and_that_is_said(monkeypatch):
     trial = plant("sculpture", 1, ground=False, noise=0.002, object_points=4000, density_ratio=1.0)
     low, high = trial.scene.points.min(0), trial.scene.points.max(0)
     far = low + (high - low) * np.array([[-9, -9, -9], [9, -9, -9], [-9, 9, -9], [9, 9, 9]])
-    monkeypatch.setattr("scenefuse.crop.crop_cloud.MIN_PART", 1.1)
+    monkeypatch.setattr("scenefuse.crop.crop_cloud.MIN_PART_SHARE", 1.1)
     cut = crop_cloud(trial.scene, far, Z, SETTINGS)
     assert cut.keep.all() and "no part in the box lies near a fiducial" in cut.notes[1]
 
