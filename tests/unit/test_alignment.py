@@ -329,7 +329,7 @@ def test_a_cap_keeps_the_points_seen_most(pair):
 def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
     obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
     whole = match_landmarks(obj, scene, 0.85)
-    monkeypatch.setattr("scenefuse.register.landmarks.BLOCK", 37)
+    monkeypatch.setattr("scenefuse.register.landmarks.BLOCK_POINTS", 37)
     np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85), whole)
 
 
