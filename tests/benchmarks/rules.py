@@ -102,7 +102,8 @@ def table(*, part: str, out: Path = Path("results/bench/rules.tsv"), table: Path
         table: output TSV.
     """
     rows, module = pd.read_csv(out, sep="\t"), importlib.import_module(f"rules_of.{part}")
-    measures = [c for c in rows.columns if c not in ("rule", "trial", "kind", "reason")]
+    measures = rows.columns.drop(["rule", "trial", "kind", "reason", "cpu_s"], errors="ignore")
+    counts = [name for name in measures if pd.api.types.is_integer_dtype(rows[name])]
     whole = rows[rows.rule == NONE].set_index("trial")
     lines = []
     for rule in module.RULES:
@@ -110,20 +111,15 @@ def table(*, part: str, out: Path = Path("results/bench/rules.tsv"), table: Path
         both = whole.index.intersection(own.index)
         if not len(both):
             continue
-        kept, off = whole.loc[both], own.loc[both]
         line = {"rule": rule.name, "where": rule.where, "trials": len(both)}
-        for name in measures:
-            line |= {f"{name} with": _total(kept[name]), f"{name} without": _total(off[name])}
+        for which, found in (("with", whole.loc[both]), ("without", own.loc[both])):
+            line[f"{'/'.join(counts)} {which}"] = "/".join(str(found[name].sum()) for name in counts)
+            line |= {f"{name} {which}": f"{found[name].median():.3g}" for name in measures if name not in counts}
         lines.append(line | {"verdict": rule.decided})
-    found = pd.DataFrame(lines)
+    result = pd.DataFrame(lines)
     table.parent.mkdir(parents=True, exist_ok=True)
-    found.to_csv(table, sep="\t", index=False, float_format="%.4g")
-    print(found.drop(columns="where").to_string())
-
-
-def _total(values: pd.Series) -> float:
-    """The sum of counts, the median of other numbers."""
-    return int(values.sum()) if pd.api.types.is_integer_dtype(values) else float(values.median())
+    result.to_csv(table, sep="\t", index=False)
+    print(result.drop(columns="where").to_string())
 
 
 if __name__ == "__main__":
