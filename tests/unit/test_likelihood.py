@@ -8,7 +8,7 @@ from support.planted import deviations, errors, plant
 
 from scenefuse.geometry.icp import ScaleRange, moved_about
 from scenefuse.geometry.surface import prepare, with_queries
-from scenefuse.register import likelihood, refinement
+from scenefuse.register import refinement
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.likelihood import certified, explain, most_likely
 from scenefuse.register.problem import Problem
@@ -61,7 +61,7 @@ def test_less_noise_is_more_certain(gate):
 
 def test_gradient_and_information_are_the_derivatives_of_the_likelihood(gate, monkeypatch):
     # With few neighbours, the likelihood jumps a little wherever the farthest of them is another.
-    monkeypatch.setattr(likelihood, "NEIGHBOURS", 300)
+    monkeypatch.setattr("scenefuse.register.likelihood.NEIGHBOURS", 300)
     trial, obj, scene = gate
     scene, spacing, scales = with_queries(scene, 200), SPACING * trial.diagonal, ScaleRange(1.0, 9.0)
     found = most_likely(obj, scene, disturbed(trial), ScaleRange(trial.scene_from_object.scale, 0.5), spacing, 7.0)
