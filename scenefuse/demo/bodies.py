@@ -18,10 +18,6 @@ from scenefuse.demo import textures
 from scenefuse.metrics.true_cameras import Cameras
 
 Kind = Literal["real", "ideal"]
-# Range of the defocus of a blurred photo, the standard deviation of a Gaussian.
-DEFOCUS_PX = (0.3, 0.8)
-# Longest path of a blurred photo during its exposure.
-MAX_MOTION_PX = 2.5
 
 
 @dataclass(frozen=True)
@@ -38,6 +34,8 @@ class Body:
         shot: variance of the noise, over the light.
         read: standard deviation of the noise without light.
         blurred: share of photos that are a little out of focus and shaken.
+        defocus_px: range of their defocus, the standard deviation of a Gaussian.
+        max_motion_px: longest path of the picture during their exposure.
         haze: how white the sky is above its photos; 0 is blue.
         quality: of its JPEG files.
         subsampling: of their colours, Pillow's number: 0 is 4:4:4, 2 is 4:2:0.
@@ -52,6 +50,8 @@ class Body:
     shot: float = 0.0
     read: float = 0.0
     blurred: float = 0.0
+    defocus_px: tuple[float, float] = (0.3, 0.8)
+    max_motion_px: float = 2.5
     haze: float = 0.0
     quality: int = 95
     subsampling: int = 0
@@ -116,7 +116,10 @@ def draw_exposure(body: Body, rng: np.random.Generator) -> Exposure:
     """One photo's exposure, white balance and blur."""
     spread = body.exposure_sd * rng.normal() + body.balance_sd * rng.normal(size=3) * [1, 0, 1]
     blurred, angle = rng.random() < body.blurred, rng.uniform(0, np.pi)
-    defocus, path = rng.uniform(*DEFOCUS_PX), rng.uniform(0, MAX_MOTION_PX) * np.array([np.cos(angle), np.sin(angle)])
+    defocus, path = (
+        rng.uniform(*body.defocus_px),
+        rng.uniform(0, body.max_motion_px) * np.array([np.cos(angle), np.sin(angle)]),
+    )
     return Exposure(np.array(body.gains) * np.exp(spread), defocus * blurred, path * blurred)
 
 

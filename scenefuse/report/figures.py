@@ -19,10 +19,16 @@ from scenefuse.report.render import MAX_DRAWN, luminance, orbit_camera, point_ra
 from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
 from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
 
-GREY, ORANGE, PALE_ORANGE, BLUE, RED, PURPLE = np.array(
-    [[205, 208, 212], [240, 120, 25], [245, 170, 85], [40, 95, 185], [214, 38, 31], [150, 60, 170]], np.uint8
-)
-MISSING_COLORS = {NEVER_SEEN: RED, UNTEXTURED: BLUE, CONTRADICTED: PURPLE}
+COLORS = {
+    "scene": (205, 208, 212),
+    "added": (240, 120, 25),
+    "unconfirmed": (150, 60, 170),
+    "crop": (40, 95, 185),
+    "object": (245, 170, 85),
+    NEVER_SEEN: (214, 38, 31),
+    UNTEXTURED: (40, 95, 185),
+    CONTRADICTED: (150, 60, 170),
+}
 # Points of an object's 3D view: with three objects and a scene, the page stays well below 15 MB.
 VIEW_POINTS = 150_000
 # Clouds and the radii of their points' discs.
@@ -205,8 +211,8 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     kinds = join.after.fields.get("evidence", np.zeros(len(added), np.uint8))
     unconfirmed = added & (kinds == NERF_ONLY)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.where(added[:, None], ORANGE, GREY)
-    colors = (np.where(unconfirmed[:, None], PURPLE, colors) * shade).astype(np.uint8)
+    colors = np.where(added[:, None], COLORS["added"], COLORS["scene"])
+    colors = (np.where(unconfirmed[:, None], COLORS["unconfirmed"], colors) * shade).astype(np.uint8)
     images = sides(join.after, join.framed, radii, tile, 22.0, colors)
     note = (
         f"grey: {(~added).sum():,} points of the scene; orange: {(added & ~unconfirmed).sum():,} points added from the"
@@ -221,7 +227,9 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     tile = (430, 350)
     kinds = cells.fields["missing"] if len(cells) else np.zeros(0, np.uint8)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.concatenate([GREY * shade, np.array([MISSING_COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)])
+    colors = np.concatenate(
+        [COLORS["scene"] * shade, np.array([COLORS[kind] for kind in kinds.tolist()]).reshape(-1, 3)]
+    )
     side = 1.2 * float(np.median(radii)) if len(cells) < 2 else 0.8 * spacing(cells.points)
     cloud, sizes = Cloud(np.concatenate([join.after.points, cells.points])), np.append(radii, np.full(len(cells), side))
     middle = (join.framed.min(0) + join.framed.max(0)) / 2
@@ -263,11 +271,11 @@ def _registration(name: str, join: Surroundings) -> Image:
     """The object over the crop from three sides."""
     tile, dots = (480, 390), point_radii(join.crop.points)
     radii = 0.5 * np.minimum(dots, np.float32(np.median(dots)))
-    colors, framed = np.tile(BLUE, (len(join.crop), 1)), join.crop.points
+    colors, framed = np.tile(np.array(COLORS["crop"], np.uint8), (len(join.crop), 1)), join.crop.points
     if join.object_cloud is not None:
         framed = np.concatenate([framed, join.object_cloud.points])
         radii = np.concatenate([radii, point_radii(join.object_cloud.points)])
-        colors = np.concatenate([colors, np.tile(PALE_ORANGE, (len(join.object_cloud), 1))])
+        colors = np.concatenate([colors, np.tile(np.array(COLORS["object"], np.uint8), (len(join.object_cloud), 1))])
     # Small dots of the crop over the closed surface of the object; without normals both are shaded by depth alone.
     cloud = Cloud(framed)
     views = {"side, azimuth 30°": (30.0, 12.0), "side, azimuth 120°": (120.0, 12.0), "from above": (-90.0, 90.0)}

@@ -18,25 +18,14 @@ from scenefuse.report.run_summary import ALONE, ObjectSummary, RunSummary, Scene
 from scenefuse.report.tables import number_in, plain, records
 from scenefuse.report.values import Fields, find, number, unit_of
 
-WIDTH, LABEL_WIDTH = 100, 14
+WIDTH = 100
 # Rules that the text lists, those that took longest; runtime.tsv has them all.
 LISTED_RULES = 6
 # Quantities of a stage that are worth a line: what it chose where it had a choice, and what it noted.
-CHOICES = (
-    "workspace",
-    "pose_source",
-    "device",
-    "backend",
-    "kernels",
-    "method",
-    "pairs_choice",
-    "up_cue",
-    "mode",
-    "kept",
-)
+CHOICES = ("pose_source", "backend", "method", "mode", "up_cue")
 NOTES = re.compile(r"(^|[._])(fallbacks?|warnings?|notes?|reason|not_registered|models_left_out|gps_outliers)$")
-# Those that have a line of their own.
-REASONS = ("fine.reason", "fusion.reason", "alignment.reason")
+# Those that have a line of their own, or nothing that a user acts on.
+REASONS = ("fine.reason", "fusion.reason", "alignment.reason", "matches.pairs_reason")
 Cell = tuple[str, Any, str]
 
 
@@ -63,8 +52,7 @@ def _heading(text: str) -> list[str]:
 
 def _line(label: str, text: str) -> list[str]:
     """`label   text`, wrapped, continuation lines indented."""
-    start, rest = f"{label:<{LABEL_WIDTH}}", " " * LABEL_WIDTH
-    return textwrap.wrap(text, WIDTH, initial_indent=start, subsequent_indent=rest) if text else []
+    return textwrap.wrap(text, WIDTH, initial_indent=f"{label:<14}", subsequent_indent=" " * 14) if text else []
 
 
 def _pairs(*cells: Cell) -> str:
@@ -177,7 +165,7 @@ def _object_lines(item: ObjectSummary, row: dict[str, Any], variants: list[str])
     lines += _line("cloud", _pairs(("points", row["points"], "")))
     lines += _line("alignment", _alignment(item.stages)) + _line("pose", _pose(fields))
     others = (f"{variant} {item.status(variant)}" for variant in variants[1:])
-    lines += _line("variants", "" if item.alone else ", ".join(others))
+    lines += _line("variants", ", ".join(others) if find(fields, "fine.status") else "")
     added = ("points added", find(item.fusion, "fusion.added_points"), "")
     unconfirmed = ("of the object unconfirmed", find(item.fusion, "fusion.nerf_only_points"), "")
     lines += _line("fusion", _pairs(("mode", find(item.fusion, "fusion.mode"), ""), added, unconfirmed))
@@ -261,7 +249,7 @@ def _object_truth(item: ObjectSummary, fields: Fields) -> str:
     pose = {
         "scale off": "scale_error_pct",
         "rotation off": "rotation_error_deg",
-        "position off, over the diagonal": "translation_error_over_diagonal",
+        "position off over the diagonal": "translation_error_over_diagonal",
     }
     own = {"mask IoU": "mask_iou_mean", "cloud F-score at 1 %": "cloud_f_score_1pct"}
     scene = [number_in(item.stages, f"truth.scene_f_score_{when}_1pct") for when in ("before", "after")]
