@@ -53,7 +53,7 @@ def click_points(*, name: str, cameras: Path, clicks: Path, settings: ClickSetti
     """Click an object's landmarks in a few photos of one capture: the flight (fiducials) or its orbit (prompts).
 
     Writes a tab-separated table with the columns point, photo, x_px, y_px (pixel centres at +0.5); each point
-    appears in at least two photos. Points are clicked only where the ray caster says that nothing hides them.
+    appears in at least two photos. Points are clicked only where nothing hides them from the camera.
 
     Args:
         name: house, balloon or sculpture.

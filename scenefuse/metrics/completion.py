@@ -145,9 +145,9 @@ def _mean(values: Sequence[float | None], weights: Sequence[int]) -> float | Non
     return float(np.average([v for v, _ in there], weights=[w for _, w in there])) if there else None
 
 
-def _spread(clouds: Sequence[Array], k: int, most: int, seed: int) -> tuple[float, float]:
+def _spread(clouds: Sequence[Array], k: int, sample: int, seed: int) -> tuple[float, float]:
     """Mean and standard deviation of the local densities of several clouds, each counted by its points."""
-    found = [local_density(cloud, sampled(cloud, most, seed), k) for cloud in clouds]
+    found = [local_density(cloud, sampled(cloud, sample, seed), k) for cloud in clouds]
     weights = np.concatenate([np.full(len(rho), len(cloud) / len(rho)) for rho, cloud in zip(found, clouds)])
     rho = np.concatenate(found)
     mean = float(np.average(rho, weights=weights))

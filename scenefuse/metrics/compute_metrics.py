@@ -60,7 +60,7 @@ def compute_scene_metrics(
 
     Args:
         completed: the completed scene (PLY, with `source`).
-        completed_json: its JSON, which says which object each `source` is and which objects are in it.
+        completed_json: its JSON: the object of each `source`, and the objects that are in it.
         objects: result folders of all the scene's objects; of those in it, registration/full/crop.ply and crop.json are
             read.
         report: output JSON with `completion`; a measure is null where nothing was added.

@@ -20,7 +20,7 @@ def primitive_fitting_score(
     normals: Array,
     tolerance: float,
     support: float,
-    most: int,
+    limit: int,
     angle_deg: float,
     seed: int,
 ) -> float:
@@ -34,7 +34,7 @@ def primitive_fitting_score(
         normals: (N, 3) unit normals, either side.
         tolerance: distance to the primitive.
         support: smallest share of N that makes a primitive.
-        most: most primitives.
+        limit: largest number of primitives.
         angle_deg: largest angle between a point's normal and the primitive's.
         seed: of the draws.
     """
@@ -44,7 +44,7 @@ def primitive_fitting_score(
     link = max(2 * tolerance, 1.5 * float(np.median(nearest[:, -1])))
     size = float(np.linalg.norm(np.ptp(points, axis=0)))
     cosine = np.cos(np.radians(angle_deg))
-    for _ in range(most):
+    for _ in range(limit):
         index = np.flatnonzero(left)
         if len(index) < max(support * len(points), 10):
             break

@@ -94,7 +94,7 @@ def draw_lone_object(
     Args:
         name: the object's, for the titles.
         object_cloud: its cloud (PLY), in its own frame.
-        sparse_json: says whether that is in metres.
+        sparse_json: holds the unit of its lengths, where it is metres.
         workspace: its undistorted COLMAP workspace.
         masks: folder of its masks, {photo}.png.
         stages: folders of its four training stages.

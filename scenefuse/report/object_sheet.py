@@ -97,10 +97,10 @@ def upright(cloud: Cloud, workspace: Path) -> Cloud:
     return cloud.transformed(Sim3(1.0, rotation_between(up, np.array([0.0, 0.0, 1.0])), np.zeros(3)))
 
 
-def inner(points: Array, most: int = 20000) -> Array:
+def inner(points: Array, limit: int = 20000) -> Array:
     """At most that many of the points, without the outermost half per cent of each axis: what a picture has to show."""
     low, high = np.percentile(points, [0.5, 99.5], axis=0)
-    return points[((points >= low) & (points <= high)).all(1)][:: max(1, len(points) // most)]
+    return points[((points >= low) & (points <= high)).all(1)][:: max(1, len(points) // limit)]
 
 
 def _fit(mask: NDArray[np.bool_], shape: tuple[int, ...]) -> NDArray[np.bool_]:

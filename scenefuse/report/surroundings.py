@@ -16,6 +16,7 @@ from scenefuse.fuse.write import after_fusion
 from scenefuse.report.object_sheet import inner
 from scenefuse.report.render import luminance
 from scenefuse.report.values import find, flatten, load, number, unit_of
+from scenefuse.report.view import within
 
 # How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
 REACH = (0.35, 0.35, 0.15)
@@ -111,7 +112,8 @@ def read_surroundings(inputs: FigureInputs) -> Surroundings:
     reach = np.array(REACH) * float(np.linalg.norm(high - low))
     scene, box = open_cloud(inputs.scene), box_around(low - reach, high + reach, level.inverse())
     clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
-    before, after = (_inside(cloud.transformed(level), low - reach, high + reach) for cloud in clouds)
+    level_clouds = (cloud.transformed(level) for cloud in clouds)
+    before, after = (cloud[within(cloud.points, low - reach, high + reach, margin=0.0)] for cloud in level_clouds)
     if not len(before):
         raise StageError(
             f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
@@ -164,20 +166,13 @@ def _decision(report: dict[str, Any], scores: dict[str, dict[str, Any]]) -> str:
     reason = find(fields, "reason")
     if parts[0] != "registered" and reason:
         parts.append(str(reason))
-    for label, keys in (
-        ("scale", ("scale",)),
-        ("F-score", ("f_score",)),
-        ("fitness", ("registration.fitness",)),
-        ("inlier RMSE / diagonal", ("registration.inlier_rmse_over_diagonal",)),
-        ("normal consistency", ("registration.normal_consistency",)),
-        ("margin", ("margin",)),
-    ):
-        found = find(fields, *keys)
-        if isinstance(found, (int, float)):
-            parts.append(f"{label} {number(found)}")
-    return ", ".join(parts)
-
-
-def _inside(cloud: Cloud, low: Array, high: Array) -> Cloud:
-    """The points within an axis-aligned box."""
-    return cloud[np.all((cloud.points >= low) & (cloud.points <= high), axis=1)]
+    names = {
+        "scale": "scale",
+        "F-score": "f_score",
+        "fitness": "registration.fitness",
+        "inlier RMSE / diagonal": "registration.inlier_rmse_over_diagonal",
+        "normal consistency": "registration.normal_consistency",
+        "margin": "margin",
+    }
+    found = {label: find(fields, key) for label, key in names.items()}
+    return ", ".join([*parts, *(f"{k} {number(v)}" for k, v in found.items() if isinstance(v, (int, float)))])

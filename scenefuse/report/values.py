@@ -32,12 +32,23 @@ def load(path: Path) -> Fields:
 
 def find(fields: Fields, *names: str) -> Any:
     """The value of the first of `names` that is there: by full name, else by the last part of a name; else None."""
+    found = _field(fields, names)
+    return None if found is None else found["value"]
+
+
+def unit_of(fields: Fields, *names: str) -> str | None:
+    """The unit of what `find` finds; None when there is nothing."""
+    found = _field(fields, names)
+    return None if found is None else str(found["unit"])
+
+
+def _field(fields: Fields, names: tuple[str, ...]) -> dict[str, Any] | None:
     for name in names:
         if name in fields:
-            return fields[name]["value"]
+            return fields[name]
         for key, item in fields.items():
             if "." not in name and key.rsplit(".", 1)[-1] == name:
-                return item["value"]
+                return item
     return None
 
 
@@ -52,12 +63,3 @@ def number(item: Any) -> str:
             return "-"
         return f"{item:.4g}" if abs(item) < 1e4 else f"{item:.0f}"
     return "-" if item is None or item == "" else str(item)
-
-
-def unit_of(fields: Fields, *names: str) -> str | None:
-    """The unit of what `find` finds; None when there is nothing."""
-    for name in names:
-        for key, item in fields.items():
-            if key == name or ("." not in name and key.rsplit(".", 1)[-1] == name):
-                return str(item["unit"])
-    return None

@@ -23,8 +23,8 @@ def view_scene(*, dense: Path, completed: Path, completed_json: Path, georeferen
     Args:
         dense: the scene's cloud.
         completed: the scene with its objects, in the same frame.
-        completed_json: says what the numbers of the field `source` mean, and how many points are the scene's.
-        georeference_json: says the unit of the scene's lengths.
+        completed_json: holds the meaning of the field `source`, and the number of the scene's points.
+        georeference_json: holds the unit of the scene's lengths.
         folder: where both files are written.
 
     Raises:
@@ -57,7 +57,7 @@ def _objects(completed: TiledCloud, scene_points: int) -> list[tuple[Array, Arra
 
 
 def _read(cloud: TiledCloud, every: int, boxes: list[tuple[Array, Array]]) -> Cloud:
-    """One in so many points of a cloud, and all in some boxes and of objects."""
+    """One in `every` points of a cloud, and all in some boxes and of objects."""
     found = []
     for _, part in cloud.parts():
         chosen = _evenly(part.points, every) | (part.fields.get("source", np.zeros(len(part))) != 0)
@@ -68,7 +68,7 @@ def _read(cloud: TiledCloud, every: int, boxes: list[tuple[Array, Array]]) -> Cl
 
 
 def _evenly(points: Array, every: int) -> NDArray[np.bool_]:
-    """(N,) one in so many points, by a hash of where they are: the same ones before and after."""
+    """(N,) one in `every` points, by a hash of their positions: the same ones before and after."""
     bits = np.ascontiguousarray(points).view(np.uint64)
     mixed = (bits * np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], np.uint64)).sum(1)
     return np.asarray((mixed >> np.uint64(33)) % np.uint64(every) == 0)
