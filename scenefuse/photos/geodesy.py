@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 # Of positions spread evenly, none is farther from the middle than twice the median distance. Only wild ones are farther
 # than this many.
-FAR = 10.0
+MAX_MEDIAN_DISTANCES = 10.0
 
 
 @dataclass(frozen=True)
@@ -116,9 +116,9 @@ def local_frame(positions: Array) -> LocalFrame:
 
 
 def _middle(values: Array) -> float:
-    """Mean of the values that are no farther from the median than `FAR` times the median distance."""
+    """Mean of the values that are no farther from the median than `MAX_MEDIAN_DISTANCES` times the median distance."""
     distance = np.abs(values - np.median(values))
-    return float(values[distance <= FAR * np.median(distance)].mean())
+    return float(values[distance <= MAX_MEDIAN_DISTANCES * np.median(distance)].mean())
 
 
 @dataclass(frozen=True)

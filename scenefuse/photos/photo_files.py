@@ -3,14 +3,14 @@ workflow lists them often."""
 
 import os
 from collections import Counter
-from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 
 from scenefuse.core.stage import StageError
 
 # Positions of the photos beside it, as OpenDroneMap names the file.
 GEO_FILE = "geo.txt"
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp"}
+SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp")
 VIDEO_SUFFIXES = {".mp4", ".mov", ".avi", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts"}
 # Photos all the same, but in formats that not every stage can decode.
 UNREADABLE = frozenset(
@@ -88,11 +88,35 @@ def mask_files(folder: Path) -> dict[str, Path]:
     return files
 
 
-def find_photo(name: str, files: Iterable[Path], folder: Path) -> Path:
-    """The photo of that name, with or without its ending and wherever it lay; where there is none, what it would be."""
-    wanted = Path(name.replace("\\", "/")).name
-    exact = [file for file in files if file.name == wanted]
-    return (exact or [file for file in files if file.stem == wanted] or [folder / wanted])[0]
+class PhotosByName:
+    """Photos by the names that other programs give them.
+
+    Args:
+        folder: of the photos.
+        beside: folder that names may be relative to, which is looked at first.
+    """
+
+    def __init__(self, folder: Path, beside: Path | None = None) -> None:
+        self.folder, self.places = folder, [folder] if beside is None else [beside, folder]
+
+    def at(self, name: str) -> Path | None:
+        """The file of that path, or of a frame's name, with or without its ending; None where there is none."""
+        paths = [place / called for place in self.places for called in (name, frame_name(name))]
+        endings = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
+        named = (Path(os.path.abspath(path.with_name(path.name + ending))) for path in paths for ending in endings)
+        return next((file for file in named if file.is_file()), None)
+
+    def find(self, name: str) -> Path:
+        """The same, or else the photo in the folder that has the name's last part; without any, what it would be."""
+        name = name.replace("\\", "/")
+        found, wanted = self.at(name), Path(name).name
+        alike = [file for file in self._files if file.name == wanted] if found is None else [found]
+        alike = alike or [file for file in self._files if file.stem == wanted]
+        return (alike or [Path(os.path.abspath(self.places[0] / name))])[0]
+
+    @cached_property
+    def _files(self) -> list[Path]:
+        return photo_files(self.folder) if self.folder.is_dir() else []
 
 
 def in_folders(names: list[str]) -> str:
@@ -121,6 +145,17 @@ def upright_size(path: Path) -> tuple[int, int]:
             return (height, width) if turned else (width, height)
     except (OSError, ValueError, Image.DecompressionBombError) as error:
         raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
+
+
+def stored_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo as it is stored; errors as of `upright_size`."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as picture:
+            return picture.size
+    except OSError:
+        raise StageError(f"{path} is not a readable picture; export it again") from None
 
 
 def frame_name(photo: str) -> str:

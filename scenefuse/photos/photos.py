@@ -17,8 +17,8 @@ from scenefuse.photos.photo_files import GEO_FILE, in_folders, photo_files
 from scenefuse.photos.positions import positions_of, read_geo, rtk_accuracy
 
 # Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
-MOST_PIXELS = 250_000_000
-Image.MAX_IMAGE_PIXELS = MOST_PIXELS
+MAX_PIXELS = 250_000_000
+Image.MAX_IMAGE_PIXELS = MAX_PIXELS
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
 # Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.

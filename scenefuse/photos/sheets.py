@@ -17,7 +17,7 @@ from scenefuse.core.stage import atomic_file
 Image = NDArray[np.uint8]
 
 _DPI = 100
-_LARGEST_BYTES = 950_000
+_MAX_BYTES = 950_000
 
 
 @dataclass(frozen=True)
@@ -119,9 +119,9 @@ def save_png(path: Path, image: Image) -> None:
     """Write a PNG below 1 MB: full colour if that fits, else 256 colours, else smaller."""
     picture = Picture.fromarray(image)
     data = _encode(picture)
-    if len(data) > _LARGEST_BYTES:
+    if len(data) > _MAX_BYTES:
         data = _encode(picture.quantize(256, dither=Picture.Dither.NONE))
-    while len(data) > _LARGEST_BYTES:
+    while len(data) > _MAX_BYTES:
         picture = picture.resize((picture.width * 9 // 10, picture.height * 9 // 10), Picture.Resampling.LANCZOS)
         data = _encode(picture.quantize(256, dither=Picture.Dither.NONE))
     with atomic_file(path) as temporary:

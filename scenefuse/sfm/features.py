@@ -9,7 +9,8 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.stage import StageError, atomic_file, setting, threads
-from scenefuse.photos.photos import SHAPE_TOLERANCE, Photo, check_unchanged, read_photos
+from scenefuse.photos.cameras.posed_photo import at_size
+from scenefuse.photos.photos import Photo, check_unchanged, read_photos
 from scenefuse.sfm.interrupt import cancellable
 
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
@@ -144,13 +145,7 @@ def _reader_options(
     """The camera that photos like this one begin with: the known one at their size, or a guess by EXIF."""
     if known is None:
         return pycolmap.ImageReaderOptions(camera_model=settings.camera_model)
-    if abs(known.width * photo.height / (known.height * photo.width) - 1) > SHAPE_TOLERANCE:
-        raise StageError(
-            f"the calibration is of photos of {known.width} x {known.height} pixels, but {photo.name} has"
-            f" {photo.width} x {photo.height}; give the calibration of these photos, upright as they are used"
-        )
-    camera = pycolmap.Camera(known.todict())
-    camera.rescale(photo.width, photo.height)
+    camera = at_size(known, (photo.width, photo.height), f"{photo.name}, upright as it is used,")
     numbers = ",".join(repr(float(number)) for number in camera.params)
     return pycolmap.ImageReaderOptions(camera_model=camera.model_name, camera_params=numbers)
 

@@ -9,24 +9,13 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.stage import StageError, scratch_directory
-from scenefuse.photos.cameras.bundler import read_bundler
-from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
-from scenefuse.photos.cameras.opensfm import find_opensfm, opensfm_place, read_opensfm
-from scenefuse.photos.cameras.place import Place
-from scenefuse.photos.cameras.upright import possible_turns
-from scenefuse.photos.photo_files import BUNDLER, frame_name
-from scenefuse.photos.photos import SHAPE_TOLERANCE
-from scenefuse.photos.posed_photos import PosedPhoto, find_posed_photos
+from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size, possible_turns
+from scenefuse.photos.cameras.read_cameras import read_posed_photos
+from scenefuse.photos.photo_files import frame_name
 from scenefuse.sfm.interrupt import cancellable
 
 # Cameras that fit their photos give each photo so many points at least, in the median.
 MIN_POINTS = 20
-# Parameters of lenses that differ by less, relatively, are of one camera.
-SAME_LENS = 1e-6
-METASHAPE = "in Metashape, export the cameras as Agisoft XML (File, Export, Export Cameras)"
-REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) with the list of photos"
-# What to do about files of other programs that hold cameras in a form that is not read.
-EXPORTS = {".psx": METASHAPE, ".psz": METASHAPE, ".csv": REALITY, ".rcproj": REALITY}
 
 
 def triangulated(
@@ -53,7 +42,7 @@ def triangulated(
         StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
             camera in the database but not here; cameras that do not fit the photos.
     """
-    given = read_given(cameras, folder)
+    given, _ = read_posed_photos(cameras, folder)
     with pycolmap.Database.open(database) as opened:
         own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         sizes = {image.name: own[image.camera_id] for image in opened.read_all_images()}
@@ -102,7 +91,9 @@ def _model(
                 if photo is not None:
                     own = opened.read_camera(image.camera_id)
                     _check_same(shared.setdefault(image.camera_id, photo), photo, cameras)
-                    opened.update_camera(_fitted(photo, own, cameras))
+                    camera = at_size(photo.camera, (own.width, own.height), f"{cameras}: the photo {image.name}")
+                    camera.camera_id, camera.has_prior_focal_length = own.camera_id, True
+                    opened.update_camera(camera)
             cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions())
         model = pycolmap.Reconstruction()
         model.load(cache)
@@ -115,32 +106,6 @@ def _model(
                 model.register_frame(frame.frame_id)
         (scratch / "points").mkdir()
         return cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
-
-
-def read_given(cameras: Path, folder: Path) -> list[PosedPhoto]:
-    """The posed photos of any format that is read."""
-    if not cameras.exists():
-        raise StageError(f"the cameras {cameras} do not exist; correct the path")
-    ending = cameras.suffix.lower()
-    if ending in EXPORTS:
-        raise StageError(f"{cameras} is not read; {EXPORTS[ending]}")
-    if ending == ".xml":
-        return read_metashape(cameras, folder)
-    if cameras.suffix == BUNDLER:
-        return read_bundler(cameras, folder)
-    file = find_opensfm(cameras)
-    if file is not None:
-        return read_opensfm(file, folder)
-    has_json = cameras.is_file() or any((cameras / f"transforms{end}.json").is_file() for end in ("", "_train"))
-    return find_posed_photos(cameras, None if has_json else folder)[0]
-
-
-def place_of(cameras: Path) -> Place | None:
-    """Where the cameras that `read_given` gives lie on the earth; None where their project does not say."""
-    if cameras.suffix.lower() == ".xml":
-        return metashape_place(cameras)
-    file = find_opensfm(cameras)
-    return None if file is None else opensfm_place(file)
 
 
 def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> dict[str, PosedPhoto]:
@@ -172,21 +137,8 @@ def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> di
 def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:
     """StageError where photos of one camera in the database have two lenses here."""
     a, b = first.camera, photo.camera
-    if a.model != b.model or not np.allclose(a.params, b.params, rtol=SAME_LENS):
+    if a.model != b.model or not np.allclose(a.params, b.params):
         raise StageError(
             f"{cameras}: {first.file.name} and {photo.file.name} have different lenses, but count as photos of one"
             " camera; set features.camera_mode to per_photo"
         )
-
-
-def _fitted(photo: PosedPhoto, own: pycolmap.Camera, cameras: Path) -> pycolmap.Camera:
-    """A given camera at the size of the photos, with the id of the database's."""
-    camera = pycolmap.Camera(photo.camera.todict())
-    if abs(camera.width / camera.height * own.height / own.width - 1) > SHAPE_TOLERANCE:
-        raise StageError(
-            f"{cameras}: the camera of {photo.file.name} has {camera.width} x {camera.height} pixels, but the photo"
-            f" {own.width} x {own.height}; give the photos that the cameras were computed for"
-        )
-    camera.rescale(own.width, own.height)
-    camera.camera_id, camera.has_prior_focal_length = own.camera_id, True
-    return camera

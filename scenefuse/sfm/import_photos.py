@@ -13,10 +13,12 @@ from scipy import ndimage
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.photos.photo_files import mask_files
+from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
+from scenefuse.photos.cameras.read_cameras import read_posed_photos
+from scenefuse.photos.cameras.transforms import PERSPECTIVE
+from scenefuse.photos.photo_files import SUFFIXES, mask_files, stored_size
 from scenefuse.photos.photos import JPEG_QUALITY, SHAPE_TOLERANCE
 from scenefuse.photos.pictures import matte_of, write_picture
-from scenefuse.photos.posed_photos import PERSPECTIVE, PosedPhoto, find_posed_photos, photo_size
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
@@ -44,8 +46,8 @@ def import_photos(
     is kept as it is (0 to 255), other masks become 0 or 255. Photos without a mask are left out.
 
     Args:
-        data: folder or file with the cameras; see `find_posed_photos`.
-        images: folder of a COLMAP model's photos; None for `data`/images.
+        data: folder or file with the cameras; see `read_posed_photos`.
+        images: folder of the photos; None for images/ beside the cameras, or where a JSON says.
         masks: folder of masks named like the photos; None to look elsewhere.
         workspace: output, with images/, sparse/ (PINHOLE, no points), and held_out.txt where the data say which photos
             are held out.
@@ -58,7 +60,7 @@ def import_photos(
     """
     if masks is not None and not masks.is_dir():
         raise StageError(f"--masks {masks} is no folder; give the folder of the masks")
-    photos, kind = find_posed_photos(data, images)
+    photos, kind = _photos_with_cameras(data, images)
     files = {} if masks is None else mask_files(masks)
     exact = masks is None and not any(photo.mask for photo in photos)
     lenses = _lenses(photos, settings)
@@ -87,6 +89,27 @@ def import_photos(
     }
     write_json(report, origin | _described(photos, lenses, kept))
     print(f"{len(kept)} of {len(photos)} photos ({kind}) have a mask, masks from {source}", flush=True)
+
+
+def _photos_with_cameras(data: Path, images: Path | None) -> tuple[list[PosedPhoto], str]:
+    """The photos, which are all there and called differently, and the name of the program."""
+    photos, kind = read_posed_photos(data, images or (data if data.is_dir() else data.parent) / "images")
+    if not photos:
+        raise StageError(f"{data} holds no photo with a camera; reconstruct the photos first")
+    missing = [photo.file for photo in photos if not photo.file.is_file()]
+    if missing:
+        raise StageError(
+            f"{len(missing)} of {len(photos)} photos of {data} are missing, {missing[0]} for one; give their folder"
+            " with --images"
+        )
+    # Metashape names photos without their ending.
+    whole = {photo.name: Path(photo.name).suffix.lower() in SUFFIXES for photo in photos}
+    photos = [p if whole[p.name] else replace(p, name=p.name + p.file.suffix) for p in photos]
+    stems = [Path(photo.name).stem for photo in photos]
+    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+    if twice is not None:
+        raise StageError(f"two photos of {data} are both called {twice}; rename one")
+    return photos, kind
 
 
 def _write_photo(
@@ -164,14 +187,7 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
     options = pycolmap.UndistortCameraOptions(max_image_size=settings.max_size_px)
     pairs = []
     for photo in photos:
-        width, height = photo_size(photo.file)
-        camera = pycolmap.Camera(photo.camera.todict())
-        if abs(camera.width / camera.height * height / width - 1) > SHAPE_TOLERANCE:
-            raise StageError(
-                f"{photo.file} has {width} x {height} pixels, but its camera {camera.width} x {camera.height}; give"
-                " the photos that the cameras were computed for, or smaller copies"
-            )
-        camera.rescale(width, height)
+        camera = at_size(photo.camera, stored_size(photo.file), str(photo.file))
         target = camera if _straight(camera) else pycolmap.undistort_camera(options, camera)
         cam_from_object: Array = np.array(np.linalg.inv(photo.object_from_cam), dtype=np.float64)
         intrinsics: Array = np.array(target.calibration_matrix(), dtype=np.float64)

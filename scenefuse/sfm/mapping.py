@@ -23,30 +23,27 @@ from scenefuse.core.stage import (
     write_json,
 )
 from scenefuse.marks.lengths import read_lengths
+from scenefuse.photos.cameras.read_cameras import place_of
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photos import orientations_in, read_photos
 from scenefuse.sfm.adjustment import (
     ITERATIONS,
     MAX_REPROJECTION_ERROR_PX,
+    MIN_PHOTOS,
     ROUGH_TOLERANCE,
     TOLERANCE,
     adjust,
     drop_outliers,
 )
 from scenefuse.sfm.explained import STRONG_PAIR, doubtful_photos, explained_matches
-from scenefuse.sfm.given_cameras import place_of, triangulated
+from scenefuse.sfm.given_cameras import triangulated
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
-from scenefuse.sfm.matches import MIN_INLIERS
 
-# Fewest matches of the first pair of photos; COLMAP's own.
-INIT_MIN_INLIERS = 100
 # A second mapping that explains this share of the matches that the first explains is the better one: less is chance.
-AS_MANY = 0.999
+MIN_EXPLAINED_AGAIN = 0.999
 # Mappings are tried with so many seeds while photos seem to stand in wrong places.
 ATTEMPTS = 3
-# The smallest model that has a shape.
-MIN_PHOTOS = 3
 
 
 @dataclass(frozen=True)
@@ -175,7 +172,7 @@ def _attempt(
     if choice.lens not in (HELD, KNOWN):
         again = _mapped_again(model, database, folder, sparse, _mapper_options(len(names), True, seed, least_matches))
         second = choice.lens.fit(again[0], TOLERANCE) if again else None
-        if second is not None and _explained(second, database) >= AS_MANY * _explained(model, database):
+        if second is not None and _explained(second, database) >= MIN_EXPLAINED_AGAIN * _explained(model, database):
             ranked, model, mappings = again, second, 2
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(choice, model)
@@ -213,9 +210,10 @@ def _mapped_first(
     strong = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed, STRONG_PAIR))
     if strong and strong[0].num_reg_images() == len(names):
         return strong, STRONG_PAIR
-    every = _models(database, folder, sparse, _mapper_options(len(names), calibrated, seed))
+    options = _mapper_options(len(names), calibrated, seed)
+    every = _models(database, folder, sparse, options)
     if every and (not strong or _explained(every[0], database) > _explained(strong[0], database)):
-        return every, MIN_INLIERS
+        return every, options.min_num_matches
     return strong, STRONG_PAIR
 
 
@@ -305,17 +303,16 @@ def _describe(model: pycolmap.Reconstruction, names: list[str]) -> dict[str, Any
 
 
 def _mapper_options(
-    photos: int, calibrated: bool, seed: int, least_matches: int = MIN_INLIERS
+    photos: int, calibrated: bool, seed: int, least_matches: int | None = None
 ) -> pycolmap.IncrementalPipelineOptions:
     options = pycolmap.IncrementalPipelineOptions()
-    options.min_num_matches = least_matches
+    options.min_num_matches = least_matches or options.min_num_matches
     options.ba_refine_focal_length = options.ba_refine_extra_params = not calibrated
     options.num_threads = threads()
     options.random_seed = seed
     options.mapper.random_seed = seed
     options.triangulation.random_seed = seed
     options.ba_global_max_num_iterations = ITERATIONS
-    options.mapper.init_min_num_inliers = INIT_MIN_INLIERS
     options.mapper.filter_max_reproj_error = MAX_REPROJECTION_ERROR_PX
     options.min_model_size = MIN_PHOTOS
     if calibrated:

@@ -16,11 +16,10 @@ from support.surveyed import FOCAL, HEIGHT, WIDTH, fly
 
 from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.georef.georeference import camera_poses
-from scenefuse.photos.cameras.upright import stood_upright
+from scenefuse.photos.cameras.posed_photo import PosedPhoto, stood_upright
+from scenefuse.photos.cameras.read_cameras import place_of, read_posed_photos
 from scenefuse.photos.photos import write_photos
-from scenefuse.photos.posed_photos import PosedPhoto
 from scenefuse.photos.workspace import View, write_model
-from scenefuse.sfm.given_cameras import place_of, read_given
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 
 FLIGHT = fly(rows=3, columns=3)
@@ -248,7 +247,7 @@ def test_wrong_cameras_are_named(tmp_path):
         mapped(tmp_path, tmp_path / "none")
     (tmp_path / "project.psx").touch()
     with pytest.raises(StageError, match=r"project\.psx is not read; in Metashape, export the cameras as Agisoft XML"):
-        read_given(tmp_path / "project.psx", tmp_path / "photos")
+        read_posed_photos(tmp_path / "project.psx", tmp_path / "photos")
     path = nerfstudio(tmp_path)
     content = json.loads(path.read_text())
     for frame, other in zip(content["frames"], json.loads(path.read_text())["frames"][::-1]):
@@ -258,10 +257,10 @@ def test_wrong_cameras_are_named(tmp_path):
         mapped(tmp_path, path)
     opensfm(tmp_path, "fisheye")
     with pytest.raises(StageError, match="of the kind fisheye"):
-        read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+        read_posed_photos(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
     (tmp_path / "opensfm/reconstruction.json").write_text("{}")
     with pytest.raises(StageError, match="no reconstruction of OpenSfM"):
-        read_given(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
+        read_posed_photos(tmp_path / "opensfm/reconstruction.json", tmp_path / "photos")
 
 
 def test_cameras_of_metashape_lie_where_a_chunk_in_local_coordinates_was_placed(tmp_path):
@@ -272,7 +271,7 @@ def test_cameras_of_metashape_lie_where_a_chunk_in_local_coordinates_was_placed(
     for view in FLIGHT.views:
         cv2.imwrite(str(tmp_path / "photos" / view.name), np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     for reference in ("", "<reference>LOCAL_CS[&quot;Local Coordinates (m)&quot;]</reference>"):
-        found = read_given(metashape(tmp_path, placed=reference + placed), tmp_path / "photos")
+        found, _ = read_posed_photos(metashape(tmp_path, placed=reference + placed), tmp_path / "photos")
         for photo, view in zip(found, FLIGHT.views, strict=True):
             pose = view.world_from_cam
             np.testing.assert_allclose(photo.object_from_cam[:3, 3], 2.5 * turn @ pose[:3, 3] + [1, 2, 3], atol=1e-9)
@@ -326,7 +325,8 @@ def test_of_a_chunk_of_metashape_the_active_component_is_taken(tmp_path):
     text = path.read_text().replace('<camera id="0" ', '<camera id="0" component_id="1" ')
     path.write_text(text.replace('<camera id="1" ', '<camera id="1" enabled="false" '))
     assert place_of(path).earth_from_model.scale == 3
-    assert [photo.name for photo in read_given(path, tmp_path / "photos")] == [n[:-4] for n in FLIGHT.names[2:]]
+    found, _ = read_posed_photos(path, tmp_path / "photos")
+    assert [photo.name for photo in found] == [n[:-4] for n in FLIGHT.names[2:]]
 
 
 def test_where_a_chunk_of_metashape_lies_has_to_be_known(tmp_path):
@@ -334,7 +334,7 @@ def test_where_a_chunk_of_metashape_lies_has_to_be_known(tmp_path):
     for view in FLIGHT.views:
         (tmp_path / "photos" / view.name).write_bytes(b"")
     with pytest.raises(StageError, match="lies on the earth, but names no CRS"):
-        read_given(metashape(tmp_path, placed=PLACED), tmp_path / "photos")
+        read_posed_photos(metashape(tmp_path, placed=PLACED), tmp_path / "photos")
     turned = "<transform><rotation>0 1 0 -1 0 0 0 0 1</rotation></transform>"
     assert place_of(metashape(tmp_path, placed=EARTH.split("<transform>")[0] + turned)) is None
     for code, message in ((2263, "does not count in metres"), (27572, "degrees from Greenwich")):
@@ -342,7 +342,7 @@ def test_where_a_chunk_of_metashape_lies_has_to_be_known(tmp_path):
         with pytest.raises(StageError, match=message):
             place_of(metashape(tmp_path, placed=f"<reference>{wkt}</reference>{PLACED}"))
     with pytest.raises(StageError, match="the scale of its transform is 0"):
-        read_given(metashape(tmp_path, placed="<transform><scale>0</scale></transform>"), tmp_path / "photos")
+        read_posed_photos(metashape(tmp_path, placed="<transform><scale>0</scale></transform>"), tmp_path / "photos")
 
 
 def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):
@@ -354,7 +354,7 @@ def test_a_lens_of_metashape_projects_as_its_manual_says(tmp_path):
     x, y = rays.T
     r2 = x**2 + y**2
     for lens, most in ((exact, 1e-6), (exact | {"k4": -0.07, "b2": -0.3}, 0.3)):
-        camera = read_given(metashape(tmp_path, lens), tmp_path / "photos")[0].camera
+        camera = read_posed_photos(metashape(tmp_path, lens), tmp_path / "photos")[0][0].camera
         radial = 1 - 0.09 * r2 - 0.07 * r2**2 + 0.1 * r2**3 + lens.get("k4", 0) * r2**4
         u = x * radial + 3e-3 * (r2 + 2 * x**2) - 2 * 1e-3 * x * y
         v = y * radial - 1e-3 * (r2 + 2 * y**2) + 2 * 3e-3 * x * y
@@ -369,16 +369,16 @@ def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
     path = bundler(tmp_path)
     (tmp_path / "list.txt").write_text("a.jpg\n")
     with pytest.raises(StageError, match="10 cameras, its list names 1 photos"):
-        read_given(path, photos)
+        read_posed_photos(path, photos)
     (tmp_path / "list.txt").unlink()
     with pytest.raises(StageError, match=r"put it beside it as list\.txt"):
-        read_given(path, photos)
+        read_posed_photos(path, photos)
     (tmp_path / "list.txt").write_text("a.jpg\n" * 10)
     path.write_text("# Bundle file v0.3\n2 0\n500 0 0\n1 0\n")
     with pytest.raises(StageError, match="no file of Bundler"):
-        read_given(path, photos)
+        read_posed_photos(path, photos)
     with pytest.raises(StageError, match=r"COLMAP's full OpenCV lens is up to .* px off"):
-        read_given(metashape(tmp_path, LENS | {"b2": -40.0}), photos)
+        read_posed_photos(metashape(tmp_path, LENS | {"b2": -40.0}), photos)
     path = metashape(tmp_path)
     for text, message in (
         (path.read_text().replace('sensor id="0" type="frame"', 'sensor id="0" type="spherical"'), "kind spherical"),
@@ -388,4 +388,4 @@ def test_wrong_files_of_metashape_and_bundler_are_named(tmp_path):
     ):
         path.write_text(text)
         with pytest.raises(StageError, match=message):
-            read_given(path, photos)
+            read_posed_photos(path, photos)

@@ -284,8 +284,9 @@ def shrink(file, size):
         (lambda root: (root / "transforms.json").unlink(), "no cameras in a known format"),
         (lambda root: (root / "transforms.json").write_text("{"), "no readable JSON"),
         (lambda root: (root / "transforms.json").write_text("[]"), "no list of frames"),
-        (lambda root: (root / "images/02.png").unlink(), r"frame 2 .*02.png does not exist"),
+        (lambda root: (root / "images/02.png").unlink(), "1 of 5 photos .*images/02.png for one"),
         (lambda root: (root / "images/02.png").write_text("no picture"), "02.png is not a readable picture"),
+        (lambda root: (root / "masks/02.png").unlink(), r"frame 2 .*its mask masks/02.png does not exist"),
         (lambda root: (root / "masks/02.png").write_text("no picture"), "the mask .*02.png is not a readable picture"),
         (edit(camera_model="OPENCV_FISHEYE"), "camera model OPENCV_FISHEYE is not read; undistort"),
         (edit(frame_camera_model="EQUIRECTANGULAR"), r"frame 0 .*EQUIRECTANGULAR is not read"),
@@ -425,8 +426,7 @@ def test_a_nerf_without_a_cloud_ends_with_three_and_the_reason(tmp_path, quick):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"data": Path("nowhere")}, "does not exist; give a folder with sparse/"),
-        ({"images": Path("images")}, "goes with a COLMAP model"),
+        ({"data": Path("nowhere")}, "the cameras nowhere do not exist"),
         ({"out": Path("file.txt")}, "is a file"),
         ({"masks": Path("none")}, "--masks none is no folder"),
         ({"config": Path("typo.yaml")}, "unknown key 'levls'; did you mean 'levels'"),

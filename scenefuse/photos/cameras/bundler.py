@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from PIL import Image
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
-from scenefuse.photos.photo_files import bundler_list, find_photo, photo_files
-from scenefuse.photos.posed_photos import PosedPhoto
+from scenefuse.photos.cameras.posed_photo import PosedPhoto
+from scenefuse.photos.photo_files import PhotosByName, bundler_list, stored_size
 
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
@@ -32,14 +31,13 @@ def read_bundler(file: Path, folder: Path) -> list[PosedPhoto]:
         StageError: there is no list, it is shorter than the cameras, or one of the files is not well formed.
     """
     names = [FOCAL.sub("", line.strip()) for _, line in read_lines(_list(file))]
-    files, found, cameras = photo_files(folder), [], _cameras(file)
+    by_name, found, cameras = PhotosByName(folder), [], _cameras(file)
     if len(names) < len(cameras):
         raise StageError(f"{file} has {len(cameras)} cameras, its list names {len(names)} photos; export both again")
     for name, (lens, turn, shift) in zip(names, cameras):
-        photo = find_photo(name, files, folder)
+        photo = by_name.find(name)
         if lens[0] > 0 and photo.is_file():
-            with Image.open(photo) as opened:
-                width, height = opened.size
+            width, height = stored_size(photo)
             params = [lens[0], width / 2, height / 2, lens[1], lens[2]]
             camera = pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
             pose = np.eye(4)

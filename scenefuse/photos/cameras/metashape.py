@@ -12,17 +12,17 @@ from scenefuse.cloud.crs import usable
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.photo_files import find_photo, photo_files
-from scenefuse.photos.posed_photos import PosedPhoto
+from scenefuse.photos.cameras.posed_photo import PosedPhoto
+from scenefuse.photos.photo_files import PhotosByName
 
 # Parameters of its lens; those that are zero are left out of the file.
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 # COLMAP's fullest lens has neither a fourth radial coefficient nor skew: one that is as good as this takes their place.
-MOST_OFF_PX = 0.5
+MAX_OFF_PX = 0.5
 # How the CRS of a chunk that does not lie on the earth begins.
 LOCAL = "LOCAL_CS"
 # The earth's radius, and how far a place near its surface may be from that: it is flattened by 21 km.
-EARTH_M, NEAR_M = 6.371e6, 40e3
+EARTH_M, MAX_ALTITUDE_M = 6.371e6, 40e3
 # Rays that it is fitted to, in each direction over the photo.
 GRID = 33
 
@@ -42,7 +42,7 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
         if chunk is None:
             raise ValueError("it has no chunk")
         sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
-        files, lenses, found, moved = photo_files(folder), {}, [], _local_from_chunk(chunk, str(file))
+        by_name, lenses, found, moved = PhotosByName(folder), {}, [], _local_from_chunk(chunk, str(file))
         for camera in _cameras_of(chunk):
             placed, number = camera.find("transform"), camera.attrib["sensor_id"]
             if placed is None or not placed.text:
@@ -53,7 +53,7 @@ def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
             pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
             if moved is not None:
                 pose[:3, :3], pose[:3, 3] = moved.rotation @ pose[:3, :3], moved.apply(pose[:3, 3])
-            found.append(PosedPhoto(label, find_photo(label, files, folder), lenses[number], pose, None, False))
+            found.append(PosedPhoto(label, by_name.find(label), lenses[number], pose, None, False))
     except (OSError, ET.ParseError, KeyError, ValueError) as error:
         raise StageError(f"{file} holds no cameras of Metashape ({error!r}); export them as Agisoft XML") from None
     return found
@@ -101,7 +101,7 @@ def _active(chunk: ET.Element) -> str | None:
 
 def _on_earth(outside_from_chunk: Sim3) -> bool:
     """Whether a chunk's origin lies near the earth's surface, in geocentric coordinates."""
-    return abs(float(np.linalg.norm(outside_from_chunk.translation)) - EARTH_M) < NEAR_M
+    return abs(float(np.linalg.norm(outside_from_chunk.translation)) - EARTH_M) < MAX_ALTITUDE_M
 
 
 def _local_from_chunk(chunk: ET.Element, where: str) -> Sim3 | None:
@@ -184,7 +184,7 @@ def _fit(camera: pycolmap.Camera, lens: dict[str, float], where: str) -> None:
     found = least_squares(off, camera.params, x_scale="jac")
     camera.params = found.x.tolist()
     worst = float(np.linalg.norm(found.fun.reshape(-1, 2), axis=1).max())
-    if worst > MOST_OFF_PX:
+    if worst > MAX_OFF_PX:
         raise StageError(
             f"{where}: COLMAP's full OpenCV lens is up to {worst:.1f} px off this one; optimize the cameras in"
             " Metashape without b2, k4, p3 and p4, and export them again"

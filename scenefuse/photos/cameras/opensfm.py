@@ -13,8 +13,8 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.photo_files import COORDS
-from scenefuse.photos.posed_photos import PosedPhoto
+from scenefuse.photos.cameras.posed_photo import PosedPhoto
+from scenefuse.photos.photo_files import COORDS, PhotosByName
 
 FILE = "reconstruction.json"
 # Where an OpenDroneMap project has it.
@@ -46,9 +46,10 @@ def read_opensfm(file: Path, folder: Path) -> list[PosedPhoto]:
     try:
         parts = json.loads(file.read_text())
         largest = max(parts, key=lambda part: len(part["shots"]))
+        by_name = PhotosByName(folder)
         cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in largest["cameras"].items()}
         return [
-            PosedPhoto(name, folder / name, cameras[shot["camera"]], _pose(shot), None, False)
+            PosedPhoto(name, by_name.find(name), cameras[shot["camera"]], _pose(shot), None, False)
             for name, shot in sorted(largest["shots"].items())
         ]
     except (OSError, ValueError, KeyError, TypeError) as error:

@@ -1,15 +1,16 @@
-"""Cameras that another program found for photos as they are stored, turned along with the photos that EXIF says are
-rotated: here these stand upright."""
+"""A photo with the camera that another program found for it: at the photo's own size, and turned along with a photo
+that EXIF says is rotated, which stands upright here."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
 from scenefuse.photos.photos import SHAPE_TOLERANCE
-from scenefuse.photos.posed_photos import PosedPhoto
 
 QUARTERS = {6: 1, 3: 2, 8: 3}
 """EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored."""
@@ -19,6 +20,48 @@ EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
 """Parameters of a lens that a turn leaves as they are."""
 
 Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class PosedPhoto:
+    """One photo on disk and its camera.
+
+    Attributes:
+        name: what to call it, without folders; unique up to the ending.
+        file: the photo.
+        camera: COLMAP's model of its lens, for the photo's size or that of a larger or smaller original.
+        object_from_cam: (4, 4) float64 rigid pose, OpenCV axes.
+        mask: file of its mask where the format names one.
+        held_out: the format keeps it for measuring.
+    """
+
+    name: str
+    file: Path
+    camera: pycolmap.Camera
+    object_from_cam: NDArray[np.float64]
+    mask: Path | None
+    held_out: bool
+
+
+def at_size(camera: pycolmap.Camera, size: Size, where: str) -> pycolmap.Camera:
+    """A camera for copies of its photos of another size.
+
+    Raises:
+        StageError: the copies have another shape.
+    """
+    width, height = size
+    if not _same_shape(camera, size):
+        raise StageError(
+            f"{where} has {width} x {height} pixels, but its camera {camera.width} x {camera.height}; give the photos"
+            " that the camera was computed for, or copies scaled alike"
+        )
+    scaled = pycolmap.Camera(camera.todict())
+    scaled.rescale(width, height)
+    return scaled
+
+
+def _same_shape(camera: pycolmap.Camera, size: Size) -> bool:
+    return bool(abs(camera.width / camera.height * size[1] / size[0] - 1) <= SHAPE_TOLERANCE)
 
 
 def possible_turns(
@@ -40,9 +83,13 @@ def possible_turns(
     turned = {
         name: QUARTERS[o] for name, o in orientations.items() if o in QUARTERS and name in posed and name in sizes
     }
-    asked = {name: _shapes(posed[name], sizes[name]) for name, quarters in turned.items() if quarters % 2}
-    stored = [name for name, (upright, lying) in asked.items() if lying and not upright]
-    as_they_are = [name for name, (upright, lying) in asked.items() if upright and not lying]
+    shapes = {
+        name: (_same_shape(posed[name].camera, sizes[name]), _same_shape(posed[name].camera, sizes[name][::-1]))
+        for name, quarters in turned.items()
+        if quarters % 2
+    }
+    stored = [name for name, (upright, lying) in shapes.items() if lying and not upright]
+    as_they_are = [name for name, (upright, lying) in shapes.items() if upright and not lying]
     if not turned or (as_they_are and not stored):
         return [dict(posed)]
     other = dict(posed) | {
@@ -76,9 +123,3 @@ def stood_upright(photo: PosedPhoto, quarters: int) -> PosedPhoto:
         camera.params = [new[name] for name in names]
         photo = replace(photo, camera=camera, object_from_cam=photo.object_from_cam @ FROM_STORED.T)
     return photo
-
-
-def _shapes(photo: PosedPhoto, size: Size) -> tuple[bool, bool]:
-    """Whether a camera has the shape of a photo that stands, and of one that lies."""
-    ratio, wanted = photo.camera.width / photo.camera.height, size[0] / size[1]
-    return abs(ratio / wanted - 1) <= SHAPE_TOLERANCE, abs(ratio * wanted - 1) <= SHAPE_TOLERANCE
