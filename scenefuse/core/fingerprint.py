@@ -33,13 +33,13 @@ DISTRIBUTIONS = {
 }
 IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
 REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
-MOST_REMEMBERED = 5000
+MAX_REMEMBERED = 5000
 LIBRARY = Path(__file__).resolve().parents[1]
 # Files in the assets/ folder beside a module that imports this are part of its code.
 ASSETS_READER = "importlib.resources"
 OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered
 # A file of a user up to this size is read whole; of a larger one only size and date are looked at.
-LARGEST_READ_BYTES = 200_000
+MAX_READ_BYTES = 200_000
 
 
 class _Module(NamedTuple):
@@ -98,7 +98,7 @@ def _state(path: Path) -> str:
     if not path.is_file():
         return "no file"
     about = path.stat()
-    if about.st_size > LARGEST_READ_BYTES:
+    if about.st_size > MAX_READ_BYTES:
         return f"{about.st_size} {about.st_mtime_ns}"
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
@@ -143,7 +143,7 @@ def _remembered() -> dict[str, str]:
 def _remember(known: dict[str, str], before: int) -> None:
     if len(known) > before and REMEMBERED.is_absolute():
         with contextlib.suppress(OSError), atomic_file(REMEMBERED) as temporary:
-            temporary.write_text(json.dumps(dict(list(known.items())[-MOST_REMEMBERED:])))
+            temporary.write_text(json.dumps(dict(list(known.items())[-MAX_REMEMBERED:])))
 
 
 @functools.cache

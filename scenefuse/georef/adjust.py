@@ -8,20 +8,14 @@ import pycolmap
 
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click
+from scenefuse.georef.placement import ROBUST_SD
 from scenefuse.sfm.adjustment import Freedom, adjustment_options
 
-# In its standard deviations: error of a photo's position at which it loses half its weight (Cauchy).
-ROBUST_POSITION = 3.0
 # Relative gain that ends an adjustment.
-SURVEY_TOLERANCE = 1e-9
-# How far from its point, in metres, a camera stands that measures a coordinate; its aperture takes no depth in.
+TOLERANCE = 1e-9
+# How far from its point, in metres, a camera stands that measures a coordinate: its aperture takes no depth in. Also
+# the standard deviation of an unknown height.
 FAR_M = 1000.0
-# Focal length that counts a coordinate for nothing.
-BLIND = 1e-9
-# Error of the alignment that COLMAP is to find: none, see `_held`.
-EXACT_M = 1e-6
-# A standard deviation for what is unknown, in metres.
-UNKNOWN_M = 1e4
 # cam_from_world of cameras that look down (x east, y south) and north (x east, y down).
 DOWN = np.diag([1.0, -1.0, -1.0])
 NORTH = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -64,7 +58,7 @@ def adjust_to_survey(
     freedom: Freedom,
     photos: SurveyedPhotos,
     points: SurveyedPoints,
-    tolerance: float = SURVEY_TOLERANCE,
+    tolerance: float = TOLERANCE,
 ) -> None:
     """Adjust a model that lies in the local frame (metres) in place, by reprojection errors and by what was surveyed.
 
@@ -93,10 +87,10 @@ def adjust_to_survey(
         config.set_constant_cam_intrinsics(held.images[image].camera_id)
     priors += [_prior(held.images[i], held.images[i].projection_center(), np.ones(3)) for i in still]
     options = pycolmap.PosePriorBundleAdjustmentOptions()
-    options.alignment_ransac.max_error = EXACT_M
+    options.alignment_ransac.max_error = 1e-6  # none, see `_held`
     options.alignment_ransac.random_seed = 0
     options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    options.ceres.prior_position_loss_scale = ROBUST_POSITION
+    options.ceres.prior_position_loss_scale = ROBUST_SD
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(
         adjustment_options(freedom, tolerance), options, config, priors, held
     )
@@ -124,7 +118,8 @@ def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int)
     known = np.where(np.isfinite(place), place, points.start[row])
     still = [_add_camera(model, DOWN, known, (horizontal, horizontal))]
     if np.isfinite(place[2]):
-        still.append(_add_camera(model, NORTH, known, (BLIND, vertical)))
+        # Its focal length counts the horizontal coordinate for nothing.
+        still.append(_add_camera(model, NORTH, known, (1e-9, vertical)))
     for image in still:
         track.add_element(image, 0)
     model.add_point3D(points.start[row], track)
@@ -162,7 +157,7 @@ def _position_prior(model: pycolmap.Reconstruction, photos: SurveyedPhotos, row:
     image = model.find_image_with_name(photos.names[row])
     place, (horizontal, vertical) = photos.x_in_local[row], photos.sd_m[row]
     known = np.where(np.isfinite(place), place, image.projection_center())
-    up = vertical if np.isfinite(place[2]) else UNKNOWN_M
+    up = vertical if np.isfinite(place[2]) else FAR_M
     return _prior(image, known, np.array([horizontal, horizontal, up]))
 
 

@@ -19,9 +19,9 @@ from scenefuse.marks.triangulation import intersect, model_pixel
 from scenefuse.photos.photos import Photo
 
 # Fewest control points that fix a model.
-MIN_POINTS = 3
+MIN_CONTROL_POINTS = 3
 # Control points lie along one line if none is farther from it than this share of their extent.
-NARROW = 0.01
+MIN_WIDTH_SHARE = 0.01
 
 
 @dataclass(frozen=True)
@@ -67,10 +67,10 @@ def read_sighted(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]
     surveyed = read_control(path)
     sightings, notes = sight(surveyed, model, {p.name: (p.width, p.height) for p in photos})
     good = [s for s in sightings if not (s.problem or s.point.check) and np.isfinite(s.point.position).all()]
-    if len(good) < MIN_POINTS:
+    if len(good) < MIN_CONTROL_POINTS:
         reasons = "; ".join(f"{s.point.name}: {s.problem}" for s in sightings if s.problem and not s.point.check)
         raise StageError(
-            f"{path}: {len(good)} control points with a height can be used, {MIN_POINTS} are needed"
+            f"{path}: {len(good)} control points with a height can be used, {MIN_CONTROL_POINTS} are needed"
             f"{f' ({reasons})' if reasons else ''}; click more points, each in two photos or more"
         )
     return Control(path, grid_name(surveyed.crs), sightings, notes)
@@ -161,7 +161,7 @@ def check_spread(target: Array, names: list[str], where: str) -> None:
     """StageError where points (N, 3; metres) lie at one place or along one line."""
     centred = target - target.mean(0)
     extent = np.linalg.svd(centred, compute_uv=False)
-    if extent[1] <= NARROW * extent[0] or extent[0] == 0:
+    if extent[1] <= MIN_WIDTH_SHARE * extent[0] or extent[0] == 0:
         raise StageError(
             f"{where}: the control points {', '.join(names)} lie along one line, which leaves the model free to turn"
             " about it; add one beside the line"

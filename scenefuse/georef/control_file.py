@@ -21,9 +21,9 @@ CHECK = "CHK-"
 SD_M = (0.02, 0.03)
 # Coordinates, standard deviations, photo and pixel.
 Row = tuple[Array, tuple[float, float], str, Array]
-# Columns up to the photo's name.
-LEAST_CELLS = 6
+# Columns; those up to the photo's name are needed.
 LAYOUT = "x y z pixel_x pixel_y photo [name [horizontal sd [vertical sd]]]"
+MIN_CELLS = len(LAYOUT.partition(" [")[0].split())
 
 
 @dataclass(frozen=True)
@@ -86,14 +86,14 @@ def read_control(path: Path) -> ControlFile:
 
 def _cells(line: str) -> list[str]:
     """The columns of a line; between blanks, a photo's name that holds some ends where a photo's ending does."""
-    blank = len(line.split()) >= LEAST_CELLS and not line.split()[0].endswith((",", ";"))
+    blank = len(line.split()) >= MIN_CELLS and not line.split()[0].endswith((",", ";"))
     marks = "\t" if blank else "\t;,"
-    mark = next((mark for mark in marks if line.count(mark) >= LEAST_CELLS - 1), None)
+    mark = next((mark for mark in marks if line.count(mark) >= MIN_CELLS - 1), None)
     cells = [cell.strip() for cell in line.split(mark)]
     if mark is None:
-        ends = (k for k, cell in enumerate(cells) if k >= LEAST_CELLS - 1 and Path(cell).suffix.lower() in SUFFIXES)
-        last = next(ends, LEAST_CELLS - 1)
-        cells[LEAST_CELLS - 1 : last + 1] = [" ".join(cells[LEAST_CELLS - 1 : last + 1])]
+        ends = (k for k, cell in enumerate(cells) if k >= MIN_CELLS - 1 and Path(cell).suffix.lower() in SUFFIXES)
+        last = next(ends, MIN_CELLS - 1)
+        cells[MIN_CELLS - 1 : last + 1] = [" ".join(cells[MIN_CELLS - 1 : last + 1])]
     return cells
 
 

@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, spacing, write_cloud
 from scenefuse.cloud.crs import plane
-from scenefuse.cloud.formats import LAS_DIMENSIONS, las_crs
-from scenefuse.cloud.import_cloud import IMPORTED, ImportedFile
+from scenefuse.cloud.import_cloud import IMPORTED, MIN_POINTS, ImportedFile
+from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.georef.cloud_fit import FIT, LEAST_PHOTOS, check_fit, fit_to_cameras, misfit
-from scenefuse.georef.on_cloud import cloud_crs, in_local
+from scenefuse.geometry.photo_check import LEAST_PHOTOS
+from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
 from scenefuse.photos.cameras.place import read_place
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
 from scenefuse.photos.workspace import View, read_model, read_views, with_mask
 
 # A point of an object lies inside the masks in so many of the photos that frame it; masks are grown by this share of
-# the photo's width; fewer points give no features to register by.
-INSIDE, SLACK, LEAST_INSIDE = 0.9, 0.005, 200
+# the photo's width.
+MIN_INSIDE, MASK_MARGIN = 0.9, 0.005
 
 
 def import_posed_cloud(
@@ -64,7 +64,7 @@ def import_posed_cloud(
             coordinates than the cameras.
     """
     file = ImportedFile.of(source, () if georeference_json is None else LAS_DIMENSIONS, degrees=True)
-    sample = file.survey.sample
+    sample = file.summary.sample
     if sparse is None or sparse_json is None:
         assert georeference_json is not None
         georeference = read_json(georeference_json)
@@ -179,7 +179,7 @@ def inside_masks(points: Array, views: list[View]) -> NDArray[np.bool_]:
         rows, pixels, _ = view.visible(points)
         framed[rows] += 1
         inside[rows] += view.pixels[pixels[:, 1], pixels[:, 0]]
-    return np.asarray((framed >= LEAST_PHOTOS) & (inside >= INSIDE * framed))
+    return np.asarray((framed >= LEAST_PHOTOS) & (inside >= MIN_INSIDE * framed))
 
 
 def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:
@@ -188,11 +188,11 @@ def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:
     for view in read_views(workspace / "sparse"):
         path = masks / f"{Path(view.name).stem}.png"
         if path.is_file():
-            side = 2 * int(np.ceil(SLACK * view.width)) + 1
+            side = 2 * int(np.ceil(MASK_MARGIN * view.width)) + 1
             grown = cv2.dilate(with_mask(view, path).pixels, np.ones((side, side), np.uint8))
             views.append(replace(view, pixels=grown > 127))
     part = whole[inside_masks(whole.points, views)]
-    if len(part) < LEAST_INSIDE:
+    if len(part) < MIN_POINTS:
         raise StageError(
             f"only {len(part)} of {len(whole)} points of {source} lie inside the masks in {masks}; look at masks.png"
             " beside them, and correct the clicks"

@@ -1,4 +1,5 @@
-"""A model that GPS or control points placed, laid on a cloud of the same scene, which is more exact than either."""
+"""A sparse model and a cloud of the same scene: whether they fit, and how a model that GPS or control points placed is
+laid on the cloud, which is more exact than either."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,27 +12,40 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.cloud_file import CloudFile
+from scenefuse.cloud.clouds import spacing
 from scenefuse.cloud.crs import check_place, grid_name, to_wgs84, usable
-from scenefuse.cloud.formats import check_projected, readable
+from scenefuse.cloud.formats import readable
 from scenefuse.cloud.import_cloud import crs_of
-from scenefuse.core.stage import StageError, quantity, threads
+from scenefuse.cloud.readers.las import check_projected
+from scenefuse.cloud.strays import STRAY_PERCENT
+from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
 from scenefuse.geometry.icp import refine_on_cloud
-from scenefuse.georef.cloud_fit import FIT, fit_to_cameras, misfit
+from scenefuse.geometry.photo_check import LEAST_PHOTOS
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference
 from scenefuse.photos.geodesy import LocalFrame
+from scenefuse.photos.workspace import View, posed_images, view_of
 
-# Points of the cloud that the model is laid on, about, and of the model that have to lie over it at least.
-MOST_COMPARED, LEAST_OVER = 200_000, 50
-# What GPS is off at most, and how far beyond the model the cloud is looked at, as a share of the model's extent.
-OFF_M, BESIDE = 30.0, 0.1
-# Strays of either on each side, in percent, do not say how far it reaches.
-STRAY_PERCENT = 1.0
+# Points of a cloud that a model is compared with or laid on, and that are projected into all photos.
+MAX_COMPARED, MAX_PROJECTED = 200_000, 10_000
+# A cloud in other coordinates than the cameras has a smaller share of its points in their pictures than the first, or
+# is met by a smaller share of the points that the photos' own matches give in its box than the second. Of four right
+# clouds 66 % were met or more; with mirrored or swapped axes, half a turn, or 5 % larger, 17 % or fewer.
+MIN_SEEN, MIN_MET = 0.1, 0.2
+# Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off, and
+# where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
+USUALLY_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
+# What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
+NEAR = 0.002
+# Fewer points of a model in the cloud's box say that the cloud is elsewhere; fewer over it do not lay the model on it.
+MIN_INSIDE, MIN_OVER = 10, 50
+# What GPS is off at most, in metres: the cloud is looked at so far beyond the model.
+MAX_GPS_ERROR_M = 30.0
 # ICP goes on in so many rounds of steps, until one moves no point by more than this share of the model's extent.
-ROUNDS, STAYS = 10, 1e-3
-# Heights are compared with those of so many points of the cloud about each of the model's, seen from above.
-NEIGHBOURS = 8
+ROUNDS, MAX_STEP = 10, 1e-3
+# What is reported of a fit in any case.
+FIT = ("seen_share", "met_share")
 
 
 def cloud_crs(cloud: Path, crs: str | None) -> pyproj.CRS:
@@ -49,6 +63,72 @@ def cloud_crs(cloud: Path, crs: str | None) -> pyproj.CRS:
             " cameras of the cloud's project in the column cameras"
         )
     return usable(pyproj.CRS.from_user_input(named), str(cloud))
+
+
+def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, Any]:
+    """How a cloud's points (N, 3) and a sparse model in its frame fit: shares, as quantities.
+
+    `seen_share` of the points lie in the pictures of three photos or more; `met_share` of the model's own points in the
+    cloud's box lie on the cloud. Where that is little, how much it would be if the cloud were moved, and by what.
+    """
+    views = [view_of(model, image) for image in posed_images(model)]
+    own = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    seen, centres = _seen(points[:: max(1, len(points) // MAX_PROJECTED)], views), np.array([v.centre for v in views])
+    points = points[:: max(1, len(points) // MAX_COMPARED)]
+    own = _in_box_of(points, own)
+    met = _met(points, own, centres)
+    content = {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
+    if seen < MIN_SEEN or len(own) < MIN_INSIDE or met > USUALLY_MET:
+        return content
+    moved = refine_on_cloud(own, points)
+    middle = own.mean(0)
+    off = float(np.linalg.norm(moved.apply(middle) - middle))
+    return content | {
+        "met_share_if_moved": quantity(_met(points, moved.apply(own), centres), "1"),
+        "moved_by": quantity(off, "units of the given cameras"),
+        "moved_by_over_distance": quantity(off / float(np.median(np.linalg.norm(centres - middle, axis=1))), "1"),
+        "turned_by_deg": quantity(rotation_angle_deg(moved.rotation), "deg"),
+        "scaled_by_pct": quantity(100 * (moved.scale - 1), "%"),
+    }
+
+
+def misfit(fit: dict[str, Any]) -> str:
+    """What says that a cloud lies in other coordinates than the cameras; "" where nothing does. Of `fit_to_cameras`."""
+    seen, met = value(fit, "seen_share"), value(fit, "met_share")
+    if seen < MIN_SEEN:
+        return f"{100 * seen:.0f} % of its points are in the pictures of {LEAST_PHOTOS} photos"
+    words = f"{100 * met:.0f} % of the points where the photos' matches meet lie on it"
+    if "met_share_if_moved" in fit and _is_off(fit):
+        by = f"{100 * value(fit, 'moved_by_over_distance'):.2g} % of the cameras' distance"
+        turned, scaled = value(fit, "turned_by_deg"), value(fit, "scaled_by_pct")
+        return (
+            f"{words}, and {100 * value(fit, 'met_share_if_moved'):.0f} % if they are moved by {by}, turned by"
+            f" {turned:.2g} degrees and scaled by {scaled:+.2g} % (another datum, geoid, zone or unit?)"
+        )
+    return words if met < MIN_MET else ""
+
+
+def _is_off(fit: dict[str, Any]) -> bool:
+    """Whether a cloud lies beside where it would be met by more points."""
+    better = value(fit, "met_share_if_moved") - value(fit, "met_share")
+    off = (value(fit, "moved_by_over_distance"), value(fit, "turned_by_deg"), value(fit, "scaled_by_pct"))
+    return bool(better > MIN_BETTER_MET or (better > 0 and (np.abs(off) > MAX_OFF).any()))
+
+
+def check_fit(source: Path, fit: dict[str, Any], also: str = "") -> None:
+    """StageError where a cloud lies in other coordinates than the cameras.
+
+    Args:
+        source: its file.
+        fit: of `fit_to_cameras`.
+        also: where else it was looked for, for the message.
+    """
+    found = misfit(fit)
+    if found:
+        raise StageError(
+            f"{source} does not lie in the coordinates of the row's cameras{also}: only {found}; export cloud and"
+            " cameras in the same coordinates, with the same axes, or empty the cell cameras or the cell cloud"
+        )
 
 
 def lay_on_cloud(
@@ -118,14 +198,13 @@ def in_local(points: Array, crs: pyproj.CRS, frame: LocalFrame, where: Path) -> 
 def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Array:
     """The points (N, 3) of a cloud that lie over or near a model (M, 3), in the scene's frame."""
     low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
-    reach = BESIDE * float(np.linalg.norm(high - low)) + OFF_M
-    corners = frame.in_crs(box_corners(low - reach, high + reach))
+    corners = frame.in_crs(box_corners(low - MAX_GPS_ERROR_M, high + MAX_GPS_ERROR_M))
     low, high = corners.min(0), corners.max(0)
     low[2], high[2] = -np.inf, np.inf
-    file = CloudFile.of(cloud, (low, high), MOST_COMPARED)
-    check_place(crs.to_wkt(), file.survey.sample, cloud)
-    if len(file.part) < LEAST_OVER:
-        off = in_local(np.median(file.survey.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(
+    file = CloudFile.of(cloud, (low, high), MAX_COMPARED)
+    check_place(crs.to_wkt(), file.summary.sample, cloud)
+    if len(file.part) < MIN_OVER:
+        off = in_local(np.median(file.summary.sample, axis=0)[None], crs, frame, cloud)[0, :2] - np.median(
             own[:, :2], axis=0
         )
         raise StageError(
@@ -139,7 +218,7 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
     """The similarity that lays a model (M, 3) on a cloud (N, 3), from metres away: ICP until it stays, by the points of
     the model that lie over the cloud."""
     moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[_over(cloud, own, name)])]))
-    stays = STAYS * float(np.linalg.norm(np.ptp(own, axis=0)))
+    stays = MAX_STEP * float(np.linalg.norm(np.ptp(own, axis=0)))
     for _ in range(ROUNDS):
         here = moved.apply(own)
         here = here[_over(cloud, here, name)]
@@ -154,9 +233,9 @@ def _over(cloud: Array, own: Array, name: str) -> NDArray[np.bool_]:
     """(M,) which points of a model lie over a cloud (N, 3)."""
     low, high = np.percentile(cloud[:, :2], [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
     over = ((own[:, :2] >= low) & (own[:, :2] <= high)).all(1)
-    if over.sum() < LEAST_OVER:
+    if over.sum() < MIN_OVER:
         raise StageError(
-            f"{over.sum()} of the {len(own)} points that the photos' matches give lie over {name}, {LEAST_OVER} are"
+            f"{over.sum()} of the {len(own)} points that the photos' matches give lie over {name}, {MIN_OVER} are"
             " needed; give a cloud that shows more of what the photos do"
         )
     return np.asarray(over)
@@ -164,5 +243,27 @@ def _over(cloud: Array, own: Array, name: str) -> NDArray[np.bool_]:
 
 def _height_above(cloud: Array, own: Array) -> float:
     """How much higher a cloud (N, 3) is than a model (M, 3): GPS counts heights from another zero than most clouds."""
-    index = cKDTree(cloud[:, :2]).query(own[:, :2], NEIGHBOURS, workers=threads())[1]
-    return float(np.median(np.median(cloud[index, 2], axis=1) - own[:, 2]))
+    nearest = cKDTree(cloud[:, :2]).query(own[:, :2], workers=threads())[1]
+    return float(np.median(cloud[nearest, 2] - own[:, 2]))
+
+
+def _seen(points: Array, views: list[View]) -> float:
+    """Share of points (N, 3) that lie in enough pictures; a lens's distortion is left out."""
+    count = np.zeros(len(points), np.int64)
+    for view in views:
+        count[view.visible(points)[0]] += 1
+    return float((count >= LEAST_PHOTOS).mean())
+
+
+def _in_box_of(points: Array, own: Array) -> Array:
+    """Those of a model's points (M, 3) that are in the box of a cloud (N, 3)."""
+    low, high = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    return own[((own >= low) & (own <= high)).all(1)]
+
+
+def _met(points: Array, own: Array, centres: Array) -> float:
+    """Share of a model's points (M, 3) that lie on a cloud (N, 3); centres (V, 3): of cameras."""
+    if len(own) < MIN_INSIDE:
+        return 0.0
+    reach = np.maximum(NEAR * cKDTree(centres).query(own)[0], spacing(points))
+    return float((cKDTree(points).query(own, workers=threads())[0] <= reach).mean())

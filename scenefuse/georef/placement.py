@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
-from scenefuse.core.transforms import Sim3, fit_sim3, fit_sim3_robust, rotation_between
+from scenefuse.core.transforms import SD_OVER_MEDIAN, Sim3, fit_sim3, fit_sim3_robust, rotation_between
 from scenefuse.georef.control import Sighting, check_spread, describe_misses
-from scenefuse.photos.geodesy import FAR
+from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
+from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -18,19 +19,15 @@ UP = np.array([0.0, 0.0, 1.0])
 MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
-OUTLIER, SPREAD, WIDTH = 4.0, 5.0, 3.0
-# Heights that lean against what the cameras surely say is up, by more than the first (degrees), are not believed where
-# they fix the tilt to more than the second only (two standard errors); five photos beside each other have one error,
-# and heights are half as exact as stated for the plane.
-LEAN_DEG, TILT_DEG, HEIGHTS, ALIKE = 3.0, 2.0, 2.0, 5.0
+OUTLIER, MIN_SPREAD, MIN_WIDTH = 4.0, 5.0, 3.0
+# Heights of GPS have twice the error of the plane, and so many photos beside each other have one error.
+HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
-BENT = 0.1
+MAX_BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
 ELSEWHERE_M = 1000.0
-# In standard deviations: error of a control point at which it loses half its weight beside exact positions.
-DOUBTED = 3.0
-# Standard deviation of a normal error over the median of its size.
-NORMAL = 1.4826
+# In standard deviations: error of a control point or a position at which it loses half its weight (Cauchy).
+ROBUST_SD = 3.0
 # Each round halves what filling in half of the heights leaves to be found.
 FILL_ROUNDS = 30
 
@@ -115,7 +112,7 @@ def place_by_control(
     whole = np.isfinite(there).all(1)
     check_spread(there[whole], [n for n, w in zip(names, whole) if w], where)
     sd_m = max(max(sightings[k].point.sd_m) for k in rows)
-    limit = max(OUTLIER * sd_m, BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
+    limit = max(OUTLIER * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
     try:
         fitted, inliers = fit_measured(start, there, limit, seed)
     except ValueError:
@@ -189,8 +186,8 @@ def beside_gps(
         here[1] += shift
         off = np.abs(wanted[0] - here[0])
         # Clicks add to what was stated of the coordinates.
-        each = np.maximum(stated, NORMAL * float(np.nanmedian(off)))
-        sd_m = [each * np.hypot(1.0, np.sqrt(np.nansum(off**2, axis=1)) / (DOUBTED * each)), gps.sd_m[inliers, 0]]
+        each = np.maximum(stated, SD_OVER_MEDIAN * float(np.nanmedian(off)))
+        sd_m = [each * np.hypot(1.0, np.sqrt(np.nansum(off**2, axis=1)) / (ROBUST_SD * each)), gps.sd_m[inliers, 0]]
         filled = [np.where(np.isfinite(b), b, a) for a, b in zip(here, wanted)]
         means = [
             [np.average(part, axis=0, weights=sd**-2.0) for part, sd in zip(side, sd_m)] for side in (start, filled)
@@ -204,7 +201,7 @@ def beside_gps(
 
 def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
     """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
-    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, BENT * extent))
+    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, MAX_BENT * extent))
 
 
 def middle_of(difference: Array) -> Array:
@@ -225,13 +222,14 @@ def place_by_gps(
     """Fit local_from_model to camera centres (N, 3) in model units and their GPS positions (N, 3) in metres.
 
     Unknown heights are NaN and take no part. Positions along one line leave the roll about it open, and horizontal ones
-    the tilt: then the cameras' up direction (3,) closes it; also where it is sure and inexact heights contradict it, as
-    a phone's do on a walk around a house. Positions within five times the GPS accuracy of each other say nothing about
-    scale: then the model is only turned upright. `sd_m` is the accuracy that the positions state.
+    the tilt: then the cameras' up direction (3,) closes it; also where it is sure, and heights that fix the tilt less
+    well contradict it, as a phone's do on a walk around a house. Positions within five times the GPS accuracy of each
+    other say nothing about scale: then the model is only turned upright. `sd_m` is the accuracy that the positions
+    state.
     """
     accuracy_m, extent = sd_m or settings.gps_accuracy_m, _extent(target)
     limit = _limit(accuracy_m, extent[0], settings)
-    if extent[0] < SPREAD * accuracy_m:
+    if extent[0] < MIN_SPREAD * accuracy_m:
         reason = f"GPS positions spread over {extent[0]:.1f} m only, with an accuracy of {accuracy_m:g} m"
         return upright(up, reason)
     fitted, inliers, levelled = _fit(centres, target, up, accuracy_m, limit, seed, sure_up)
@@ -240,7 +238,7 @@ def place_by_gps(
         return upright(up, reason)
     reason = f"{inliers.sum()} of {len(target)} photos by GPS"
     if levelled:
-        line = "along one line, " if _extent(target[inliers])[1] < WIDTH * accuracy_m else ""
+        line = "along one line, " if _extent(target[inliers])[1] < MIN_WIDTH * accuracy_m else ""
         reason += f", {line}levelled by the cameras"
     unknown = np.isnan(target[:, 2])
     if unknown.all():
@@ -257,12 +255,14 @@ def _fit(
     has_height = np.isfinite(target[:, 2])
 
     def fixes_tilt(rows: NDArray[np.bool_]) -> bool:
-        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= WIDTH * accuracy_m)
+        return bool(rows.sum() >= MIN_GPS_PHOTOS and _extent(target[rows])[1] >= MIN_WIDTH * accuracy_m)
 
     def leans(fitted: Sim3, rows: NDArray[np.bool_]) -> bool:
         lean = np.degrees(np.arccos(np.clip(fitted.rotate(up)[2] / np.linalg.norm(up), -1, 1)))
-        tilt = np.degrees(HEIGHTS * accuracy_m * np.sqrt(ALIKE / rows.sum()) / _extent(target[rows])[1])
-        return bool(sure_up and lean > LEAN_DEG and tilt > TILT_DEG)
+        sd = np.degrees(
+            HEIGHT_ERROR * accuracy_m * np.sqrt(PHOTOS_OF_ONE_ERROR / rows.sum()) / _extent(target[rows])[1]
+        )
+        return bool(sure_up and min(lean, sd) > MAX_VERTICAL_SD_DEG)
 
     if fixes_tilt(has_height):
         with contextlib.suppress(ValueError):  # no three positions agree
@@ -351,5 +351,5 @@ def _extent(target: Array) -> Array:
     """RMS extent in metres of positions (N, 3) along the two axes of their horizontal spread, far ones left out."""
     centred = target[:, :2] - np.median(target[:, :2], axis=0)
     distance = np.linalg.norm(centred, axis=1)
-    centred = centred[distance <= FAR * np.median(distance)]
+    centred = centred[distance <= MAX_MEDIAN_DISTANCES * np.median(distance)]
     return np.linalg.svd(centred, compute_uv=False) / np.sqrt(len(centred))

@@ -20,8 +20,8 @@ COLUMNS += ["photos", "reprojection_px"]
 
 
 # Control points that miss their coordinates by so many standard deviations deserve a note.
-MISFIT = 5.0
-MOST_NAMED = 3
+MISFIT_SD = 5.0
+MAX_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -190,15 +190,15 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
     sd_m = np.array([s.point.sd_m for s in control.sightings]).reshape(-1, 2)
     horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
     ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
-    worst = [k for k in np.argsort(-ratio) if ratio[k] > MISFIT]
+    worst = [k for k in np.argsort(-ratio) if ratio[k] > MISFIT_SD]
     if not worst:
         return []
     named = [
         "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.sightings[k].point.name, *left.points[k])
-        for k in worst[:MOST_NAMED]
+        for k in worst[:MAX_NAMED]
     ]
     return [
-        f"{len(worst)} of {used.sum()} control points are more than {MISFIT:g} stated standard deviations off, in"
+        f"{len(worst)} of {used.sum()} control points are more than {MISFIT_SD:g} stated standard deviations off, in"
         f" metres: {', '.join(named)}; correct coordinates and clicks, or state larger deviations in columns 8 and 9"
     ]
 

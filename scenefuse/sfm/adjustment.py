@@ -14,8 +14,8 @@ ITERATIONS, LINEAR_SOLVER_ITERATIONS, TOLERANCE = 100, 200, 0.0
 ROUGH_TOLERANCE = 1e-7
 # Observations with a larger error are dropped; COLMAP's own.
 MAX_REPROJECTION_ERROR_PX = 4.0
-# Points whose rays meet at a smaller angle are dropped; COLMAP's own.
-MIN_TRIANGULATION_ANGLE_DEG = 1.5
+# The smallest model that has a shape.
+MIN_PHOTOS = 3
 # Reprojection error at which an observation loses half its weight (Cauchy; Triggs et al. 1999).
 ROBUST_PX = 1.0
 
@@ -59,6 +59,7 @@ def adjustment_options(freedom: Freedom, tolerance: float) -> pycolmap.BundleAdj
 def drop_outliers(model: pycolmap.Reconstruction) -> None:
     """Drop observations with large errors or behind the camera, and points whose rays hardly spread."""
     observations = pycolmap.ObservationManager(model)
-    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=MIN_TRIANGULATION_ANGLE_DEG)
+    min_angle_deg = pycolmap.IncrementalMapperOptions().filter_min_tri_angle
+    observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=min_angle_deg)
     observations.filter_observations_with_negative_depth()
     model.update_point_3d_errors()

@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from scenefuse.sfm.adjustment import MAX_REPROJECTION_ERROR_PX
 
+# Matches that chance hardly gives a pair: as many as COLMAP needs to place a photo. Between leaves, guided matching
+# along a wrong epipolar line finds 15 to 20.
 STRONG_PAIR = 30
-"""Matches from which on chance hardly explains a pair: as many as COLMAP asks for to place a photo. Between leaves,
-guided matching along a wrong epipolar line finds 15 to 20."""
-LEAST_EXPLAINED = 0.7
-"""Of the matches of a photo's strong pairs, the share that the model explains at least where it stands right. A
-sculpture alike from two sides leaves 0.76; in models with a group of frames in wrong places some had 0.28 to 0.66."""
+# Share of the matches of a photo's strong pairs that the model explains where the photo stands right. A sculpture alike
+# from two sides leaves 0.76; in models with a group of frames in wrong places some had 0.28 to 0.66.
+MIN_EXPLAINED = 0.7
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def doubtful_photos(model: pycolmap.Reconstruction, found: Explained) -> dict[st
     Each has too small a share: where that lies at a wrong neighbour, the neighbour's own share is hardly touched.
     """
     shares = {model.images[i].name: share for i, share in found.shares().items()}
-    return {name: round(share, 3) for name, share in sorted(shares.items()) if share < LEAST_EXPLAINED}
+    return {name: round(share, 3) for name, share in sorted(shares.items()) if share < MIN_EXPLAINED}
 
 
 def _rays(model: pycolmap.Reconstruction, photo: int, pixels: NDArray[np.floating]) -> NDArray[np.float64]:

@@ -1,18 +1,16 @@
 """Which way is up in a reconstruction that no GPS has turned upright."""
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from scenefuse.core.transforms import SD_OVER_MEDIAN, Array
 
 # RMS sine (about 8 degrees) by which the cameras' x axes have to leave one line to fix the vertical on their own.
 MIN_AXIS_SPREAD = 0.15
-# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number:
-# beyond this, in degrees, they hardly do.
-MOST_HEADINGS_SD_DEG = 2.5
+# Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number. With
+# a larger standard deviation it is no measurement.
+MAX_VERTICAL_SD_DEG = 2.5
 # A hand rolls a camera by so many degrees at least, as far as a few photos can tell.
-LEAST_ROLL_DEG = 1.0
-MEDIAN_TO_SD = 1.48
+MIN_ROLL_DEG = 1.0
 UNSURE_CUES = ("image up", "viewing direction", "few headings")
 """Up by these is off by as much as the photos are not level, or not straight down: good enough for pictures."""
 
@@ -41,8 +39,8 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     up, spread = _orthogonal_to_all(x)
     if spread >= MIN_AXIS_SPREAD:
         # Image-up sides and looking down both tell the sign; for nadir photos only the latter does.
-        roll_deg = max(MEDIAN_TO_SD * roll_spread_deg(world_from_cam, up), LEAST_ROLL_DEG)
-        sure = roll_deg / (spread * np.sqrt(len(x))) <= MOST_HEADINGS_SD_DEG
+        roll_deg = max(SD_OVER_MEDIAN * roll_spread_deg(world_from_cam, up), MIN_ROLL_DEG)
+        sure = roll_deg / (spread * np.sqrt(len(x))) <= MAX_VERTICAL_SD_DEG
         return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings" if sure else "few headings"
     line = np.linalg.eigh(x.T @ x)[1][:, 2]
     candidates = {"image up": -y.mean(0), "viewing direction": -z.mean(0)}

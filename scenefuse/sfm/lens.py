@@ -19,14 +19,13 @@ from scenefuse.sfm.adjustment import ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
 MIN_GAIN = 3.0
 # And their median error has to fall by this share. What changes less is no better lens that matters, but tangential
 # distortion in the place of a principal point, which turns the cameras.
-LEAST_GAIN = 0.005
+MIN_MEDIAN_GAIN = 0.005
 # One observation of every point seen so often is held out.
 MIN_TRACK = 4
 # Errors beyond it count as this, so that one wrong match does not decide.
-MOST_PX = 20.0
+MAX_ERROR_PX = 20.0
 # A principal point farther from the middle, as a share of the longer side, is no lens but a fit to something else.
-MOST_OFF_CENTRE = 0.1
-SEED = 0
+MAX_OFF_CENTRE = 0.1
 # Models by the number of their distortion parameters, the poorer ones as prefixes of the richer.
 POLYNOMIALS = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 
@@ -110,7 +109,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
         errors = _errors(fitted, held)
         gain = min(_gain(others, errors) for others in poorer)
         median = min(np.median(others) for others in poorer) if held else 0.0
-        better = len(errors) > 0 and np.median(errors) <= (1 - LEAST_GAIN) * median
+        better = len(errors) > 0 and np.median(errors) <= (1 - MIN_MEDIAN_GAIN) * median
         problem = _problem(fitted, gain if better else 0.0)
         trials.append(_trial(lens, errors, gain, problem or "predicts held-out observations better"))
         if _in_bounds(fitted):
@@ -127,7 +126,7 @@ def choose_lens(model: pycolmap.Reconstruction, lenses: tuple[Lens, ...] = DISTO
 
 def hold_out(model: pycolmap.Reconstruction) -> tuple[pycolmap.Reconstruction, Held]:
     """A copy of a model without one observation of each long track, and these: point, photo, (2,) pixels."""
-    rng, kept, held = np.random.default_rng(SEED), copy.deepcopy(model), Held()
+    rng, kept, held = np.random.default_rng(0), copy.deepcopy(model), Held()
     for point in sorted(model.point3D_ids()):
         track = model.points3D[point].track.elements
         if len(track) >= MIN_TRACK:
@@ -166,13 +165,13 @@ def describe_lens(choice: Choice, model: pycolmap.Reconstruction) -> dict[str, A
 
 
 def _errors(model: pycolmap.Reconstruction, held: Held) -> Array:
-    """(N,) reprojection errors in pixels at held-out observations, at most `MOST_PX`; that, where there is none."""
-    errors = np.full(len(held), MOST_PX)
+    """(N,) reprojection errors in pixels at held-out observations, at most MAX_ERROR_PX; that, where there is none."""
+    errors = np.full(len(held), MAX_ERROR_PX)
     for row, (point, photo, pixel) in enumerate(held):
         if point in model.points3D:
             seen = model.images[photo].project_point(model.points3D[point].xyz)
             if seen is not None:
-                errors[row] = min(MOST_PX, float(np.linalg.norm(seen - pixel)))
+                errors[row] = min(MAX_ERROR_PX, float(np.linalg.norm(seen - pixel)))
     return errors
 
 
@@ -195,7 +194,7 @@ def _in_bounds(model: pycolmap.Reconstruction) -> bool:
     """Whether all principal points are near enough to the middle to be a lens's."""
     for camera in model.cameras.values():
         off = np.array([camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2])
-        if np.abs(off).max() > MOST_OFF_CENTRE * max(camera.width, camera.height):
+        if np.abs(off).max() > MAX_OFF_CENTRE * max(camera.width, camera.height):
             return False
     return True
 

@@ -18,15 +18,15 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.photos.workspace import read_model
-from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.adjustment import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.lens import LENSES, Lens
 
-# Groups of photos, each left out once; fewest photos that a model keeps.
-GROUPS, MIN_PHOTOS = 8, 3
+# Groups of photos, each left out once.
+GROUPS = 8
 # Points kept of a model, those that most photos see; points around a place whose common motion is its motion.
-POINTS, NEAREST = 4000, 200
+MAX_POINTS, NEAREST_POINTS = 4000, 200
 # Points that moved more than so many times the median beside the common motion do not count for it.
-ASTRAY = 3.0
+MAX_ERROR_MEDIANS = 3.0
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Spread:
         add (K - 1) / K times the squares about their mean, the others their squares. None where no photos could be left
         out: three at most, or all on one line.
         """
-        near = np.argsort(np.linalg.norm(self.points - place, axis=1))[:NEAREST]
+        near = np.argsort(np.linalg.norm(self.points - place, axis=1))[:NEAREST_POINTS]
         deviations, whole = [], []
         for moved, counts_whole in zip(self.moved[:, near], self.whole):
             seen = np.isfinite(moved).all(1)
@@ -101,7 +101,7 @@ def spread_of(
         lens: what is refined.
         beyond: the next richer lens, or None.
     """
-    ids = sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:POINTS]
+    ids = sorted(model.point3D_ids(), key=lambda p: (-model.points3D[p].track.length(), p))[:MAX_POINTS]
     points = np.array([model.points3D[p].xyz for p in ids]).reshape(-1, 3)
     names = sorted((model.images[i].name, i) for i in model.reg_image_ids())
     groups = min(GROUPS, len(names)) if len(names) > MIN_PHOTOS else 0
@@ -161,7 +161,7 @@ def _common_motion(before: Array, after: Array) -> Sim3:
     """The similarity that most points share."""
     motion = fit_sim3(before, after)
     error = np.linalg.norm(motion.apply(before) - after, axis=1)
-    good = error <= ASTRAY * np.median(error)
+    good = error <= MAX_ERROR_MEDIANS * np.median(error)
     return fit_sim3(before[good], after[good]) if good.sum() >= MIN_PHOTOS else motion
 
 

@@ -19,7 +19,7 @@ from scenefuse.sfm.interrupt import cancellable
 
 # A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
 # alone scales by a few percent, which bilinear sampling does better without.
-AVERAGE_ABOVE = 1 / 0.9
+MIN_SHRINK = 1 / 0.9
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def undistort_picture(pixels: NDArray[Any], camera: pycolmap.Camera, view: View)
     """
     width, height = pixels.shape[1], pixels.shape[0]
     shrink = view.intrinsics[0, 0] * camera.width / (camera.mean_focal_length() * width)
-    if shrink * AVERAGE_ABOVE < 1:
+    if shrink * MIN_SHRINK < 1:
         width, height = max(round(width * shrink), 1), max(round(height * shrink), 1)
         pixels = cv2.resize(pixels, (width, height), interpolation=cv2.INTER_AREA)
     u, v = np.meshgrid(np.arange(view.width) + 0.5, np.arange(view.height) + 0.5)
