@@ -1,65 +1,26 @@
-"""Point clouds in memory and on disk: any known format in; PLY with float64 positions, LAS and LAZ with a CRS out."""
+"""Point clouds in memory: any known format in, PLY with float64 positions out (LAS: write_las)."""
 
 import re
-import shutil
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.formats import LAS_DIMENSIONS, bytes_of, read_columns
-from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, Columns, positions
-from scenefuse.core.stage import StageError, atomic_file, threads
+from scenefuse.cloud.formats import read_columns
+from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, Columns, bytes_of, positions
+from scenefuse.cloud.readers.ply import Element, header_of
+from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Sim3
-from scenefuse.core.version import VERSION
 
-LAS_DESCRIPTIONS = {
-    "source": "0 scene, n the n-th object",
-    "photos": "photos that confirm the point",
-    "match": "their mean correlation, -1 to 1",
-    "deviation": "sd on the line of sight",
-    "world_deviation": "the same with the pose's",
-    "evidence": "1 measured; 0, 2, 3 not (README)",
-}
-"""What fields mean, in the header of a LAS file: 32 bytes at most."""
-LENGTHS = {"deviation", "world_deviation"}
-"""Fields that are lengths, in the unit of the points."""
-
-
-FAR = 10.0
-"""Sizes of a cloud; what lies so far from it is none of it."""
-
-
-STEP_SPACINGS = 0.25
-"""Of the spacing of points, from which the steps of their coordinates show."""
-
-
-NEIGHBOURS, ALONE, LONELY, FEW = 8, 0.02, 10.0, 0.1
-"""Of `strays`: neighbours of a point; how far they are from a lonely one, of the diagonal and beside most points; the
-largest share of all points that strays are."""
-
-
-EVENLY, COARSE = 0.02, 0.25
-"""Of `strays`, in sizes of the box: the cubes in which a point counts once; those in which more points than a lonely
-one has neighbours are a part of the cloud, and by which a box has to grow."""
-
-
-AT_ONCE = 1 << 18
-"""Points whose neighbours are held at once."""
-
-
-COINCIDING = 0.1
-"""Share of points that lie where others do, from which it is told."""
-
-
+# Share of points that lie where others do, from which it is said.
+MIN_COINCIDING = 0.1
+# Normals may be this far from unit length.
 UNIT_TOLERANCE = 0.05
-"""Normals may be this far from unit length."""
+# Share of the spacing of points, from which the steps of their coordinates show.
+MAX_STEP = 0.25
 
 
 @dataclass(frozen=True)
@@ -121,7 +82,7 @@ def voxel_downsample(cloud: Cloud, voxel: float, mean_colors: bool = False) -> C
     """
     if len(cloud) == 0:
         return cloud
-    group, counts = _voxels(cloud.points, voxel)
+    group, counts = voxels(cloud.points, voxel)
     means = _group_means(cloud.points, group, counts)
     distance = ((cloud.points - means[group]) ** 2).sum(1)
     order = np.lexsort((distance, group))
@@ -139,7 +100,7 @@ def voxel_average(cloud: Cloud, voxel: float) -> Cloud:
 
     Normals whose mean vanishes (two sides of a thin sheet) are those of one of the points. Fields are left out.
     """
-    group, counts = _voxels(cloud.points, voxel)
+    group, counts = voxels(cloud.points, voxel)
     normals, colors = cloud.normals, cloud.colors
     if normals is not None:
         mean = _group_means(normals, group, counts)
@@ -153,10 +114,10 @@ def voxel_average(cloud: Cloud, voxel: float) -> Cloud:
 
 def occupied_voxels(points: NDArray[np.float64], voxel: float) -> int:
     """How many points `voxel_downsample` would leave."""
-    return len(_voxels(points, voxel)[1])
+    return len(voxels(points, voxel)[1])
 
 
-def _voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def voxels(points: NDArray[np.float64], voxel: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """The occupied voxel of every point (N,), numbered from 0, and the points in each."""
     cells = np.floor((points - points.min(0)) / voxel).astype(np.int64)
     size = cells.max(0) + 1
@@ -173,7 +134,7 @@ def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0, quan
     """Median (or other quantile) distance from a point to its nearest neighbour elsewhere, by a seeded sample; 0 where
     all are in one place. Of points that coincide, as in a scan that was merged twice, one counts."""
     distance = _to_nearest(points, sample, seed)
-    if np.count_nonzero(distance == 0) > COINCIDING * len(distance):
+    if np.count_nonzero(distance == 0) > MIN_COINCIDING * len(distance):
         distance = _to_nearest(np.unique(points, axis=0), sample, seed)
     distance = distance[distance > 0]
     return float(np.quantile(distance, quantile)) if len(distance) else 0.0
@@ -240,65 +201,6 @@ def chosen_rows(columns: Columns, chosen: NDArray[np.bool_]) -> tuple[Columns, i
     return {name: values[chosen] for name, values in columns.items()}, int(np.sum(~chosen))
 
 
-def is_nothing_at_zero(others: NDArray[np.float64]) -> bool:
-    """Whether points at 0 0 0 are none of a cloud, as all its other points (N, 3) but strays lie far from there:
-    scanners write so what returned nothing."""
-    if not len(others):
-        return False
-    low, high = np.percentile(others, [1, 99], axis=0)
-    away = np.linalg.norm(np.maximum(np.maximum(low, -high), 0))
-    return bool(away > FAR * np.linalg.norm(high - low))
-
-
-def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which of (N, 3) points lie far from all others, N as many as one looks through at once.
-
-    Outside the box around most of them, grown by its size on each side; or with the eighth neighbour farther away than
-    2 % of that box's diagonal, and ten times as far as the median of points on an even grid, so that a part which was
-    measured densely does not stand for all. None, if they are many.
-    """
-    low, high, near, together = _box_of_most(points)
-    far, size = np.ones(len(points), dtype=bool), float((high - low).max())
-    far[near] = False
-    if len(near) > NEIGHBOURS and size:
-        tree, parts = cKDTree(points[near]), np.array_split(points[near], 1 + len(near) // AT_ONCE)
-        away = np.concatenate([tree.query(part, k=NEIGHBOURS + 1, workers=threads())[0][:, -1] for part in parts])
-        evenly = voxel_downsample(Cloud(points[near], fields={"away": away})[together], EVENLY * size)
-        usual = float(np.median(evenly.fields["away"])) if len(evenly) else np.inf
-        far[near] = away > max(ALONE * float(np.linalg.norm(high - low)), LONELY * usual)
-    return far if far.mean() <= FEW else np.zeros(len(points), dtype=bool)
-
-
-def _box_of_most(
-    points: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64], NDArray[np.bool_]]:
-    """Corners (3,) of the box around most of (N, 3) points, the rows (M,) in the box grown by its size on each side,
-    and which of these lie among others.
-
-    It begins as that of the middle 98 %, which may all lie in a part that was measured densely; while there are clearly
-    larger ones, it becomes the box of those in the grown box that lie among others.
-    """
-    low, high = np.percentile(points, [1, 99], axis=0)
-    while True:
-        size = float((high - low).max())
-        near = np.flatnonzero(((points >= low - size) & (points <= high + size)).all(1))
-        group, counts = _voxels(points[near], COARSE * size or 1.0)
-        together = counts[group] > NEIGHBOURS
-        part = points[near[together]]
-        ends = part.min(0, initial=np.inf), part.max(0, initial=-np.inf)
-        if np.maximum(low - ends[0], ends[1] - high).max() <= COARSE * size:
-            return low, high, near, together
-        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
-
-
-def without_strays(cloud: Cloud, what: str) -> tuple[Cloud, list[str]]:
-    """The cloud without its strays, and a note, if there are any, in which the cloud is called `what`."""
-    far = strays(cloud.points)
-    if not far.any():
-        return cloud, []
-    return cloud[np.flatnonzero(~far)], [f"{far.sum()} points of {what}, far from all others, are left out"]
-
-
 def has_unit_normals(cloud: Cloud) -> bool:
     """Whether all normals have unit length; other ones say nothing of the surface."""
     return cloud.normals is None or bool((np.abs(np.linalg.norm(cloud.normals, axis=1) - 1) <= UNIT_TOLERANCE).all())
@@ -308,7 +210,7 @@ def precision_note(path: Path, points: NDArray[np.float64], step: float) -> list
     """What to say of coordinates in single precision, whose steps are not small beside the spacing `step`."""
     farthest = float(np.abs(points).max(initial=0))
     coarse = float(np.spacing(np.float32(farthest)))
-    if coarse < STEP_SPACINGS * step or not (points == points.astype(np.float32)).all():
+    if coarse < MAX_STEP * step or not (points == points.astype(np.float32)).all():
         return []
     return [
         f"{path.name} has coordinates up to {farthest:.6g} in single precision, which knows them in steps of"
@@ -320,7 +222,7 @@ def coincidence_note(path: Path, points: NDArray[np.float64]) -> list[str]:
     """What to say of a file where many of (N, 3) points lie in the place of others."""
     distance = _to_nearest(points)
     same = np.count_nonzero(distance == 0) / max(len(distance), 1)
-    if same <= COINCIDING:
+    if same <= MIN_COINCIDING:
         return []
     return [
         f"{same:.0%} of the points of {path.name} lie exactly where others do, as in a scan that was merged twice or"
@@ -346,8 +248,9 @@ def write_cloud(path: Path, cloud: Cloud) -> None:
     PLY allows no spaces in a field's name: they become underscores.
     """
     vertex = records_of(cloud, path)
-    with atomic_file(path) as temporary:
-        PlyData([PlyElement.describe(vertex, "vertex")], byte_order="<").write(temporary)
+    with atomic_file(path) as temporary, open(temporary, "wb") as file:
+        file.write(header_of([Element("vertex", len(vertex), vertex.dtype)]))
+        file.write(vertex.tobytes())
 
 
 def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
@@ -357,7 +260,7 @@ def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
         columns |= dict(zip(("nx", "ny", "nz"), cloud.normals.astype(np.float32).T))
     if cloud.colors is not None:
         columns |= dict(zip(("red", "green", "blue"), cloud.colors.astype(np.uint8).T))
-    names = _file_names(path, list(cloud.fields), set(columns))
+    names = file_names(path, list(cloud.fields), set(columns))
     for name, values in cloud.fields.items():
         # PLY knows no integers of 64 bits; a float64 holds them up to 2^53.
         columns[names[name]] = values.astype(np.float64) if values.dtype in (np.int64, np.uint64) else values
@@ -367,159 +270,7 @@ def records_of(cloud: Cloud, path: Path) -> NDArray[Any]:
     return vertex
 
 
-def write_laz(path: Path, cloud: Cloud, origin: NDArray[np.float64], crs: str | None) -> None:
-    """Write LAZ 1.4, coordinates to a millimetre, or finer where the points ask for it; without a CRS to 1e-8 of the
-    cloud's diagonal.
-
-    Args:
-        path: output, .laz or .las.
-        cloud: with the axes of the CRS, relative to `origin`, which is added.
-        origin: (3,) coordinates of the cloud's local origin.
-        crs: anything pyproj understands, "EPSG:32632" for instance; None when the coordinates are in no CRS.
-    """
-    ends = cloud.points.min(0, initial=np.inf), cloud.points.max(0, initial=-np.inf)
-    ends, apart = ends if len(cloud) else (np.zeros(3), np.zeros(3)), spacing(cloud.points)
-    with laz_in_parts(path, cloud, ends, origin, crs, apart) as append:
-        append(cloud)
-
-
-@dataclass(frozen=True)
-class LasLayout:
-    """How points are written as LAS 1.4: steps, offsets, CRS and further columns.
-
-    Attributes:
-        header: with the columns, the steps and the CRS; counts and boxes are not filled in.
-        names: what the clouds' fields are called in it.
-        origin: (3,) coordinates of the clouds' local origin.
-    """
-
-    header: Any
-    names: dict[str, str]
-    origin: NDArray[np.float64]
-
-    @classmethod
-    def of(
-        cls, path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]],
-        origin: NDArray[np.float64], crs: str | None, apart: float,
-    ) -> "LasLayout":  # fmt: skip
-        """For clouds of `like`'s columns; see `laz_in_parts`."""
-        import laspy
-        import pyproj
-
-        header = laspy.LasHeader(point_format=6 if like.colors is None else 7, version="1.4")
-        header.generating_software = f"scenefuse {VERSION}"
-        low, high = box
-        if crs is not None:
-            step, offset = _step_of(path, np.maximum(np.abs(low), np.abs(high)), apart), np.floor(origin)
-        else:  # LAS counts steps from the offset in 32 bits, and the points may lie anywhere
-            step, offset = (float(np.linalg.norm(high - low)) or 1.0) * 1e-8, origin + (low + high) / 2
-        header.scales, header.offsets = np.full(3, step), offset
-        header.global_encoding.wkt = True  # LAS 1.4 asks it of these columns, with or without a CRS
-        if crs is not None:
-            header.add_crs(pyproj.CRS.from_user_input(crs))
-        # Classes and intensities of LAS stay what they are; of other fields none takes their names.
-        own = [name for name, kind in LAS_DIMENSIONS.items() if name in like.fields and like.fields[name].dtype == kind]
-        further = [name for name in like.fields if name not in own]
-        names = dict(zip(own, own)) | _file_names(path, further, set(header.point_format.dimension_names))
-        for name in further:
-            values = like.fields[name]
-            kind = f"{values.dtype.kind}{values.dtype.itemsize}"
-            header.add_extra_dim(laspy.ExtraBytesParams(names[name], kind, LAS_DESCRIPTIONS.get(name, "")))
-        return cls(header, names, origin)
-
-    def records(self, part: Cloud) -> Any:
-        """A `laspy.ScaleAwarePointRecord` of some points."""
-        import laspy
-
-        points = laspy.ScaleAwarePointRecord.zeros(len(part), header=self.header)
-        points.x, points.y, points.z = (part.points + self.origin).T
-        points.return_number = points.number_of_returns = np.ones(len(part), np.uint8)
-        if part.colors is not None:
-            points.red, points.green, points.blue = part.colors.astype(np.uint16).T * 257
-        for name, values in part.fields.items():
-            points[self.names[name]] = values
-        return points
-
-
-def finer(step: float, apart: float, fits: Callable[[float], bool]) -> float:
-    """A step of coordinates, or the tenth of it, or of that, ..., that points which lie `apart` need, as far as `fits`
-    says that integers count so far."""
-    while step > STEP_SPACINGS * apart > 0 and fits(step / 10):
-        step /= 10
-    return step
-
-
-def _step_of(path: Path, farthest: NDArray[np.float64], apart: float) -> float:
-    """A thousandth of the CRS's unit; less where points are dense; more where 32 bits do not count as far as strays
-    lie.
-
-    Args:
-        path: for the note.
-        farthest: (3,) largest distance from the origin along each axis; the factor of 4 is for turned axes and feet.
-        apart: spacing of the points.
-    """
-
-    def fits(step: float) -> bool:
-        return bool(4 * np.linalg.norm(farthest) / step < 1 << 31)
-
-    step = finer(0.001, apart, fits)
-    while not fits(step):
-        step *= 10
-    if step > 0.001:
-        print(
-            f"note: points lie up to {farthest.max():.3g} from the origin, so {path.name} counts in {step:g} of its"
-            " CRS's unit: take these strays out of the scene's cloud, and it counts in 0.001",
-            flush=True,
-        )
-    return step
-
-
-@contextmanager
-def laz_in_parts(
-    path: Path, like: Cloud, box: tuple[NDArray[np.float64], NDArray[np.float64]], origin: NDArray[np.float64],
-    crs: str | None, apart: float = np.inf,
-) -> Iterator[Callable[[Cloud], None]]:  # fmt: skip
-    """`write_laz` for clouds of any size: gives a function that appends a part.
-
-    Args:
-        path: output, .laz or .las; it appears when all parts are written.
-        like: a cloud, perhaps empty, with the columns that all parts have.
-        box: two opposite corners (3,) of a box around all points, relative to `origin`.
-        origin: see `write_laz`.
-        crs: see `write_laz`.
-        apart: spacing of the points; much closer than a millimetre it asks for finer steps.
-
-    Raises:
-        StageError: the disk is full.
-    """
-    layout = LasLayout.of(path, like, box, origin, crs, apart)
-    with las_writer(path, layout.header) as writer:
-        yield lambda part: writer.write_points(layout.records(part))
-
-
-@contextmanager
-def las_writer(path: Path, header: Any) -> Iterator[Any]:
-    """A `laspy.LasWriter` of a file that appears when all is written.
-
-    Raises:
-        StageError: the disk is full.
-    """
-    import laspy
-    import lazrs
-
-    with atomic_file(path) as temporary:
-        try:
-            with laspy.open(temporary, mode="w", header=header) as writer:
-                yield writer
-        except lazrs.LazrsError as error:  # it does not say why, and only writing can fail
-            left = shutil.disk_usage(temporary.parent).free / 1e9
-            raise StageError(
-                f"{path} could not be written ({error}); {left:.3g} GB of its disk are free: free some space and run"
-                " this again"
-            ) from None
-
-
-def _file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:
+def file_names(path: Path, names: list[str], taken: set[str]) -> dict[str, str]:
     """What fields are called in a file: PLY separates by blanks, both formats know ASCII alone, LAS 32 letters."""
     called: dict[str, str] = {}
     for name in names:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from scenefuse.cloud.cloud_file import FileSummary, summarise
 from scenefuse.cloud.clouds import (
     Cloud,
     cloud_of,
@@ -15,25 +16,21 @@ from scenefuse.cloud.clouds import (
     has_unit_normals,
     precision_note,
     spacing,
-    without_strays,
     write_cloud,
 )
-from scenefuse.cloud.formats import LAS_DIMENSIONS, WITHHELD, check_not_degrees, las_crs, las_dimensions
+from scenefuse.cloud.formats import check_not_degrees, columns_in_parts
 from scenefuse.cloud.readers.columns import Columns
+from scenefuse.cloud.readers.las import LAS_DIMENSIONS, WITHHELD, las_crs, las_dimensions
 from scenefuse.cloud.readers.text import text_notes
-from scenefuse.cloud.tiles.parts import columns_in_parts
-from scenefuse.cloud.tiles.statistics import Survey, survey
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.strays import STRAY_PERCENT, without_strays
+from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3
 
 # Fewer different points give no features to register by.
-LEAST_POINTS = 200
+MIN_POINTS = 200
 # Among so many points they are looked for before they are counted among all.
 ENOUGH = 10_000
-# Positions below this share of the points, and above the same share, are strays: they do not move the origin.
-STRAY_PERCENT = 1.0
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -57,7 +54,7 @@ def import_scene_cloud(
             another CRS than `crs`, or has too few different points.
     """
     file = ImportedFile.of(source, LAS_DIMENSIONS)
-    sample = file.survey.sample
+    sample = file.summary.sample
     check_not_degrees(source, sample)
     crs = crs_of(source, crs)
     unit, name = "scene units", None
@@ -110,7 +107,7 @@ def import_object_cloud(*, source: Path, cloud: Path, report: Path) -> None:
         StageError: as of `import_scene_cloud`.
     """
     file = ImportedFile.of(source)
-    check_not_degrees(source, file.survey.sample)
+    check_not_degrees(source, file.summary.sample)
     whole, notes = without_strays(concatenate(list(file.clouds())), source.name)
     origin = near_origin(whole.points)
     placed = replace(whole, points=whole.points - origin)
@@ -137,13 +134,13 @@ class ImportedFile:
     """A file whose points are taken over.
 
     Attributes:
-        survey: what is known of all its points.
+        summary: what is known of all its points.
         unit_normals: whether there are normals, all of unit length; None where there are none.
         kept: names of further columns that are taken over.
         unused: names of further columns.
     """
 
-    survey: Survey
+    summary: FileSummary
     unit_normals: bool | None
     kept: tuple[str, ...]
     unused: list[str]
@@ -170,11 +167,11 @@ class ImportedFile:
             if part.normals is not None:
                 unit_normals = unit_normals is not False and has_unit_normals(part)
 
-        whole = survey(source, columns_in_parts(source, degrees), look)
+        whole = summarise(source, columns_in_parts(source, degrees), look)
         different = len(np.unique(whole.sample[:: max(1, len(whole.sample) // ENOUGH)], axis=0))
-        if different < LEAST_POINTS and (different := len(np.unique(whole.sample, axis=0))) < LEAST_POINTS:
+        if different < MIN_POINTS and (different := len(np.unique(whole.sample, axis=0))) < MIN_POINTS:
             raise StageError(
-                f"{source} has only {different} different positions among its {whole.count} points; {LEAST_POINTS} or"
+                f"{source} has only {different} different positions among its {whole.count} points; {MIN_POINTS} or"
                 " more are needed to place it"
             )
         own = set(LAS_DIMENSIONS) if whole.is_las else set[str]()
@@ -183,12 +180,12 @@ class ImportedFile:
 
     def clouds(self) -> Iterator[Cloud]:
         """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
-        for columns in self.survey.columns():
-            cloud = cloud_of(self.survey.surface(columns), self.survey.most_color)
+        for columns in self.summary.columns():
+            cloud = cloud_of(self.summary.surface(columns), self.summary.most_color)
             normals = None
             if self.unit_normals and cloud.normals is not None:
                 normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
-            colors = None if self.survey.most_color is None else cloud.colors
+            colors = None if self.summary.most_color is None else cloud.colors
             yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in self.kept})
 
     def write(self, cloud: Path, move: Callable[[Cloud], Cloud], unit: str) -> dict[str, Any]:
@@ -203,9 +200,9 @@ class ImportedFile:
         def placed() -> Iterator[Cloud]:
             return map(move, self.clouds())
 
-        write_tiled(cloud, placed, self.survey.count, move(Cloud(self.survey.sample)).points)
+        write_tiled(cloud, placed, self.summary.count, move(Cloud(self.summary.sample)).points)
         tiles = open_cloud(cloud)
-        same = coincidence_note(self.survey.path, np.concatenate(tiles.samples()))
+        same = coincidence_note(self.summary.path, np.concatenate(tiles.samples()))
         return self.report(tiles.spacing(), float(np.linalg.norm(tiles.high.max(0) - tiles.low.min(0))), unit, same)
 
     def report(self, step: float, diagonal: float, unit: str, more: Sequence[str] = ()) -> dict[str, Any]:
@@ -217,9 +214,9 @@ class ImportedFile:
             unit: of both.
             more: further notes.
         """
-        source = self.survey.path
-        notes = [f"{count} {why} were left out" for why, count in self.survey.left_out.items() if count]
-        notes += [*more, *text_notes(source), *precision_note(source, self.survey.sample, step)]
+        source = self.summary.path
+        notes = [f"{count} {why} were left out" for why, count in self.summary.left_out.items() if count]
+        notes += [*more, *text_notes(source), *precision_note(source, self.summary.sample, step)]
         if self.unit_normals is False:
             notes.append("its normals are not all of unit length and were left out: they are estimated from the points")
         if self.unused:
@@ -227,12 +224,12 @@ class ImportedFile:
         for note in notes:
             print(note, flush=True)
         return {
-            "points": quantity(self.survey.count, "1"),
+            "points": quantity(self.summary.count, "1"),
             "spacing": quantity(step, unit),
             "diagonal": quantity(diagonal, unit),
             "source": quantity(source.name, ""),
             "columns_not_used": quantity(self.unused, ""),
-            "has_colors": quantity(self.survey.most_color is not None, ""),
+            "has_colors": quantity(self.summary.most_color is not None, ""),
             "has_normals": quantity(bool(self.unit_normals), ""),
             "notes": quantity(notes, ""),
         }

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.crs import to_wgs84
-from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole

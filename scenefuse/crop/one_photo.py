@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud
-from scenefuse.cloud.tiles.tiled_cloud import Rows, TiledCloud
+from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud

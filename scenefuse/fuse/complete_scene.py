@@ -8,8 +8,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing
-from scenefuse.cloud.tiles.copc import write_copc
-from scenefuse.cloud.tiles.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
+from scenefuse.cloud.copc import write_copc
+from scenefuse.cloud.tiled_cloud import BOX, ROW_OF_TILE, TiledCloud, open_cloud
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.version import VERSION

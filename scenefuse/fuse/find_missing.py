@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, voxel_downsample, write_cloud
-from scenefuse.cloud.tiles.tiled_cloud import AT_ONCE, open_cloud
+from scenefuse.cloud.readers.columns import AT_ONCE
+from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, rotation_between

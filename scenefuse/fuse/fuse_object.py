@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
-from scenefuse.cloud.tiles.tiled_cloud import Rows, open_cloud
+from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around

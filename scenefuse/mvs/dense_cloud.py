@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
-from scenefuse.cloud.tiles.tiled_cloud import WHOLE
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import neighbours, vote

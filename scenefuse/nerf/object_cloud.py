@@ -34,7 +34,7 @@ NEAR_POINTS = 8
 # Voxels are no larger than so many pixels: windows of five pixels, which the depths were matched by, tell no more.
 VOXEL_PIXELS = 2
 # Points belong to one group where steps of this many spacings lead from one to the other.
-STEP_SPACINGS = 3
+MAX_STEP = 3
 # Points that a normal's plane is fitted to.
 PLANE_POINTS = 16
 
@@ -199,7 +199,7 @@ def clean(cloud: Cloud, deviations: float, min_component: float, step: float) ->
     near = min(NEAR_POINTS + 1, len(cloud))
     distance = cKDTree(cloud.points).query(cloud.points, k=near, workers=threads())[0][:, 1:].mean(1)
     cloud = cloud[distance <= distance.mean() + deviations * distance.std()]
-    pairs = cKDTree(cloud.points).query_pairs(STEP_SPACINGS * step, output_type="ndarray")
+    pairs = cKDTree(cloud.points).query_pairs(MAX_STEP * step, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cloud), len(cloud)))
     group = connected_components(graph, directed=False)[1]
     return cloud[np.bincount(group)[group] >= min_component * len(cloud)]

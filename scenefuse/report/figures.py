@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import atomic_directory, read_json
 from scenefuse.core.transforms import Array, box_corners
 from scenefuse.fuse.measure import NERF_ONLY

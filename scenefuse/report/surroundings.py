@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
 from scenefuse.fuse.fuse_object import is_placed

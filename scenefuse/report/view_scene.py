@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate
-from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
 from scenefuse.photos.geodesy import length_unit

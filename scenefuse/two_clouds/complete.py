@@ -11,11 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.clouds import LAS_DESCRIPTIONS, STEP_SPACINGS, Cloud, finer, las_writer, spacing
-from scenefuse.cloud.formats import las_crs
+from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
+from scenefuse.cloud.clouds import MAX_STEP, Cloud, spacing
+from scenefuse.cloud.readers.las import las_crs
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.columns import COLOR
-from scenefuse.cloud.tiles.tiled_cloud import Rows
+from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, scratch_directory, write_json
 from scenefuse.core.transforms import Sim3
@@ -121,11 +122,11 @@ def write_files(out: Path, done: Completed, object: Path, scene: CloudFile) -> l
     """
     with scratch_directory(out / "completed") as folder:
         notes = list(done.notes)
-        if scene.survey.is_las:
+        if scene.summary.is_las:
             notes += append_to_las(folder / "completed.laz", scene, done)
-            if noise := scene.survey.rows - scene.survey.count:
+            if noise := scene.summary.rows - scene.summary.count:
                 notes.append(f"completed.ply leaves out the {noise} points that are not used; completed.laz has them")
-        count = scene.survey.count - len(done.removed) + len(done.added)
+        count = scene.summary.count - len(done.removed) + len(done.added)
         write_completed(folder / "completed.ply", scene.like, scene.parts(), done.changes, [done.added], count)
         _write_report(folder / "completed.json", done, object, scene, notes)
         written = [folder / name for name in FILES if (folder / name).exists()]
@@ -136,10 +137,10 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
     """Write completed.json, and print the notes."""
     for note in notes:
         print(f"note       {note}", flush=True)
-    crs = las_crs(scene.survey.path)
+    crs = las_crs(scene.summary.path)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
-    earlier = {str(number): f"{number} in {scene.survey.path.name}" for number in range(FROM_OBJECT, done.source)}
-    kept = scene.survey.count - len(done.removed)
+    earlier = {str(number): f"{number} in {scene.summary.path.name}" for number in range(FROM_OBJECT, done.source)}
+    kept = scene.summary.count - len(done.removed)
     content = {
         "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
         "points": quantity(kept + len(done.added), "points"),
@@ -172,10 +173,10 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
     """
     import laspy
 
-    with laspy.open(scene.survey.path) as reader:
+    with laspy.open(scene.summary.path) as reader:
         header = copy.deepcopy(reader.header)
         _keep_no_data(header)
-        times, notes = _finer_steps(header, done, scene.survey.path)
+        times, notes = _finer_steps(header, done, scene.summary.path)
         # What laspy writes; a later version has all that 1.0 and 1.1 have.
         header.version = max(header.version, laspy.header.Version(1, 2))
         # An index of the points (COPC) is not one of more points.
@@ -197,7 +198,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                     part.array[name] = chunk.array[name]
                 for axis in AXES if times > 1 else ():
                     if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MOST:
-                        raise StageError(f"points of {scene.survey.path} lie outside the box it names; write it again")
+                        raise StageError(f"points of {scene.summary.path} lie outside the box it names; write it again")
                     part.array[axis] *= times
                 if "red" in own:
                     brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
@@ -234,7 +235,7 @@ def _finer_steps(header: Any, done: Completed, scene: Path) -> tuple[int, list[s
     if times > 1:
         header.scales = own / times
         notes.append(f"completed.laz counts in steps of {step:g}, not {own.max():g}, as the object is so dense")
-    if step > STEP_SPACINGS * apart > 0:
+    if step > MAX_STEP * apart > 0:
         notes.append(
             f"the added points are {apart:.3g} apart, and completed.laz counts in steps of {step:g}: use completed.ply,"
             " or write the scene again with an offset near its points and finer steps"

@@ -10,9 +10,11 @@ import numpy as np
 import tyro
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.clouds import Cloud, has_unit_normals, without_strays, write_cloud, write_laz
-from scenefuse.cloud.formats import las_crs
+from scenefuse.cloud.clouds import Cloud, has_unit_normals, write_cloud
 from scenefuse.cloud.import_cloud import unit_and_name
+from scenefuse.cloud.readers.las import las_crs
+from scenefuse.cloud.strays import without_strays
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, atomic_file, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.core.version import VERSION
@@ -120,7 +122,7 @@ def register(
             )
             print(f"note       {notes[-1]}", flush=True)
     evidence = evidence_of(given.object, given.scene.part, given.ups)
-    points = {"object_points": len(given.object), "scene_points": given.scene.survey.count}
+    points = {"object_points": len(given.object), "scene_points": given.scene.summary.count}
     content = report(found, given.ups) | {
         "evidence": quantity(evidence, ""),
         "searched": quantity(given.searched, ""),
@@ -180,19 +182,19 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     if crs is not None:
         from scenefuse.cloud.crs import check_place
 
-        check_place(crs, whole.survey.sample, scene)
+        check_place(crs, whole.summary.sample, scene)
     notes = [*cloud.notes, *strays, *whole.notes, *_notes(object, scene)]
     if whole.every > 1:
         notes.append(f"the part to look in is large: one in {whole.every} of its points is searched")
     if box is not None and not len(whole.part):
-        low, high = (" ".join(f"{x:.10g}" for x in end(whole.survey.sample, axis=0)) for end in (np.min, np.max))
+        low, high = (" ".join(f"{x:.10g}" for x in end(whole.summary.sample, axis=0)) for end in (np.min, np.max))
         raise StageError(
             "no scene point lies in the crop box; give least x y z, then greatest x y z, of what lies from about"
             f" {low} to {high} in {scene}"
         )
     # Marks around which nothing lies are far from all of the scene, which the crop says.
-    near = whole.part if len(whole.part) else Cloud(whole.survey.sample)
-    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.survey.count)
+    near = whole.part if len(whole.part) else Cloud(whole.summary.sample)
+    part, searched = cut_scene(near, settings.crop, up_scene, known.fiducials, box, whole.summary.count)
     part, strays = without_strays(part, f"what is searched of {scene}")
     notes += strays
     for each, path in ((own, object), (part, scene)):

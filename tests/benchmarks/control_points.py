@@ -43,8 +43,7 @@ from scenefuse.sfm.features import FeatureSettings, extract_features
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.lens import LENSES
 from scenefuse.sfm.mapping import MappingSettings, map_photos
-from scenefuse.sfm.matches import match_features
-from scenefuse.sfm.pairs import MatchSettings
+from scenefuse.sfm.matches import MatchSettings, match_features
 
 
 @dataclass(frozen=True)

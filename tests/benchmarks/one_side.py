@@ -18,7 +18,8 @@ import pandas as pd
 import yaml
 from support.marks import frame_of_its_own, marks_of
 
-from scenefuse.cloud.clouds import read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import read_cloud, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3

@@ -20,7 +20,8 @@ import pyproj
 import yaml
 from plyfile import PlyData
 
-from scenefuse.cloud.clouds import Cloud, write_laz
+from scenefuse.cloud.clouds import Cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array

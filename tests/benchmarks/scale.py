@@ -26,10 +26,10 @@ import pandas as pd
 from support.copc_file import write_copc
 from support.planted import Trial, errors, plant
 
-from scenefuse.cloud.clouds import Cloud, laz_in_parts, read_cloud, records_of, write_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, records_of, write_cloud
 from scenefuse.cloud.import_cloud import import_scene_cloud
-from scenefuse.cloud.tiles.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud
-from scenefuse.cloud.tiles.write_tiles import reserved
+from scenefuse.cloud.tiled_cloud import BOX, ROW_OF_TILE, TILE, open_cloud, reserved
+from scenefuse.cloud.write_las import laz_in_parts
 from scenefuse.core.job_records import JobRecords
 from scenefuse.core.stage import quantity, read_json, run, value, write_json
 from scenefuse.core.transforms import Array, Sim3

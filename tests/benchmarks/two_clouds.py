@@ -14,7 +14,8 @@ import numpy as np
 import pandas as pd
 from support.marks import frame_of_its_own, marks_of
 
-from scenefuse.cloud.clouds import read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import read_cloud, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.metrics.object_truth import read_object_truth, scene_scores, surface_to_find

@@ -14,7 +14,8 @@ from support.cloud_files import UTM
 from support.planted import errors, plant
 from support.user_project import CLICKS, Project, planned
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3
 

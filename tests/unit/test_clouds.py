@@ -4,16 +4,9 @@ import laspy
 import numpy as np
 import pytest
 
-from scenefuse.cloud.clouds import (
-    Cloud,
-    concatenate,
-    read_cloud,
-    spacing,
-    strays,
-    voxel_downsample,
-    write_cloud,
-    write_laz,
-)
+from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, voxel_downsample, write_cloud
+from scenefuse.cloud.strays import strays
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 

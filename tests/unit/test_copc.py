@@ -10,11 +10,10 @@ import pytest
 from laspy.copc import load_octree_for_query
 from scipy.spatial import cKDTree
 
+from scenefuse.cloud import copc, tiled_cloud
 from scenefuse.cloud.clouds import Cloud, write_cloud
-from scenefuse.cloud.tiles import copc, tiled_cloud, write_tiles
-from scenefuse.cloud.tiles.copc import write_copc
-from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.copc import write_copc
+from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud, write_tiled
 from scenefuse.core.stage import StageError
 from scenefuse.photos.geodesy import LocalFrame
 
@@ -24,10 +23,8 @@ UTM = np.array([462_000.0, 5_260_000.0, 400.0])
 @pytest.fixture
 def small_nodes(monkeypatch):
     """Tiles of 500 points, cubes of 3000 in memory, nodes of 200 points and 8 cells along an axis."""
-    for module in (tiled_cloud, write_tiles):
-        monkeypatch.setattr(module, "WHOLE", 2000)
-        monkeypatch.setattr(module, "TILE", 500)
-    monkeypatch.setattr(write_tiles, "POINTS_A_CELL", 20)
+    for name, number in {"WHOLE": 2000, "TILE": 500, "POINTS_A_CELL": 20}.items():
+        monkeypatch.setattr(tiled_cloud, name, number)
     for name, number in {"AT_ONCE": 3000, "NODE_POINTS": 200, "GRID_BITS": 3, "TILES_HELD": 2}.items():
         monkeypatch.setattr(copc, name, number)
 

@@ -9,9 +9,9 @@ import pycolmap
 import pytest
 from support.planted import plant
 
+from scenefuse.cloud import tiled_cloud
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
-from scenefuse.cloud.tiles import tiled_cloud, write_tiles
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.tiled_cloud import write_tiled
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_cloud import CropSettings, crop_cloud, in_wide_hull, least_footprint
@@ -100,9 +100,8 @@ def test_the_crop_of_a_large_scene_is_that_of_the_part_around_the_marks(tmp_path
     far = np.random.default_rng(0).uniform(-1, 1, (60000, 3)) * 40 * trial.diagonal * [1, 1, 0.001]
     far = far[(np.abs(far[:, :2]) > 4 * trial.diagonal).any(1)]
     scene = concatenate([Cloud(far), Cloud(trial.scene.points)])
-    for module in (tiled_cloud, write_tiles):
-        monkeypatch.setattr(module, "WHOLE", 2000)
-        monkeypatch.setattr(module, "TILE", 500)
+    monkeypatch.setattr(tiled_cloud, "WHOLE", 2000)
+    monkeypatch.setattr(tiled_cloud, "TILE", 500)
     write_tiled(files["inputs"].scene, lambda: [scene], len(scene), scene.points)
     crop_scene(**files, settings=SETTINGS)
     found = read_cloud(files["crop"])

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scenefuse.cloud import tiled_cloud
 from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.cloud.tiles import tiled_cloud, write_tiles
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.tiled_cloud import write_tiled
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import look_at
 from scenefuse.crop.crop_cloud import CropSettings
@@ -108,9 +108,8 @@ def test_in_a_large_scene_clicks_find_the_object_in_the_tiles_along_their_rays(c
     far = np.random.default_rng(5).uniform([-50, -50, 0], [50, 50, 0.02], (250_000, 3))
     far = far[(np.abs(far[:, :2]) > 20).any(1)]
     points = np.concatenate([YARD, far, shell(SIZE, EYE + [4, -6, 3], 3000, 6)])
-    for module in (tiled_cloud, write_tiles):
-        monkeypatch.setattr(module, "WHOLE", 2000)
-        monkeypatch.setattr(module, "TILE", 1000)
+    monkeypatch.setattr(tiled_cloud, "WHOLE", 2000)
+    monkeypatch.setattr(tiled_cloud, "TILE", 1000)
     whole, read = tiled_cloud.TiledCloud.read, []
     monkeypatch.setattr(tiled_cloud.TiledCloud, "read", lambda *tiles: read.append(len(tiles[1])) or whole(*tiles))
     kept, report = crop(inside(*CORNERS), points)

@@ -9,9 +9,11 @@ from pye57 import libe57
 from scipy.spatial.transform import Rotation
 from support.cloud_files import UTM, write_e57, write_pcd
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.cloud.formats import bytes_of, las_crs
-from scenefuse.cloud.readers.text import text_notes, text_parts
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.readers.columns import bytes_of
+from scenefuse.cloud.readers.las import las_crs
+from scenefuse.cloud.readers.text import read_text, text_notes
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError
 
 
@@ -344,17 +346,17 @@ def test_a_table_in_degrees_is_refused(tmp_path):
 
 
 def test_text_is_read_in_parts_and_a_bad_row_is_counted_from_its_part(tmp_path, monkeypatch):
-    monkeypatch.setattr("scenefuse.cloud.readers.text.HEAD", 10)
-    monkeypatch.setattr("scenefuse.cloud.readers.text.LOOKED_AT", 5)
+    monkeypatch.setattr("scenefuse.cloud.readers.text.MAX_HEAD_LINES", 10)
+    monkeypatch.setattr("scenefuse.cloud.readers.text.MAX_LAYOUT_ROWS", 5)
     points = np.random.default_rng(0).uniform(-5, 5, (25, 3)).round(3)
     np.savetxt(tmp_path / "a.xyz", points, fmt="%.3f", header="x y z\n")
-    parts = list(text_parts(tmp_path / "a.xyz", 10))
+    parts = list(read_text(tmp_path / "a.xyz", 10))
     assert [len(part["x"]) for part in parts] == [10, 10, 5]
     np.testing.assert_allclose(np.concatenate([np.column_stack(list(part.values())) for part in parts]), points)
     lines = (tmp_path / "a.xyz").read_text().splitlines()
     (tmp_path / "b.xyz").write_text("\n".join([*lines[:-1], "1 2"]) + "\n")
     with pytest.raises(ValueError, match=r"row 5.*rows counted from line 23"):
-        list(text_parts(tmp_path / "b.xyz", 10))
+        list(read_text(tmp_path / "b.xyz", 10))
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,8 @@ import pytest
 from support.cloud_files import UTM
 from support.surveyed import FRAME, MODEL_FROM_LOCAL, fly, on_earth, write_inputs
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import fit_sim3
 from scenefuse.georef.georeference import camera_poses, georegister

@@ -10,8 +10,9 @@ from plyfile import PlyData
 from support.cloud_files import UTM, write_e57, write_pcd
 from support.copc_file import write_copc
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.cloud.import_cloud import import_object_cloud, import_scene_cloud, near_origin
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_scene import points_in
@@ -76,8 +77,8 @@ def test_a_file_read_in_parts_gives_the_same_scene(tmp_path, cloud, name, monkey
     turned = np.random.default_rng(1).normal(size=(500, 3))
     source = write_as(tmp_path / name, replace(cloud, normals=turned / np.linalg.norm(turned, axis=1, keepdims=True)))
     whole, *jsons = imported_scene(tmp_path, source)
-    monkeypatch.setattr("scenefuse.cloud.tiles.parts.AT_ONCE", 64)
-    monkeypatch.setattr("scenefuse.cloud.tiles.statistics.SAMPLE", 220)  # of which the origin is found
+    monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", 64)
+    monkeypatch.setattr("scenefuse.cloud.cloud_file.SAMPLE", 220)  # of which the origin is found
     found, *others = imported_scene(tmp_path, source)
     assert jsons == others and np.array_equal(found.points, whole.points)
     assert np.array_equal(found.colors, cloud.colors)
@@ -103,13 +104,13 @@ def test_colors_of_16_bits_are_told_from_bytes_by_the_whole_file(tmp_path, cloud
     colors[-1] = [65535, 257, 0]
     columns = dict(zip(("red", "green", "blue"), colors.T))
     write_cloud(tmp_path / "a.ply", Cloud(cloud.points, None, None, columns))
-    monkeypatch.setattr("scenefuse.cloud.tiles.parts.AT_ONCE", 64)
+    monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", 64)
     assert imported_scene(tmp_path, tmp_path / "a.ply")[0].colors[-1].tolist() == [255, 1, 0]
 
 
 @pytest.mark.parametrize("name", ["a.laz", "a.las", "a.e57", "a.ply", "text.ply", "a.pcd", "text.pcd", "a.copc.laz"])
 def test_a_file_that_is_cut_short_is_one_sentence(tmp_path, cloud, name, monkeypatch):
-    monkeypatch.setattr("scenefuse.cloud.tiles.parts.AT_ONCE", 64)
+    monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", 64)
     source = write_as(tmp_path / name, cloud)
     source.write_bytes(source.read_bytes()[:-3000])
     with pytest.raises(StageError, match=f"{name} is (cut short: its last|not a readable)"):

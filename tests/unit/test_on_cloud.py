@@ -8,7 +8,8 @@ import pyproj
 import pytest
 from support.surveyed import FRAME, fly, gcp_lines, write_inputs
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.crop.crop_cloud import CropSettings
 from scenefuse.crop.crop_scene import CropInputs, crop_scene

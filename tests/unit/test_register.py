@@ -10,8 +10,9 @@ import pytest
 from support.cloud_files import UTM, write_e57
 from support.planted import errors, plant
 
-from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud, write_laz
-from scenefuse.cloud.formats import las_crs
+from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
+from scenefuse.cloud.readers.las import las_crs
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.coarse import CoarseSettings

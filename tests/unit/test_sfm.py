@@ -18,8 +18,7 @@ from scenefuse.sfm.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
 from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MappingSettings, map_photos
-from scenefuse.sfm.matches import match_features
-from scenefuse.sfm.pairs import MatchSettings, choose_pairs, sequential_pairs, spatial_pairs
+from scenefuse.sfm.matches import MatchSettings, choose_pairs, match_features, sequential_pairs, spatial_pairs
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture
 
 PAIRS = MatchSettings(spatial_from=10, exhaustive_up_to=20, neighbours=3, overlap=2, loop_every=4)

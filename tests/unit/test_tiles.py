@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from plyfile import PlyData
 
+from scenefuse.cloud import tiled_cloud
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing, write_cloud
-from scenefuse.cloud.tiles import tiled_cloud, write_tiles
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
-from scenefuse.cloud.tiles.write_tiles import write_tiled
+from scenefuse.cloud.tiled_cloud import open_cloud, write_tiled
 from scenefuse.core.stage import StageError
 
 LOW, HIGH = np.array([30.0, 40.0, -1.0]), np.array([36.0, 47.0, 3.0])
@@ -20,9 +19,8 @@ def small_tiles(monkeypatch):
     """Clouds of more than 2000 points are large, tiles hold 500, and 3000 are held at once."""
     for name, number in {"WHOLE": 2000, "TILE": 500}.items():
         monkeypatch.setattr(tiled_cloud, name, number)
-        monkeypatch.setattr(write_tiles, name, number)
     monkeypatch.setattr(tiled_cloud, "AT_ONCE", 3000)
-    monkeypatch.setattr(write_tiles, "POINTS_A_CELL", 20)
+    monkeypatch.setattr(tiled_cloud, "POINTS_A_CELL", 20)
 
 
 @pytest.fixture
@@ -129,7 +127,7 @@ def test_bad_files_are_one_sentence(tmp_path, cloud):
 
 
 def test_a_full_disk_is_said_before_anything_is_written(tmp_path, cloud, monkeypatch):
-    monkeypatch.setattr(write_tiles.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
+    monkeypatch.setattr(tiled_cloud.shutil, "disk_usage", lambda _: SimpleNamespace(free=1000))
     with pytest.raises(
         StageError, match=r"the disk is too full for .*a\.ply: it needs 0\.00082 GB and 1e-06 GB are free"
     ):

@@ -15,7 +15,8 @@ from support.cloud_files import UTM
 from support.planted import plant
 
 from scenefuse.cloud.cloud_file import EVERYWHERE, CloudFile
-from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud, write_laz
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
+from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, quantity, read_json, value
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
@@ -377,8 +378,8 @@ def test_an_input_in_the_folder_of_the_results_is_kept(tmp_path, house):
 
 def in_parts(monkeypatch, rows, most):
     """Files are read so many rows at a time, and so many points of a part are held."""
-    monkeypatch.setattr("scenefuse.cloud.tiles.parts.AT_ONCE", rows)
-    monkeypatch.setattr("scenefuse.cloud.tiles.statistics.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", rows)
+    monkeypatch.setattr("scenefuse.cloud.cloud_file.AT_ONCE", rows)
     monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
 
 
@@ -429,7 +430,7 @@ def test_a_crop_box_is_all_that_is_held_of_a_scene(tmp_path):
     write_survey(tmp_path / "yard.laz", in_scene(sheet(0, 40)))
     low, high = UTM + [2.95, -1, -1], UTM + [4.95, 3, 1]
     held = CloudFile.of(tmp_path / "yard.laz", (low, high))
-    assert (len(held.part), held.survey.count) == (20 * 20, 400 * 20)
+    assert (len(held.part), held.summary.count) == (20 * 20, 400 * 20)
     rows, near = held.near(low - 1, high + 1)
     assert len(near) == 40 * 20 and np.array_equal(near.points, read_cloud(tmp_path / "yard.laz").points[rows])
 
@@ -450,12 +451,12 @@ def test_points_at_zero_that_fill_a_whole_part_are_none_either(tmp_path, monkeyp
     scene = in_scene(sheet(0, 4))
     write_cloud(tmp_path / "yard.ply", Cloud(np.concatenate([scene.points, np.zeros((1200, 3))])))
     held = CloudFile.of(tmp_path / "yard.ply")
-    assert held.survey.count == len(held.part) == len(scene)
+    assert held.summary.count == len(held.part) == len(scene)
     assert any("1200 points at 0 0 0, far from all others, of" in note for note in held.notes)
     assert sum(len(cloud) for _, cloud in held.parts()) == len(held.near(*EVERYWHERE)[0]) == len(scene)
     # A site whose own zero lies in it has a point there.
     write_cloud(tmp_path / "site.ply", Cloud(np.concatenate([sheet(0, 4).points, np.zeros((1, 3))])))
-    assert CloudFile.of(tmp_path / "site.ply").survey.count == len(scene) + 1
+    assert CloudFile.of(tmp_path / "site.ply").summary.count == len(scene) + 1
 
 
 def test_an_object_may_be_anywhere_whatever_crs_its_file_names(tmp_path, house, monkeypatch):
@@ -527,7 +528,7 @@ def test_a_las_of_an_old_version_is_completed(tmp_path):
     done = complete(own(sheet(2, 8)), scene, POSE, FusionSettings(mode="append"))
     append_to_las(tmp_path / "completed.las", scene, done)
     after = laspy.read(tmp_path / "completed.las")
-    assert len(after.points) == scene.survey.rows + len(done.added)
+    assert len(after.points) == scene.summary.rows + len(done.added)
 
 
 def test_colours_that_the_scene_has_no_place_for_are_named(tmp_path):

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from scenefuse.cloud.readers.columns import COLOR, Columns
 from scenefuse.core.stage import StageError
 
-# Lines that are taken at once where nobody says how many: as text they take twice the memory of their numbers.
-LINES_AT_ONCE = 1_000_000
-
 
 @dataclass(frozen=True)
 class _Header:
@@ -40,8 +37,8 @@ class _Header:
     begin: int
 
 
-def pcd_parts(path: Path, at_once: int | None = None) -> Iterator[Columns]:
-    """The columns of a PCD file, so many rows at a time, all by default; compressed ones are held whole.
+def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
+    """The columns of a PCD file, so many rows at a time; compressed ones are held whole.
 
     Raises:
         StageError: the file is cut short.
@@ -76,33 +73,33 @@ def _header(path: Path) -> _Header:
     return _Header(names, types, repeats, count, words["DATA"][0], begin)
 
 
-def _lines(path: Path, header: _Header, at_once: int | None) -> Iterator[list[NDArray[Any]]]:
+def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The fields (N, n) each of rows of text."""
     cuts = np.cumsum(header.repeats)[:-1]
     with open(path, encoding="ascii") as file:
         file.seek(header.begin)
         left = header.count
-        while lines := list(islice(file, min(at_once or LINES_AT_ONCE, left))):
+        while lines := list(islice(file, min(at_once, left))):
             left -= len(lines)
             rows = np.loadtxt(lines, ndmin=2)
             yield [part.astype(kind) for part, kind in zip(np.split(rows, cuts, axis=1), header.types)]
 
 
-def _rows(path: Path, header: _Header, at_once: int | None) -> Iterator[list[NDArray[Any]]]:
+def _rows(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The same of binary rows."""
     fields = [(str(k), kind, (n,)) for k, (kind, n) in enumerate(zip(header.types, header.repeats))]
     row, left = np.dtype(fields), header.count
     with open(path, "rb") as file:
         file.seek(header.begin)
         while left:
-            rows = np.fromfile(file, row, min(at_once or left, left))
+            rows = np.fromfile(file, row, min(at_once, left))
             if not len(rows):
                 return
             left -= len(rows)
             yield [np.ascontiguousarray(rows[name]) for name, *_ in fields]
 
 
-def _compressed(path: Path, header: _Header, at_once: int | None) -> Iterator[list[NDArray[Any]]]:
+def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The same of compressed columns, one after the other."""
     with open(path, "rb") as file:
         file.seek(header.begin)
@@ -113,9 +110,8 @@ def _compressed(path: Path, header: _Header, at_once: int | None) -> Iterator[li
         np.frombuffer(raw, kind, header.count * n, at).reshape(header.count, n)
         for kind, n, at in zip(header.types, header.repeats, np.cumsum([0, *sizes]))
     ]
-    step = at_once or max(header.count, 1)
-    for first in range(0, header.count, step):
-        yield [array[first : first + step] for array in arrays]
+    for first in range(0, header.count, at_once):
+        yield [array[first : first + at_once] for array in arrays]
 
 
 def _columns(header: _Header, arrays: list[NDArray[Any]]) -> Columns:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, Columns, common_name
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, Columns, common_name
 from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
@@ -20,13 +20,11 @@ EASTING = ("x", "easting", "east", "e", "rechtswert", "rw", "ostwert")
 NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
 # By how much the better of two places for the colours among the columns has to be.
-CLEARLY = 0.1
+MIN_CORRELATION_GAIN = 0.1
 # Rows or columns that no scanner's grid has more of; most coordinates in metres do.
-MOST_ROWS = 100_000
+MAX_GRID_ROWS = 100_000
 # Lines in which the first row is looked for, and rows by which it is told what their columns are.
-HEAD, LOOKED_AT = 50, 100_000
-# Lines that are taken at once where nobody says how many: as text they take twice the memory of their numbers.
-AT_ONCE = 1_000_000
+MAX_HEAD_LINES, MAX_LAYOUT_ROWS = 50, 100_000
 
 
 @dataclass(frozen=True)
@@ -77,12 +75,12 @@ def text_layout(path: Path) -> TextLayout:
         ValueError: no rows of numbers.
     """
     with open(path, encoding=_encoding(path)) as file:
-        head = list(islice(file, HEAD))
+        head = list(islice(file, MAX_HEAD_LINES))
         if not "".join(head).strip():
             return TextLayout(columns=dict(zip(POSITION, range(3))))
         above, named = _first_row(path, head)
         begin = TextLayout(above, _separator(head[above]), named, path.suffix.lower() == ".pts")
-        rows = begin.rows(head[above:] + list(islice(file, LOOKED_AT)))
+        rows = begin.rows(head[above:] + list(islice(file, MAX_LAYOUT_ROWS)))
     names = _names(head[:above], begin.separator, rows.shape[1])
     if len(names) == rows.shape[1]:
         if set(POSITION) <= {common_name(name) for name in names}:
@@ -126,7 +124,7 @@ def text_notes(path: Path) -> list[str]:
     return text_layout(path).notes if path.suffix.lower() in TEXTS else []
 
 
-def text_parts(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
+def read_text(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
     """The columns of a file of text (`text_layout`), so many rows at a time.
 
     Raises:
@@ -205,7 +203,7 @@ def _colors_at(path: Path, rows: NDArray[np.float64]) -> tuple[int, list[str]]:
     varying = len(places) == 2 and len(finite) > 1 and (np.ptp(finite[:, 3:7], axis=0) > 0).all()
     alike = np.array(np.corrcoef(finite[:, 3:7].T)) if varying else np.zeros((4, 4))
     behind, before = min(alike[0, 1], alike[1, 2]), min(alike[1, 2], alike[2, 3])
-    if abs(before - behind) > CLEARLY:
+    if abs(before - behind) > MIN_CORRELATION_GAIN:
         first = 4 if before > behind else 3
         said = f"columns {first + 1} to {first + 3} are taken for red, green and blue"
     else:
@@ -246,7 +244,7 @@ def _indices(rows: NDArray[np.float64]) -> int:
         return 0
     whole = (rows == np.rint(rows)).all(0)
     if columns > 4 and whole[:2].all() and not whole[2:5].any() and (columns % 3 == 2 or whole[5:].all()):
-        return 2 if rows[:, :2].min() >= 0 and rows[:, :2].max() <= MOST_ROWS else 0
+        return 2 if rows[:, :2].min() >= 0 and rows[:, :2].max() <= MAX_GRID_ROWS else 0
     if (first == first[0] + np.arange(len(first))).all():
         return 1
     once = len(np.unique(first)) == len(first)

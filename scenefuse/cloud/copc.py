@@ -18,8 +18,9 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import LENGTHS, LasLayout
-from scenefuse.cloud.tiles.tiled_cloud import AT_ONCE, TiledCloud
+from scenefuse.cloud.readers.columns import AT_ONCE
+from scenefuse.cloud.tiled_cloud import TiledCloud
+from scenefuse.cloud.write_las import LENGTHS, LasLayout
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Array
 
@@ -42,7 +43,7 @@ Steps = NDArray[np.int64]
 
 
 def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], crs: str | None) -> None:
-    """Write a cloud of any size as COPC; steps, offsets and columns as of `clouds.write_laz`.
+    """Write a cloud of any size as COPC; steps, offsets and columns as of `write_laz`.
 
     Args:
         path: output, .copc.laz.

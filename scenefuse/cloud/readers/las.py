@@ -1,0 +1,93 @@
+"""LAS and LAZ read: points, what the format says of them, and the coordinate system."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns
+from scenefuse.core.stage import StageError
+
+ENDINGS = (".las", ".laz")
+# What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
+LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
+# Classes of LAS that are no surface: low and high noise; the flag of points that whoever edited the cloud took out.
+NOISE, WITHHELD = (7, 18), "withheld"
+
+
+def las_crs(path: Path) -> str | None:
+    """The coordinate system of a LAS or LAZ file as WKT; None where it has none, and for any other file."""
+    if path.suffix.lower() not in ENDINGS:
+        return None
+    import laspy
+
+    with laspy.open(path) as file:
+        crs = _crs(file.header)
+    return None if crs is None else crs.to_wkt()
+
+
+def check_projected(path: Path) -> None:
+    """StageError where a LAS or LAZ file is in degrees."""
+    import pyproj
+
+    wkt = las_crs(path)
+    crs = None if wkt is None else pyproj.CRS.from_wkt(wkt)
+    if crs is not None and crs.is_geocentric:
+        raise StageError(
+            f"{path} is in geocentric coordinates ({crs.name}), with z along the earth's axis; project it first"
+        )
+    if crs is not None and crs.is_geographic:
+        raise StageError(f"{path} is in degrees ({crs.name}); project it to metres first, to UTM for instance")
+
+
+def las_dimensions(path: Path) -> list[str]:
+    """What a LAS or LAZ file says of its points beside position, colour and extra dimensions, as far as it differs
+    among the first million or is a class: names of the format; empty for any other file."""
+    if path.suffix.lower() not in ENDINGS:
+        return []
+    import laspy
+
+    with laspy.open(path) as file:
+        points = next(iter(file.chunk_iterator(AT_ONCE)), None)
+    if points is None:
+        return []
+    form = points.point_format
+    names = [name for name in form.standard_dimension_names if name.lower() not in (*POSITION, *COLOR)]
+    values = {name: np.asarray(points[name]) for name in names}
+    differing = {name for name in names if values[name].min() != values[name].max()}
+    return [name for name in names if name in differing or (name == "classification" and values[name].any())]
+
+
+def read_las(path: Path, at_once: int) -> Iterator[Columns]:
+    """Positions, colours, extra dimensions of one number, classes and intensities, and what is withheld, so many points
+    at a time. A format with colours is used for points without, which are all black then."""
+    import laspy
+
+    with laspy.open(path) as file:
+        form, count = file.header.point_format, 0
+        named = [*POSITION, *(COLOR if set(COLOR) <= set(form.dimension_names) else ())]
+        for points in file.chunk_iterator(at_once):
+            count += len(points)
+            extra = {name: np.asarray(points[name]) for name in form.extra_dimension_names}
+            own = {name: np.asarray(points[name]).astype(kind) for name, kind in LAS_DIMENSIONS.items()}
+            own[WITHHELD] = np.asarray(points[WITHHELD]) != 0
+            yield (
+                {name: np.asarray(points[name]) for name in named}
+                | own
+                | {name: values for name, values in extra.items() if values.ndim == 1 and name not in own}
+            )
+        if count < file.header.point_count:
+            missing = file.header.point_count - count
+            raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+
+
+def _crs(header: Any) -> Any:
+    """The pyproj CRS of a LAS header, or None; an entry that pyproj cannot read counts as none."""
+    from pyproj.exceptions import CRSError
+
+    try:
+        return header.parse_crs()
+    except CRSError as error:
+        print(f"the file's coordinate system cannot be read and is ignored: {error}", flush=True)
+        return None
