@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, records_of
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS
-from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows, TiledCloud, open_cloud
-from scenefuse.cloud.tiled_cloud import reserved
+from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows, TiledCloud, open_cloud, reserved
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import KEPT
 from scenefuse.fuse.measure import FIELDS, MEASURED, unchecked

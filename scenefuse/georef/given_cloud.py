@@ -16,7 +16,7 @@ from scenefuse.cloud.import_cloud import IMPORTED, MIN_POINTS, ImportedFile
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS, las_crs
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
-from scenefuse.geometry.photo_check import LEAST_PHOTOS
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.georef.on_cloud import FIT, check_fit, cloud_crs, fit_to_cameras, in_local, misfit
 from scenefuse.photos.cameras.place import read_place
 from scenefuse.photos.geodesy import LocalFrame, length_unit, scene_frame
@@ -179,7 +179,7 @@ def inside_masks(points: Array, views: list[View]) -> NDArray[np.bool_]:
         rows, pixels, _ = view.visible(points)
         framed[rows] += 1
         inside[rows] += view.pixels[pixels[:, 1], pixels[:, 0]]
-    return np.asarray((framed >= LEAST_PHOTOS) & (inside >= MIN_INSIDE * framed))
+    return np.asarray((framed >= CONFIRMING_PHOTOS) & (inside >= MIN_INSIDE * framed))
 
 
 def _cut_out(whole: Cloud, source: Path, workspace: Path, masks: Path) -> Cloud:

@@ -21,7 +21,7 @@ from scenefuse.cloud.strays import STRAY_PERCENT
 from scenefuse.core.stage import StageError, quantity, threads, value
 from scenefuse.core.transforms import Array, Sim3, box_corners, rotation_angle_deg
 from scenefuse.geometry.icp import refine_on_cloud
-from scenefuse.geometry.photo_check import LEAST_PHOTOS
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.georef.placement import middle_of
 from scenefuse.georef.residuals import Georeference
 from scenefuse.photos.geodesy import LocalFrame
@@ -96,7 +96,7 @@ def misfit(fit: dict[str, Any]) -> str:
     """What says that a cloud lies in other coordinates than the cameras; "" where nothing does. Of `fit_to_cameras`."""
     seen, met = value(fit, "seen_share"), value(fit, "met_share")
     if seen < MIN_SEEN:
-        return f"{100 * seen:.0f} % of its points are in the pictures of {LEAST_PHOTOS} photos"
+        return f"{100 * seen:.0f} % of its points are in the pictures of {CONFIRMING_PHOTOS} photos"
     words = f"{100 * met:.0f} % of the points where the photos' matches meet lie on it"
     if "met_share_if_moved" in fit and _is_off(fit):
         by = f"{100 * value(fit, 'moved_by_over_distance'):.2g} % of the cameras' distance"
@@ -252,7 +252,7 @@ def _seen(points: Array, views: list[View]) -> float:
     count = np.zeros(len(points), np.int64)
     for view in views:
         count[view.visible(points)[0]] += 1
-    return float((count >= LEAST_PHOTOS).mean())
+    return float((count >= CONFIRMING_PHOTOS).mean())
 
 
 def _in_box_of(points: Array, own: Array) -> Array:

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.cloud_file import CloudFile
-from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
 from scenefuse.cloud.clouds import MAX_STEP, Cloud, spacing
-from scenefuse.cloud.readers.las import las_crs
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.columns import COLOR
+from scenefuse.cloud.readers.las import las_crs
 from scenefuse.cloud.tiled_cloud import Rows
+from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, scratch_directory, write_json
 from scenefuse.core.transforms import Sim3

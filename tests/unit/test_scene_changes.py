@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.changed_scene import write_changes
 
-from scenefuse.cloud.clouds import Cloud, concatenate, write_cloud
 from scenefuse.cloud import tiled_cloud
+from scenefuse.cloud.clouds import Cloud, concatenate, write_cloud
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.fuse.measure import MEASURED, STEREO_ONLY
 from scenefuse.fuse.write import added_by, after_fusion, merged, read_changes
