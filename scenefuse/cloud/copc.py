@@ -24,22 +24,22 @@ from scenefuse.cloud.write_las import LENGTHS, LasLayout
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Array
 
+# A node's grid has 2^7 cells along each axis, as is usual.
 GRID_BITS = 7
-"""A node's grid has 2^7 cells along each axis, as is usual."""
+# A cube of no more points is not divided.
 NODE_POINTS = 1 << 16
-"""A cube of no more points is not divided."""
+# Tiles of the source that are kept for the neighbouring cubes.
 TILES_HELD = 32
-"""Tiles of the source that are kept for the neighbouring cubes."""
+# A node in the hierarchy, and the head of the record that holds it.
 ENTRY, EXTENDED = struct.Struct("<4iQ2i"), struct.Struct("<H16sHQ32s")
-"""A node in the hierarchy, and the head of the record that holds it."""
 
+# Level and place along x, y, z of a cube.
 Key = tuple[int, int, int, int]
-"""Level and place along x, y, z of a cube."""
 ROOT: Key = (0, 0, 0, 0)
+# Points as the file has them.
 Records = NDArray[Any]
-"""Points as the file has them."""
+# Places counted in the file's steps, or numbers of tiles.
 Steps = NDArray[np.int64]
-"""Places counted in the file's steps, or numbers of tiles."""
 
 
 def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], crs: str | None) -> None:

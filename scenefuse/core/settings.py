@@ -14,8 +14,8 @@ from scenefuse.core.stage import StageError
 
 PACKAGE = Path(__file__).resolve().parents[1]
 SHIPPED = PACKAGE / "shipped"
+# Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's.
 ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent
-"""Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's."""
 T = TypeVar("T")
 
 

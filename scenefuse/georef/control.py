@@ -25,7 +25,7 @@ MIN_WIDTH_SHARE = 0.01
 
 
 @dataclass(frozen=True)
-class Sighting:
+class LocatedPoint:
     """A surveyed point as a model's cameras see it.
 
     Attributes:
@@ -48,37 +48,37 @@ class Control:
     Attributes:
         path: of the file, for messages.
         grid: the projected CRS of the coordinates, "" for a geographic one.
-        sightings: of every point in the file.
+        located: of every point in the file.
         notes: a line for every click and point that is left out.
     """
 
     path: Path
     grid: str
-    sightings: list[Sighting]
+    located: list[LocatedPoint]
     notes: list[str]
 
 
-def read_sighted(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]) -> Control:
+def read_control_points(path: Path, model: pycolmap.Reconstruction, photos: list[Photo]) -> Control:
     """Read surveyed points and find them in a model.
 
     Raises:
-        StageError: what `read_control` and `sight` say; fewer than three control points that can be used.
+        StageError: what `read_control` and `locate_points` say; fewer than three control points that can be used.
     """
     surveyed = read_control(path)
-    sightings, notes = sight(surveyed, model, {p.name: (p.width, p.height) for p in photos})
-    good = [s for s in sightings if not (s.problem or s.point.check) and np.isfinite(s.point.position).all()]
+    located, notes = locate_points(surveyed, model, {p.name: (p.width, p.height) for p in photos})
+    good = [s for s in located if not (s.problem or s.point.check) and np.isfinite(s.point.position).all()]
     if len(good) < MIN_CONTROL_POINTS:
-        reasons = "; ".join(f"{s.point.name}: {s.problem}" for s in sightings if s.problem and not s.point.check)
+        reasons = "; ".join(f"{s.point.name}: {s.problem}" for s in located if s.problem and not s.point.check)
         raise StageError(
             f"{path}: {len(good)} control points with a height can be used, {MIN_CONTROL_POINTS} are needed"
             f"{f' ({reasons})' if reasons else ''}; click more points, each in two photos or more"
         )
-    return Control(path, grid_name(surveyed.crs), sightings, notes)
+    return Control(path, grid_name(surveyed.crs), located, notes)
 
 
-def sight(
+def locate_points(
     control: ControlFile, model: pycolmap.Reconstruction, sizes: Mapping[str, tuple[int, int]]
-) -> tuple[list[Sighting], list[str]]:
+) -> tuple[list[LocatedPoint], list[str]]:
     """Find each surveyed point by its clicks, and say which clicks are left out and why.
 
     Clicks that do not agree with most of the others on the point are left out; so are those in photos that are not
@@ -94,7 +94,7 @@ def sight(
     """
     images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
     sizes = {composed(name): size for name, size in sizes.items()}
-    sightings, notes = [], []
+    located, notes = [], []
     for point in control.points:
         seen, lost = [], []
         for click in point.clicks:
@@ -107,15 +107,15 @@ def sight(
             else:
                 lost.append(photo)
         notes += [f"{point.name}: {photo} could not be registered, its click is left out" for photo in lost]
-        sighting, dropped = _agreed(replace(point, clicks=seen), {image.name: image for image in images.values()})
-        sightings.append(sighting)
-        notes += dropped + ([f"{point.name} is left out: {sighting.problem}"] if sighting.problem else [])
-    return sightings, notes
+        located_point, dropped = _agreed(replace(point, clicks=seen), {image.name: image for image in images.values()})
+        located.append(located_point)
+        notes += dropped + ([f"{point.name} is left out: {located_point.problem}"] if located_point.problem else [])
+    return located, notes
 
 
-def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple[Sighting, list[str]]:
+def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple[LocatedPoint, list[str]]:
     """A point by the largest set of its clicks that agree, and a line for every other click."""
-    nowhere = Sighting(point, np.full(3, np.nan), np.zeros(0))
+    nowhere = LocatedPoint(point, np.full(3, np.nan), np.zeros(0))
     if len(point.clicks) < 2:
         where = f"in {point.clicks[0].photo} only" if point.clicks else "in no registered photo"
         return replace(nowhere, problem=f"it is clicked {where}; click it in two or more"), []
@@ -148,7 +148,7 @@ def _agreed(point: SurveyedPoint, images: Mapping[str, pycolmap.Image]) -> tuple
         for k, click in enumerate(point.clicks)
         if k not in agree
     ]
-    return Sighting(replace(point, clicks=[point.clicks[k] for k in agree]), position, off[list(agree)]), dropped
+    return LocatedPoint(replace(point, clicks=[point.clicks[k] for k in agree]), position, off[list(agree)]), dropped
 
 
 def off_px(position: Array, images: list[pycolmap.Image], pixels: Array) -> Array:
@@ -168,24 +168,24 @@ def check_spread(target: Array, names: list[str], where: str) -> None:
         )
 
 
-def seen_at(sightings: list[Sighting], model: pycolmap.Reconstruction) -> tuple[Array, Array]:
+def seen_at(located: list[LocatedPoint], model: pycolmap.Reconstruction) -> tuple[Array, Array]:
     """Places (N, 3) of points in a model by their clicks, and RMS distances (N,) of clicks from these, in pixels.
 
     NaN where clicks give nothing.
     """
     images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
-    places, rms_px = np.full((len(sightings), 3), np.nan), np.full(len(sightings), np.nan)
-    for row, sighting in enumerate(sightings):
-        if not sighting.problem:
-            seen = [images[click.photo] for click in sighting.point.clicks]
-            position, residual = intersect(seen, np.array([click.pixel for click in sighting.point.clicks]))
+    places, rms_px = np.full((len(located), 3), np.nan), np.full(len(located), np.nan)
+    for row, located_point in enumerate(located):
+        if not located_point.problem:
+            seen = [images[click.photo] for click in located_point.point.clicks]
+            position, residual = intersect(seen, np.array([click.pixel for click in located_point.point.clicks]))
             if position is not None:
                 places[row], rms_px[row] = position, residual
     return places, rms_px
 
 
-def describe_misses(sighting: Sighting, local_from_model: Sim3, target: Array) -> str:
+def describe_misses(located_point: LocatedPoint, local_from_model: Sim3, target: Array) -> str:
     """How far a point (3,) is from its coordinates, and where it was clicked."""
-    miss = float(np.sqrt(np.nansum((local_from_model.apply(sighting.x_in_model) - target) ** 2)))
-    photos = ", ".join(click.photo for click in sighting.point.clicks)
+    miss = float(np.sqrt(np.nansum((local_from_model.apply(located_point.x_in_model) - target) ** 2)))
+    photos = ", ".join(click.photo for click in located_point.point.clicks)
     return f"by its clicks in {photos} it lies {miss:.2f} m from its coordinates; correct these or the clicks"

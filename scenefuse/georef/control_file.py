@@ -63,7 +63,7 @@ class ControlFile:
 def read_control(path: Path) -> ControlFile:
     """Read a gcp_list.txt: the CRS in the first line, then one click a line, `x y z pixel_x pixel_y photo name`.
 
-    Points without a name are told by their coordinates; z may be NaN. Numbers in the eighth and ninth column are
+    Points without a name are named by their coordinates; z may be NaN. Numbers in the eighth and ninth column are
     standard deviations in metres, horizontal and vertical. Points named CHK-... are check points. Columns are separated
     by tabs, semicolons, commas or blanks. Lines that begin with # are ignored.
 
@@ -98,7 +98,7 @@ def _cells(line: str) -> list[str]:
 
 
 def unknown_photo(path: Path, point: str, photo: str, names: Collection[str]) -> StageError:
-    """The error that a click lies in a photo that is none of the scene's `names`."""
+    """The error of a click in a photo that the scene does not have; it has those of `names`."""
     return StageError(
         f"{path}: point {point} is clicked in {photo}, which is none of the {len(names)} photos"
         f" ({next(iter(names), '')}, ...); correct the name"

@@ -12,7 +12,7 @@ from scenefuse.cloud.crs import check_in_area, grid_name, projected_crs
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, value, write_json
 from scenefuse.core.transforms import box_corners, fit_sim3
 from scenefuse.georef.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_survey
-from scenefuse.georef.control import Control, read_sighted
+from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
     ELSEWHERE_M,
@@ -79,14 +79,14 @@ def georegister(
         seed: of RANSAC.
 
     Raises:
-        StageError: what `read_sighted`, `read_lengths`, `place_by_control`, `beside_gps` and `lay_on_cloud` say; `crs`
-            is given and nothing says where the scene lies, or it lies elsewhere.
+        StageError: as of `read_control_points`, `read_lengths`, `place_by_control`, `beside_gps` and `lay_on_cloud`;
+            `crs` is given but the scene has no place on the earth, or one outside it.
     """
     model, listed = read_model(sparse), read_photos(photos)
     names, rotations, centres = camera_poses(model)
     gps = gps_cameras(names, centres, listed, settings.gps_accuracy_m)
     up, cue = estimate_up(rotations, centres)
-    surveyed = None if control is None else read_sighted(control, model, listed)
+    surveyed = None if control is None else read_control_points(control, model, listed)
     place = read_place(read_json(sparse_json))
     if place is not None and surveyed is None:
         found = placed_as_given(place, model, gps)
@@ -148,13 +148,13 @@ def georeference(
     """
     by_gps = settings.use_gps and len(gps.names) >= MIN_GPS_PHOTOS
     if control is not None:
-        positions = np.array([s.point.position for s in control.sightings])
+        positions = np.array([s.point.position for s in control.located])
         frame = replace(local_frame(positions), grid=control.grid)
         there, where = frame.apply(positions), str(control.path)
-        placement, notes = place_by_control(control.sightings, there, up, where, seed)
+        placement, notes = place_by_control(control.located, there, up, where, seed)
         if by_gps:
             positions = frame.apply(gps.positions)
-            placement = beside_gps(placement, control.sightings, there, gps, positions, where, settings)
+            placement = beside_gps(placement, control.located, there, gps, positions, where, settings)
         return Georeference(placement, frame, gps, replace(control, notes=[*control.notes, *notes]))
     if by_gps:
         frame = local_frame(gps.positions)
@@ -208,7 +208,7 @@ def adjust_georeferenced(model: pycolmap.Reconstruction, found: Georeference, fr
     chosen = placement.inliers if len(placement.inliers) else np.zeros(len(gps.names), dtype=bool)
     places = frame.apply(gps.positions[chosen]) - placement.gps_shift
     photos = SurveyedPhotos([n for n, c in zip(gps.names, chosen) if c], places, gps.sd_m[chosen])
-    used = [s for s, u in zip(found.sightings, placement.used) if u]
+    used = [s for s, u in zip(found.located, placement.used) if u]
     if not (used or photos.names):
         return {}
     points = SurveyedPoints(

@@ -41,8 +41,8 @@ def import_posed_cloud(
 ) -> None:
     """Take the cloud of given cameras into the frame that these are in now (M12), or one that photos lie on (M14).
 
-    It lies in the coordinates of the cameras, or in a CRS where their project, or the scene's survey, says how they lie
-    on the earth.
+    It lies in the coordinates of the cameras, or in a CRS where their project or the scene's survey places them on the
+    earth.
 
     Args:
         source: PLY, LAS, LAZ, E57, PCD, text, or a mesh (PLY, OBJ, GLB) that points are drawn from.

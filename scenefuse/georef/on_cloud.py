@@ -93,7 +93,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
 
 
 def misfit(fit: dict[str, Any]) -> str:
-    """What says that a cloud lies in other coordinates than the cameras; "" where nothing does. Of `fit_to_cameras`."""
+    """Why a cloud lies in other coordinates than the cameras, by `fit_to_cameras`; "" where it lies in theirs."""
     seen, met = value(fit, "seen_share"), value(fit, "met_share")
     if seen < MIN_SEEN:
         return f"{100 * seen:.0f} % of its points are in the pictures of {CONFIRMING_PHOTOS} photos"
@@ -217,11 +217,19 @@ def _beside(cloud: Path, own: Array, crs: pyproj.CRS, frame: LocalFrame) -> Arra
 def _onto(cloud: Array, own: Array, name: str) -> Sim3:
     """The similarity that lays a model (M, 3) on a cloud (N, 3), from metres away: ICP until it stays, by the points of
     the model that lie over the cloud."""
-    moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[_over(cloud, own, name)])]))
+    over = _over(cloud, own)
+    if over.sum() < MIN_OVER:
+        raise StageError(
+            f"{over.sum()} of the {len(own)} points that the photos' matches give lie over {name}, {MIN_OVER} are"
+            " needed; give a cloud that shows more of what the photos do"
+        )
+    moved = Sim3(1.0, np.eye(3), np.array([0.0, 0.0, _height_above(cloud, own[over])]))
     stays = MAX_STEP * float(np.linalg.norm(np.ptp(own, axis=0)))
     for _ in range(ROUNDS):
         here = moved.apply(own)
-        here = here[_over(cloud, here, name)]
+        here = here[_over(cloud, here)]
+        if len(here) < MIN_OVER:
+            break
         step = refine_on_cloud(here, cloud)
         moved = step @ moved
         if np.linalg.norm(step.apply(here) - here, axis=1).max() < stays:
@@ -229,16 +237,10 @@ def _onto(cloud: Array, own: Array, name: str) -> Sim3:
     return moved
 
 
-def _over(cloud: Array, own: Array, name: str) -> NDArray[np.bool_]:
+def _over(cloud: Array, own: Array) -> NDArray[np.bool_]:
     """(M,) which points of a model lie over a cloud (N, 3)."""
     low, high = np.percentile(cloud[:, :2], [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
-    over = ((own[:, :2] >= low) & (own[:, :2] <= high)).all(1)
-    if over.sum() < MIN_OVER:
-        raise StageError(
-            f"{over.sum()} of the {len(own)} points that the photos' matches give lie over {name}, {MIN_OVER} are"
-            " needed; give a cloud that shows more of what the photos do"
-        )
-    return np.asarray(over)
+    return np.asarray(((own[:, :2] >= low) & (own[:, :2] <= high)).all(1))
 
 
 def _height_above(cloud: Array, own: Array) -> float:

@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
 from scenefuse.core.transforms import SD_OVER_MEDIAN, Sim3, fit_sim3, fit_sim3_robust, rotation_between
-from scenefuse.georef.control import Sighting, check_spread, describe_misses
+from scenefuse.georef.control import LocatedPoint, check_spread, describe_misses
 from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
 
-# Fewer registered photos with GPS are too few to tell a wild position from the others.
+# Fewer registered photos with GPS do not show which of them is an outlier.
 MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
@@ -86,7 +86,7 @@ class GpsCameras:
 
 
 def place_by_control(
-    sightings: list[Sighting], target: Array, up: Array, where: str, seed: int
+    located: list[LocatedPoint], target: Array, up: Array, where: str, seed: int
 ) -> tuple[Placement, list[str]]:
     """Fit local_from_model to surveyed points in the model and their coordinates (P, 3) in metres.
 
@@ -94,7 +94,7 @@ def place_by_control(
     left out.
 
     Args:
-        sightings: P surveyed points.
+        located: P surveyed points.
         target: their coordinates.
         up: (3,) the cameras' up direction in the model.
         where: the file, for messages.
@@ -106,12 +106,12 @@ def place_by_control(
     Raises:
         StageError: points along one line, too few that agree, or a model that they turn upside down.
     """
-    rows = np.array([k for k, s in enumerate(sightings) if not (s.problem or s.point.check)])
-    names = [sightings[k].point.name for k in rows]
-    there, start = target[rows], np.array([sightings[k].x_in_model for k in rows])
+    rows = np.array([k for k, s in enumerate(located) if not (s.problem or s.point.check)])
+    names = [located[k].point.name for k in rows]
+    there, start = target[rows], np.array([located[k].x_in_model for k in rows])
     whole = np.isfinite(there).all(1)
     check_spread(there[whole], [n for n, w in zip(names, whole) if w], where)
-    sd_m = max(max(sightings[k].point.sd_m) for k in rows)
+    sd_m = max(max(located[k].point.sd_m) for k in rows)
     limit = max(OUTLIER * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
     try:
         fitted, inliers = fit_measured(start, there, limit, seed)
@@ -127,10 +127,10 @@ def place_by_control(
             f"{where}: the control points turn the model upside down, as swapped axes do; x has to be easting or"
             " longitude, y northing or latitude"
         )
-    used = np.zeros(len(sightings), dtype=bool)
+    used = np.zeros(len(located), dtype=bool)
     used[rows[inliers]] = True
     notes = [
-        f"{names[k]} is left out: {describe_misses(sightings[rows[k]], fitted, target[rows[k]])}"
+        f"{names[k]} is left out: {describe_misses(located[rows[k]], fitted, target[rows[k]])}"
         for k in np.flatnonzero(~inliers)
     ]
     reason = f"{inliers.sum()} of {len(rows)} control points"
@@ -140,7 +140,7 @@ def place_by_control(
 
 def beside_gps(
     placement: Placement,
-    sightings: list[Sighting],
+    located: list[LocatedPoint],
     there: Array,
     gps: GpsCameras,
     target: Array,
@@ -156,7 +156,7 @@ def beside_gps(
 
     Args:
         placement: by control points.
-        sightings: P surveyed points.
+        located: P surveyed points.
         there: (P, 3) their coordinates in the local frame; NaN where a height is unknown.
         gps: N photos with positions.
         target: (N, 3) the positions in the local frame, likewise.
@@ -178,9 +178,9 @@ def beside_gps(
     inliers = np.sqrt(np.nansum((difference - shift) ** 2, axis=1)) <= limit
     if not inliers.any():
         return replace(placement, inliers=inliers, gps_shift=shift)
-    start = [np.array([s.x_in_model for s, u in zip(sightings, points) if u]), gps.centres[inliers]]
+    start = [np.array([s.x_in_model for s, u in zip(located, points) if u]), gps.centres[inliers]]
     wanted = [there[points], target[inliers]]
-    stated = np.array([s.point.sd_m[0] for s, u in zip(sightings, points) if u])
+    stated = np.array([s.point.sd_m[0] for s, u in zip(located, points) if u])
     for _ in range(FILL_ROUNDS):
         here = [fitted.apply(part) for part in start]
         here[1] += shift
@@ -290,7 +290,7 @@ def scaled(placement: Placement, metres_per_unit: float, lengths: int) -> Placem
 def fit_measured(centres: Array, target: Array, limit: float, seed: int) -> tuple[Sim3, NDArray[np.bool_]]:
     """Similarity by RANSAC over positions whose height is known, then least squares over all measured coordinates.
 
-    Unknown heights (NaN in `target`) are set to what the fit says, again and again, which is least squares without them
+    Unknown heights (NaN in `target`) are set to those of the fit, again and again, which is least squares without them
     (expectation maximisation).
 
     Returns:

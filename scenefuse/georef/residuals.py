@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import atomic_file, quantity
 from scenefuse.core.transforms import Array
-from scenefuse.georef.control import Control, Sighting, seen_at
+from scenefuse.georef.control import Control, LocatedPoint, seen_at
 from scenefuse.georef.placement import GpsCameras, Placement
 from scenefuse.marks.lengths import Lengths
 from scenefuse.photos.geodesy import LocalFrame
@@ -32,7 +32,7 @@ class Georeference:
         placement: the similarity and what agrees with it.
         frame: the local frame; None where there is no metric one.
         gps: the photos with positions.
-        control: surveyed points; None where there are none.
+        control: surveyed points, or None.
     """
 
     placement: Placement
@@ -41,9 +41,9 @@ class Georeference:
     control: Control | None = None
 
     @property
-    def sightings(self) -> list[Sighting]:
+    def located(self) -> list[LocatedPoint]:
         """The surveyed points."""
-        return [] if self.control is None else self.control.sightings
+        return [] if self.control is None else self.control.located
 
     @property
     def metric(self) -> bool:
@@ -59,7 +59,7 @@ class Residuals:
         cameras: (N, 3) at the photos with positions, which are first moved by their common shift.
         points: (P, 3) at the surveyed points.
         points_px: (P,) RMS distances of clicks from the points that they show together.
-        lengths: known lengths as the model has them; None where there are none.
+        lengths: known lengths as the model has them, or None.
     """
 
     cameras: Array
@@ -74,8 +74,8 @@ def residuals_of(model: pycolmap.Reconstruction, found: Georeference, lengths: L
         return Residuals(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0), lengths)
     names, positions = found.gps.names, found.frame.apply(found.gps.positions) - found.placement.gps_shift
     centres = np.array([model.find_image_with_name(name).projection_center() for name in names]).reshape(-1, 3)
-    target = found.frame.apply(np.array([s.point.position for s in found.sightings]).reshape(-1, 3))
-    places, rms_px = seen_at(found.sightings, model)
+    target = found.frame.apply(np.array([s.point.position for s in found.located]).reshape(-1, 3))
+    places, rms_px = seen_at(found.located, model)
     return Residuals(centres - positions, places - target, rms_px, lengths)
 
 
@@ -87,8 +87,8 @@ def write_residuals(path: Path, found: Georeference, left: Residuals) -> None:
         for name, error in zip(left.lengths.names, left.lengths.in_model - left.lengths.metres):
             rows.append(["length", name, used, error, *[""] * 7])
     if found.placement.status == "georeferenced":
-        for row, sighting in enumerate(found.sightings):
-            point, kind = sighting.point, "check point" if sighting.point.check else "control point"
+        for row, located_point in enumerate(found.located):
+            point, kind = located_point.point, "check point" if located_point.point.check else "control point"
             used = "yes" if found.placement.used[row] else "no"
             counts = [len(point.clicks), left.points_px[row]]
             rows.append([kind, point.name, used, _length(left.points[row]), *left.points[row], *point.sd_m, *counts])
@@ -169,7 +169,7 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
     notes = [*control.notes, *_misfits(found, control, left)]
     for note in notes:
         print(f"note: {note}", flush=True)
-    check = np.array([s.point.check and not s.problem for s in control.sightings])
+    check = np.array([s.point.check and not s.problem for s in control.located])
     content: dict[str, Any] = {"control_notes": quantity(notes, "")}
     for kind, rows in (("control", found.placement.used), ("check", check)):
         horizontal, vertical = rms(left.points[rows, :2]), rms(left.points[rows, 2:])
@@ -187,14 +187,14 @@ def _of_points(found: Georeference, control: Control, left: Residuals) -> dict[s
 def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str]:
     """A note that names the control points, the worst first, whose errors are too large for what is stated of them."""
     used = found.placement.used
-    sd_m = np.array([s.point.sd_m for s in control.sightings]).reshape(-1, 2)
+    sd_m = np.array([s.point.sd_m for s in control.located]).reshape(-1, 2)
     horizontal = np.linalg.norm(left.points[:, :2], axis=1) / sd_m[:, 0]
     ratio = np.where(used, np.fmax(horizontal, np.abs(left.points[:, 2]) / sd_m[:, 1]), 0.0)
     worst = [k for k in np.argsort(-ratio) if ratio[k] > MISFIT_SD]
     if not worst:
         return []
     named = [
-        "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.sightings[k].point.name, *left.points[k])
+        "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.located[k].point.name, *left.points[k])
         for k in worst[:MAX_NAMED]
     ]
     return [

@@ -108,7 +108,7 @@ def camera_groups(photos: list[Photo], mode: str) -> list[list[str]]:
 
 def _zoom(photo: Photo) -> str:
     """The focal length that EXIF gives, in words that are the same for photos of one: the 35 mm equivalent to a pixel,
-    or, where it is not told, millimetres, and tenths of them below ten."""
+    or, where EXIF lacks it, millimetres, and tenths of them below ten."""
     if photo.focal_px:
         return f"{round(photo.focal_px)} px"
     return f"{photo.focal_mm:.{int(photo.focal_mm < 10)}f} mm" if photo.focal_mm else ""

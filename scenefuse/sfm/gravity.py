@@ -9,10 +9,10 @@ MIN_AXIS_SPREAD = 0.15
 # Headings fix the vertical to the scatter of the x axes about it, over their spread and the root of their number. With
 # a larger standard deviation it is no measurement.
 MAX_VERTICAL_SD_DEG = 2.5
-# A hand rolls a camera by so many degrees at least, as far as a few photos can tell.
+# A hand rolls a camera by so many degrees at least, as far as a few photos show.
 MIN_ROLL_DEG = 1.0
+# Up by these is off by as much as the photos are not level, or not straight down: good enough for pictures.
 UNSURE_CUES = ("image up", "viewing direction", "few headings")
-"""Up by these is off by as much as the photos are not level, or not straight down: good enough for pictures."""
 
 
 def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
@@ -26,7 +26,7 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     - keeps more cameras from standing on their head (a flight back along the next strip turns photos by 180 degrees),
     - else lets the camera centres move less along it (flights and walks keep their height).
 
-    Nothing tells one nadir strip from a walk along a wall, both straight; the walk is assumed.
+    One nadir strip and a walk along a wall, both straight, look the same; the walk is assumed.
 
     Args:
         world_from_cam: (N, 3, 3) camera rotations, OpenCV axes.
@@ -38,7 +38,7 @@ def estimate_up(world_from_cam: Array, centres: Array) -> tuple[Array, str]:
     x, y, z = (world_from_cam[:, :, k] for k in range(3))
     up, spread = _orthogonal_to_all(x)
     if spread >= MIN_AXIS_SPREAD:
-        # Image-up sides and looking down both tell the sign; for nadir photos only the latter does.
+        # Image-up sides and looking down both give the sign; for nadir photos only the latter does.
         roll_deg = max(SD_OVER_MEDIAN * roll_spread_deg(world_from_cam, up), MIN_ROLL_DEG)
         sure = roll_deg / (spread * np.sqrt(len(x))) <= MAX_VERTICAL_SD_DEG
         return (up if -(y @ up + z @ up).sum() >= 0 else -up), "headings" if sure else "few headings"

@@ -77,7 +77,7 @@ class Choice:
 
     Attributes:
         lens: the choice.
-        next: the one beyond it, which they do not determine; None where there is none.
+        next: the one beyond it, which they do not determine, or None.
         trials: of every lens tried, what came out.
     """
 

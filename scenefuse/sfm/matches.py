@@ -28,7 +28,7 @@ from scenefuse.sfm.interrupt import cancellable
 Pair = tuple[str, str]
 
 
-# GPS positions that spread less (RMS, metres) than this do not tell neighbours from others: five times the standard
+# GPS positions that spread less (RMS, metres) than this do not separate neighbours from others: five times the standard
 # error of a plain receiver.
 MIN_GPS_SPREAD_M = 15.0
 # Positions so near each other are one: a phone writes its last fix into dozens of photos.
@@ -234,7 +234,7 @@ def _automatic(
 
 
 def _gps_usable(photos: list[Photo], neighbours: int) -> bool:
-    """Whether most photos have a position, and these tell which photos are neighbours."""
+    """Whether most photos have a position, and these separate neighbours from others."""
     known, positions = gps_positions(photos)
     if len(known) < max(3, 0.8 * len(photos)) or gps_spread_m(positions) <= MIN_GPS_SPREAD_M:
         return False

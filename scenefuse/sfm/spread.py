@@ -132,7 +132,7 @@ def read_spread(path: Path) -> Spread:
     """Read a spread.
 
     Raises:
-        StageError: the file is none.
+        StageError: the file holds no spread.
     """
     try:
         with np.load(path) as content:

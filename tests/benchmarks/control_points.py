@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Array
-from scenefuse.georef.control import Control, Sighting, read_sighted, seen_at, sight
+from scenefuse.georef.control import Control, LocatedPoint, locate_points, read_control_points, seen_at
 from scenefuse.georef.control_file import ControlFile, SurveyedPoint
 from scenefuse.georef.georeference import adjust_georeferenced, camera_poses, georeference, gps_cameras
 from scenefuse.georef.placement import GeoreferenceSettings
@@ -61,7 +61,7 @@ CONTROL, CHECK, CLICKS, CLICK_NOISE_PX, SURVEY_NOISE_M = 12, 4, 6, 1.0, (0.02, 0
 
 
 def solved(
-    capture: Capture, control: Control | None, checks: list[Sighting], settings: GeoreferenceSettings
+    capture: Capture, control: Control | None, checks: list[LocatedPoint], settings: GeoreferenceSettings
 ) -> list[Array]:
     """Errors (P, 3; m) of points by their clicks, before and after a model is adjusted to control points and GPS."""
     names, rotations, centres = camera_poses(capture.model)
@@ -122,20 +122,20 @@ def leave_one_out(photos: Path, control: Path, work: Path, sd_m: float | None = 
         sd_m: standard deviation of the coordinates, where the file states none.
     """
     capture = mapped(photos, work)
-    whole = read_sighted(control, capture.model, capture.photos)
+    whole = read_control_points(control, capture.model, capture.photos)
     for note in whole.notes:
         print(note)
     left: list[list[Array]] = []
-    rows = [k for k, s in enumerate(whole.sightings) if not (s.problem or s.point.check)]
+    rows = [k for k, s in enumerate(whole.located) if not (s.problem or s.point.check)]
     print("point\tclicks\tbefore: east north up (m)\tafter: east north up (m)")
     for row in rows:
-        sightings = [
+        located = [
             replace(s, point=replace(s.point, check=k == row, sd_m=(sd_m, sd_m) if sd_m else s.point.sd_m))
-            for k, s in enumerate(whole.sightings)
+            for k, s in enumerate(whole.located)
         ]
-        others = replace(whole, sightings=sightings)
-        left.append([error[0] for error in solved(capture, others, [sightings[row]], NO_GPS)])
-        point = whole.sightings[row].point
+        others = replace(whole, located=located)
+        left.append([error[0] for error in solved(capture, others, [located[row]], NO_GPS)])
+        point = whole.located[row].point
         print(f"{point.name}\t{len(point.clicks)}\t{_words(left[-1][0])}\t{_words(left[-1][1])}", flush=True)
     _print("left out", list(np.array(left).transpose(1, 0, 2)))
 
@@ -153,9 +153,9 @@ def simulated(scene: Path, truth: Path, seeds: int = 3) -> None:
                 drawn = replace(capture, photos=_with_positions(capture.photos, cameras, origin, noise_m, rng))
                 points = [_clicked(k, place, cameras, origin, rng) for k, place in enumerate(zip(*places))]
                 sizes = {p.name: (p.width, p.height) for p in drawn.photos}
-                sightings, _ = sight(ControlFile(truth, pyproj.CRS.from_epsg(4979), points), drawn.model, sizes)
-                control = Control(truth, "", sightings, []) if counted else None
-                checks = [s for s in sightings if s.point.check and not s.problem]
+                located, _ = locate_points(ControlFile(truth, pyproj.CRS.from_epsg(4979), points), drawn.model, sizes)
+                control = Control(truth, "", located, []) if counted else None
+                checks = [s for s in located if s.point.check and not s.problem]
                 found.append(solved(drawn, control, checks, GeoreferenceSettings()))
             _print(f"positions {noise_m:g} m, {counted} control points", [np.concatenate(e) for e in zip(*found)])
 

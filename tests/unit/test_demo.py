@@ -147,8 +147,8 @@ def test_exif_position_is_the_true_one_when_noise_is_zero(rendered: Path) -> Non
         degrees = [sum(float(v) / 60**i for i, v in enumerate(gps[tag])) for tag in (2, 4)]
         found = LocalFrame(*ORIGIN).apply(np.array([[*degrees, float(gps[6])]]))
         assert np.abs(found[0] - centre).max() < 0.01
-        # 35 mm equivalent by the diagonal: 60 px on a diagonal of 100 px.
-        assert exif.get_ifd(0x8769)[0xA405] == round(0.6 * 43.267)
+        # 35 mm equivalent by the diagonal: 70 px on a diagonal of 100 px.
+        assert exif.get_ifd(0x8769)[0xA405] == round(0.7 * 43.267)
     assert not Image.open(rendered / "house/house_0001.jpg").getexif().get_ifd(0x8825)
 
 

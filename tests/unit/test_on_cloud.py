@@ -102,7 +102,7 @@ def test_photos_come_to_lie_on_a_scan_that_their_gps_is_metres_off(tmp_path):
 @pytest.mark.parametrize(
     ("extent", "most_m"),
     [
-        ({"count": 1_500_000, "low": (-250, -200), "high": (250, 200)}, 0.25),
+        ({"count": 400_000, "low": (-130, -100), "high": (130, 100)}, 0.25),
         ({"low": (0, -35)}, 0.6),
         ({"low": (-32, -22), "high": (32, 22)}, 0.6),
     ],

@@ -14,8 +14,8 @@ from scenefuse.cloud.readers.meshes import Mesh, sampled_columns, triangles
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
+# What PLY calls NumPy's types.
 NAMES = dict(zip(KINDS, ("char", "uchar", "short", "ushort", "int", "uint", "float", "double")))
-"""What PLY calls NumPy's types."""
 TYPES = {name: kind for kind, name in NAMES.items()} | dict(
     zip(("int8", "uint8", "int16", "uint16", "int32", "uint32", "float32", "float64"), KINDS)
 )

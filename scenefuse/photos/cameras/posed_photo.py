@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError
 from scenefuse.photos.photos import SHAPE_TOLERANCE
 
+# EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored.
 QUARTERS = {6: 1, 3: 2, 8: 3}
-"""EXIF orientation -> clockwise quarter turns that stand a stored photo upright; the others are mirrored."""
+# Camera axes after a clockwise quarter turn from those before, OpenCV axes.
 FROM_STORED = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""Camera axes after a clockwise quarter turn from those before, OpenCV axes."""
+# Parameters of a lens that a turn leaves as they are.
 EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
-"""Parameters of a lens that a turn leaves as they are."""
 
 Size = tuple[int, int]
 
