@@ -7,8 +7,8 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.transforms import Array
-from scenefuse.marks.clicks import Click
 from scenefuse.georef.placement import ROBUST_SD
+from scenefuse.marks.clicks import Click
 from scenefuse.sfm.adjustment import Freedom, adjustment_options
 
 # Relative gain that ends an adjustment.
