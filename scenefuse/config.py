@@ -38,7 +38,7 @@ from scenefuse.register.decision import FineSettings
 from scenefuse.register.scale import ScaleSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.mapping import MappingSettings
-from scenefuse.sfm.pairs import MatchSettings
+from scenefuse.sfm.matches import MatchSettings
 from scenefuse.sfm.undistort import UndistortSettings
 
 # Six groups that the rules read themselves; every other setting belongs to a stage, and stands beside it.

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import read_cloud
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.fuse_object import FROM_OBJECT

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, sampled
-from scenefuse.cloud.tiles.tiled_cloud import open_cloud
+from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
 from scenefuse.fuse.write import after_fusion

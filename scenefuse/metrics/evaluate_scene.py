@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import sampled_rows
-from scenefuse.cloud.tiles.tiled_cloud import TiledCloud, open_cloud
+from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.metrics.scores import nearest
