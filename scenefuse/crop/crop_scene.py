@@ -216,7 +216,7 @@ def crop_by_masks(scene: TiledCloud, inputs: CropInputs, settings: CropSettings)
     pose = _alignment(inputs.alignment_json)
     masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
     low, high = around_marks(pose.apply(masked.own), settings)
-    sight = masked.locate_points(pose)
+    sight = masked.sight(pose)
     near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
     votes = votes_of(near, masked, pose, settings, len(scene))
     cut = crop_cloud(near, np.concatenate([near.points[votes.object], votes.own]), UP, settings, votes.other)

@@ -56,8 +56,8 @@ class Masked:
     views: list[View]
     own: Array
 
-    def locate_points(self, scene_from_object: Sim3) -> Array:
-        """(K + V, 3) the own points and the cameras in the scene; cameras farther away than FAR_EXTENTS come nearer."""
+    def sight(self, scene_from_object: Sim3) -> Array:
+        """(K + V, 3) the own points and the cameras in the scene, those too far away moved nearer."""
         own = scene_from_object.apply(self.own)
         eyes = scene_from_object.apply(np.array([view.centre for view in self.views]))
         far = MAX_DISTANCE_EXTENTS * float(np.linalg.norm(np.ptp(own, axis=0)))
