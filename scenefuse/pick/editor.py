@@ -103,10 +103,10 @@ class Editor:
         self.point = label
 
     def _choose_other_end(self) -> None:
-        """After one end of a length comes the other, where the photo does not have it yet."""
-        length, here = self.point.split("\t")[0], {row.label for row in self.here}
-        left = [label for label in self.points if label.split("\t")[0] == length and label not in here]
-        self.point = left[0] if left else self.point
+        """After one end of a length comes the other, where the photo does not have it yet; then the first again."""
+        here = {row.label for row in self.here}
+        ends = [label for label in self.points if label.split("\t")[0] == self.point.split("\t")[0]]
+        self.point = next((end for end in ends if end not in here), ends[0])
 
     def _change(self, edit: Callable[[Rows], Rows]) -> None:
         self.table.document.change(edit(self.table.document.rows))

@@ -34,7 +34,7 @@ class SidePanel:
         self._session, self._act, self._on_open, self._on_accept = session, act, on_open, on_accept
         self._column = ui.column().classes("side h-full no-wrap")
         with self._column:
-            self._note = ui.label()
+            self._note = self._answer = ui.label()
 
     def fill(self, editor: Editor, layers: MaskLayers) -> None:
         """Show what there is now."""
@@ -126,11 +126,11 @@ class SidePanel:
             ui.label(text).classes("text-xs text-orange-900")
         words = command(self._session.configfiles, str(table.result))
         ui.label(as_text(words)).classes("code w-full").mark("command")
-        button = ui.button("What will run?", icon="playlist_play").props(BUTTON)
-        answer = ui.label().classes("text-xs")
+        ui.button("What will run?", icon="playlist_play", on_click=lambda: self._plan(words)).props(BUTTON)
+        self._answer = ui.label().classes("text-xs")
 
-        async def plan() -> None:
-            answer.set_text("Planning; some seconds ...")
-            answer.set_text(await asyncio.to_thread(dry_run, words))
-
-        button.on_click(plan)
+    async def _plan(self, words: list[str]) -> None:
+        """Say which rules a command will run. The panel may be filled anew meanwhile."""
+        self._answer.set_text("Planning; some seconds ...")
+        text = await asyncio.to_thread(dry_run, words)
+        self._answer.set_text(text)
