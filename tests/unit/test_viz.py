@@ -211,6 +211,10 @@ def capture(tmp_path_factory):
     return folder
 
 
+POSE = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
+REGISTERED = {"status": quantity("registered", ""), "scene_from_object": quantity(POSE.matrix, "")}
+
+
 def draw(capture, fine, figures):
     write_json(capture / "fine.json", fine)
     inputs = FigureInputs(
@@ -233,6 +237,14 @@ def draw(capture, fine, figures):
     draw_object(inputs=inputs, figures=figures)
 
 
+@pytest.fixture(scope="module")
+def figures(capture, tmp_path_factory):
+    """The figures of the box, registered; only to be read."""
+    folder = tmp_path_factory.mktemp("drawn") / "figures"
+    draw(capture, REGISTERED, folder)
+    return folder
+
+
 def test_an_object_by_itself_is_drawn_and_can_be_turned(capture, tmp_path):
     stages = tuple(capture / f"stage{stage}" for stage in (1, 2, 3, 4))
     places = {"object_cloud": capture / "object.ply", "workspace": capture / "undistorted", "masks": capture / "masks"}
@@ -247,10 +259,7 @@ def test_an_object_by_itself_is_drawn_and_can_be_turned(capture, tmp_path):
     assert '<fieldset class="when" hidden>' in section and '<fieldset class="colour">' in section
 
 
-def test_figures_show_what_was_added(capture, tmp_path):
-    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
-    draw(capture, fine, tmp_path / "figures")
+def test_figures_show_what_was_added(figures):
     names = {
         "missing.png",
         "before_after.png",
@@ -260,35 +269,30 @@ def test_figures_show_what_was_added(capture, tmp_path):
         "before.png",
         "after.png",
     }
-    assert {p.name for p in (tmp_path / "figures").iterdir()} == names | {"view.ply", "view.json"}
-    assert all(p.stat().st_size < 1_000_000 for p in (tmp_path / "figures").iterdir())
-    before, after = (cv2.imread(str(tmp_path / f"figures/{n}.png")).astype(float) for n in ("before", "after"))
+    assert {p.name for p in figures.iterdir()} == names | {"view.ply", "view.json"}
+    assert all(p.stat().st_size < 1_000_000 for p in figures.iterdir())
+    before, after = (cv2.imread(str(figures / f"{n}.png")).astype(float) for n in ("before", "after"))
     assert (np.abs(before - after).max(2) > 40).mean() > 0.02
-    colors = cv2.cvtColor(cv2.imread(str(tmp_path / "figures/provenance.png")), cv2.COLOR_BGR2RGB).astype(int)
+    colors = cv2.cvtColor(cv2.imread(str(figures / "provenance.png")), cv2.COLOR_BGR2RGB).astype(int)
     assert (colors[..., 0] - colors[..., 2] > 60).mean() > 0.01
-    colors = cv2.cvtColor(cv2.imread(str(tmp_path / "figures/missing.png")), cv2.COLOR_BGR2RGB).astype(int)
+    colors = cv2.cvtColor(cv2.imread(str(figures / "missing.png")), cv2.COLOR_BGR2RGB).astype(int)
     for first, last in ((0, 2), (2, 0)):
         assert (colors[..., first] - colors[..., last] > 70).sum() > 50
 
 
 def test_an_object_that_lacks_nothing_is_drawn(capture, tmp_path):
-    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
     kept = {name: (capture / name).read_bytes() for name in ("missing.ply", "missing.json", "next_photos.csv")}
     write_cloud(capture / "missing.ply", Cloud(np.zeros((0, 3)), None, None, {"missing": np.zeros(0, np.uint8)}))
     write_json(capture / "missing.json", {"missing": quantity(0.0, "")})
     (capture / "next_photos.csv").write_text("station,photo,x,y,z\n")
-    draw(capture, fine, tmp_path / "figures")
+    draw(capture, REGISTERED, tmp_path / "figures")
     assert (tmp_path / "figures/missing.png").is_file()
     for name, content in kept.items():
         (capture / name).write_bytes(content)
 
 
-def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path):
-    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
-    draw(capture, fine, tmp_path / "figures")
-    view = read_view(tmp_path / "figures")
+def test_the_3d_view_holds_the_scene_before_and_what_was_added(figures):
+    view = read_view(figures)
     shown, source = view.cloud.fields["shown"], view.cloud.fields["source"]
     assert set(shown) == {Shown.BOTH, Shown.AFTER}
     np.testing.assert_array_equal(source == 1, shown == Shown.AFTER)
@@ -299,14 +303,12 @@ def test_the_3d_view_holds_the_scene_before_and_what_was_added(capture, tmp_path
 
 
 def test_a_place_in_the_shade_is_shown_brighter_and_says_so(capture, tmp_path):
-    pose = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-    fine = {"status": quantity("registered", ""), "scene_from_object": quantity(pose.matrix, "")}
     kept = {name: (capture / name).read_bytes() for name in ("dense.ply", "fused.ply")}
     for name in kept:
         cloud = read_cloud(capture / name)
         write_cloud(capture / name, replace(cloud, colors=(cloud.colors // 8).astype(np.uint8)))
     dark = read_cloud(capture / "dense.ply").colors.max()
-    draw(capture, fine, tmp_path / "figures")
+    draw(capture, REGISTERED, tmp_path / "figures")
     for name, content in kept.items():
         (capture / name).write_bytes(content)
     view = read_view(tmp_path / "figures")
