@@ -32,14 +32,12 @@ class PhotoClicks:
         pixels: (N, 2) of the undistorted photo.
         inside: (N,) True on the object, False off it.
         box: (2, 2) corners of a box around the object, upper left first; None where there is none.
-        points: (N, 3) what was clicked on, in the object's frame, NaN where unknown; None before it is looked for.
         original: (N, 2) the same pixels in the original photo, as a person knows them; None where it is the same photo.
     """
 
     pixels: Array
     inside: NDArray[np.bool_]
     box: Array | None = None
-    points: Array | None = None
     original: Array | None = None
 
     @property
@@ -53,13 +51,6 @@ class PhotoClicks:
         return self.pixels[~self.inside]
 
     @property
-    def placed(self) -> Array:
-        """(K, 3) the known points that were clicked inside."""
-        if self.points is None:
-            return np.zeros((0, 3))
-        return self.points[self.inside & np.isfinite(self.points).all(axis=1)]
-
-    @property
     def prompt(self) -> bool:
         """Whether they say where the object is: one inside, or a box."""
         return bool(self.inside.any()) or self.box is not None
@@ -71,8 +62,8 @@ class PhotoClicks:
 
     def only(self, keep: NDArray[np.bool_]) -> PhotoClicks:
         """The clicks of the rows (N,) to keep, and the box."""
-        points, original = (None if rows is None else rows[keep] for rows in (self.points, self.original))
-        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], points=points, original=original)
+        original = None if self.original is None else self.original[keep]
+        return replace(self, pixels=self.pixels[keep], inside=self.inside[keep], original=original)
 
     def named(self, row: int) -> str:
         """A click in words."""

@@ -1,4 +1,4 @@
-"""Where the object is: an upright box around the prompts, and the ground it stands on."""
+"""An upright box around the prompts, and the ground that the object stands on, by the sparse points beside it."""
 
 import cv2
 import numpy as np
@@ -9,16 +9,16 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.ground import Ground, quadratic_terms
 from scenefuse.geometry.visual_hull import Box
 
-REACH = 1.5
-"""Ground is looked for so far beside the box, in half widths of it: farther off it may be another level."""
-SCATTER = 0.02
-"""How far a ground point may lie off the plane, as a share of the box's diagonal: grass, gravel, and errors of SfM."""
+# Ground is looked for so far beside the box, in half widths of it: farther off it may be another level.
+GROUND_REACH_HALF_WIDTHS = 1.5
+# How far a ground point may lie off the plane, as a share of the box's diagonal: grass, gravel, and errors of SfM.
+GROUND_SCATTER_SHARE = 0.02
+# Tilt of the ground against the horizontal; steeper planes are walls.
 MAX_TILT_DEG = 30.0
-"""Of the ground against the horizontal; steeper planes are walls."""
+# Samples of RANSAC: they find a plane that holds a quarter of the points in 99 of 100 runs.
 SAMPLES = 300
-"""Of RANSAC: finds a plane that holds a quarter of the points in 99 of 100 runs."""
-LEAST_BESIDE, LEAST_ON_PLANE, LEAST_SHARE = 20, 12, 0.25
-"""Sparse points beside the box, those of them on the plane, and their share, below which there is no ground to see."""
+# Sparse points beside the box, those of them on the plane, and their share, below which there is no ground to see.
+MIN_POINTS_BESIDE, MIN_POINTS_ON_PLANE, MIN_PLANE_SHARE = 20, 12, 0.25
 
 
 def upright_box(points: Array, up: Array, margin: float) -> Box:
@@ -61,11 +61,13 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
     centre, half = (box.low + box.high) / 2, (box.high - box.low) / 2
     nowhere = Ground(np.array([box.low[2], 0, 0, 0, 0, 0]), centre[:2])
     sideways = np.abs(points_in_box[:, :2] - centre[:2])
-    around = (sideways < half[:2] + REACH * half[:2].max()).all(1) & (points_in_box[:, 2] < box.high[2])
+    around = (sideways < half[:2] + GROUND_REACH_HALF_WIDTHS * half[:2].max()).all(1) & (
+        points_in_box[:, 2] < box.high[2]
+    )
     beside = points_in_box[around & (sideways > half[:2]).any(1)]
-    if len(beside) < LEAST_BESIDE:
+    if len(beside) < MIN_POINTS_BESIDE:
         return nowhere, False
-    tolerance = SCATTER * box.diagonal
+    tolerance = GROUND_SCATTER_SHARE * box.diagonal
     generator = np.random.default_rng(seed)
     design = np.column_stack([beside[:, :2], np.ones(len(beside))])
     best = np.zeros(len(beside), dtype=bool)
@@ -77,7 +79,7 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
         inliers = np.abs(beside[:, 2] - design @ plane) < tolerance
         if np.hypot(*plane[:2]) <= np.tan(np.radians(MAX_TILT_DEG)) and inliers.sum() > best.sum():
             best = inliers
-    if best.sum() < max(LEAST_ON_PLANE, LEAST_SHARE * len(beside)):
+    if best.sum() < max(MIN_POINTS_ON_PLANE, MIN_PLANE_SHARE * len(beside)):
         return nowhere, False
     slope = np.linalg.lstsq(design[best], beside[best, 2], rcond=None)[0]
     near = points_in_box[around & ~in_hull(points_in_box, span(prompts_in_box, tolerance))]
@@ -85,15 +87,16 @@ def find_ground(points_in_box: Array, box: Box, prompts_in_box: Array, seed: int
     fit = np.array([slope @ [*centre[:2], 1.0], slope[0], slope[1], 0, 0, 0])
     # Bending weighs as much as twenty points that are off by it at the edge of the box: few points cannot bend the
     # surface much.
-    ridge = np.diag([0, 0, 0, 1, 1, 1]) * np.sqrt(LEAST_BESIDE) * half[:2].max() ** 2
+    ridge = np.diag([0, 0, 0, 1, 1, 1]) * np.sqrt(MIN_POINTS_BESIDE) * half[:2].max() ** 2
     for width in (3, 2, 1.5, 1):
         use = np.abs(near[:, 2] - terms @ fit) < width * tolerance
         fit = np.linalg.lstsq(np.vstack([terms[use], ridge]), np.concatenate([near[use, 2], np.zeros(6)]), rcond=None)[
             0
         ]
     scatter = float(np.std(near[use, 2] - terms[use] @ fit))
-    fit[0] += min(0.0, float(Ground(fit, centre[:2]).height_of(prompts_in_box).min()) + 2 * scatter)
-    return Ground(fit, centre[:2]), True
+    ground = Ground(fit, centre[:2], tolerance)
+    fit[0] += min(0.0, float(ground.height_of(prompts_in_box).min()) + 2 * scatter)
+    return ground, True
 
 
 def span(points: Array, margin: float) -> Array:

@@ -11,28 +11,29 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import Delaunay
 
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.masks.pixels import distance_to
+from scenefuse.masks.prompts import distance_to
 
 Trimap = NDArray[np.uint8]
+
+# Bins of a histogram of colours along each axis of CIELAB.
 COLOUR_BINS = 32
-PINHOLE_SHARE = 0.0005
-"""Holes smaller than this share of a mask say nothing: a network's are as coarse."""
-GAP_EVIDENCE = 0.7
-"""A hole is one if its colours are twice as frequent around the mask as on it."""
-COLOURS_WIDTH_PX = 300
-"""Pixels along a mask's longer side of which its colours are learnt."""
-AROUND = 0.1
-"""What is around a mask: so far, as a share of its longer side."""
-LEAST_HALF_PX, THIN_BANDS = 1.5, 2.0
-"""Half width from which the middle of a part is told from its rim; how far a thin part reaches, in bands, beyond what
-is certain."""
+# Specks and holes smaller than this share of a mask change side; holes smaller than the second whatever is in them, as
+# a network's are as coarse.
+SPECK_SHARE, PINHOLE_SHARE = 0.02, 0.0005
+# A hole is one if its colours are twice as frequent around the mask as on it: log 2, in nats.
+GAP_EVIDENCE_NATS = 0.7
+# Pixels along a mask's longer side of which its colours are learnt, and how far around it, as a share of that side.
+COLOURS_WIDTH_PX, SURROUNDINGS_SHARE = 300, 0.1
+# Half width from which the middle of a part differs from its rim; how far a thin part reaches, in bands, beyond what
+# is certain.
+MIN_THIN_HALF_PX, MIN_THIN_BANDS = 1.5, 2.0
+# Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each.
 EDGE_WIDTH_PX = 1024
-"""Coarse masks are cut along edges in photos at most this wide; wider ones would take seconds each."""
-STEP_BLUR_PX, STEP_PX = 0.7, 0.15
-"""Paths between pixels: the picture is smoothed by this, and a step costs as much as this change of Lab."""
-GROWN_SHARE = 0.7
-"""What is this much nearer to the certain object than to certain background, as a share of both paths, is certain too:
-on the balloon's photos 0.6 to 0.8 were alike."""
+# Paths between pixels: the picture is smoothed by this, and a step costs as much as this change of Lab.
+PATH_BLUR_PX, STEP_COST = 0.7, 0.15
+# What is this much nearer to the certain object than to certain background, as a share of both paths, is certain too:
+# on the balloon's photos 0.6 to 0.8 were alike.
+MIN_GROWN_SHARE = 0.7
 
 
 def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spanning_px: NDArray[np.float64]) -> Trimap:
@@ -49,18 +50,6 @@ def first_trimap(size: tuple[int, int], outline_px: NDArray[np.float64], spannin
     fill_hull(likely, spanning_px, 1)
     trimap[(trimap == cv2.GC_PR_BGD) & (likely > 0)] = cv2.GC_PR_FGD
     return trimap
-
-
-def prefer_colour(trimap: Trimap, evidence: NDArray[np.float32], threshold: float = 1.5) -> None:
-    """Turn a likely label where the colour speaks clearly for the other side, in place.
-
-    Args:
-        trimap: (H, W) labels.
-        evidence: (H, W) log ratio of the colour's densities, object over background.
-        threshold: what counts as clearly.
-    """
-    trimap[(trimap == cv2.GC_PR_FGD) & (evidence < -threshold)] = cv2.GC_PR_BGD
-    trimap[(trimap == cv2.GC_PR_BGD) & (evidence > threshold)] = cv2.GC_PR_FGD
 
 
 @dataclass(frozen=True)
@@ -171,7 +160,7 @@ def grow_seeds(image: NDArray[np.uint8], trimap: Trimap, width_px: int) -> None:
     scale = min(1.0, width_px / width)
     size = (max(2, round(width * scale)), max(2, round(height * scale)))
     lab = cv2.cvtColor(cv2.resize(image, size, interpolation=cv2.INTER_AREA), cv2.COLOR_RGB2LAB).astype(np.float32)
-    graph = _steps(np.asarray(cv2.GaussianBlur(lab, (0, 0), STEP_BLUR_PX), dtype=np.float32))
+    graph = _steps(np.asarray(cv2.GaussianBlur(lab, (0, 0), PATH_BLUR_PX), dtype=np.float32))
     away = []
     for side in sides:
         # Areas: a disc of one pixel must not get lost.
@@ -180,7 +169,7 @@ def grow_seeds(image: NDArray[np.uint8], trimap: Trimap, width_px: int) -> None:
         away.append(np.broadcast_to(paths, size[0] * size[1]).reshape(size[1], size[0]))
     with np.errstate(invalid="ignore"):
         share = cv2.resize((away[1] / (away[0] + away[1])).astype(np.float32), (width, height))
-    trimap[(share > GROWN_SHARE) & (trimap != cv2.GC_BGD)] = cv2.GC_FGD
+    trimap[(share > MIN_GROWN_SHARE) & (trimap != cv2.GC_BGD)] = cv2.GC_FGD
 
 
 def _steps(lab: NDArray[np.float32]) -> coo_matrix:
@@ -191,7 +180,7 @@ def _steps(lab: NDArray[np.float32]) -> coo_matrix:
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         here = slice(0, height - down), slice(max(0, -right), width - max(0, right))
         there = slice(down, height), slice(max(0, right), width + min(0, right))
-        length = np.linalg.norm(lab[here] - lab[there], axis=-1) + STEP_PX * np.hypot(down, right)
+        length = np.linalg.norm(lab[here] - lab[there], axis=-1) + STEP_COST * np.hypot(down, right)
         steps.append((length.ravel(), rows[here].ravel(), rows[there].ravel()))
     lengths, first, second = (np.concatenate(part) for part in zip(*steps))
     return coo_matrix((lengths, (first, second)), shape=(height * width,) * 2).tocsr()
@@ -244,15 +233,15 @@ def along_edges(image: NDArray[np.uint8], mask: Mask, band_px: float) -> Mask:
     trimap = np.where(mask, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     trimap[inner > band_px], trimap[outer > band_px] = cv2.GC_FGD, cv2.GC_BGD
     certain = inner > band_px
-    middle = (inner >= LEAST_HALF_PX) & (inner >= cv2.dilate(inner, np.ones((3, 3), np.uint8))) & ~certain
+    middle = (inner >= MIN_THIN_HALF_PX) & (inner >= cv2.dilate(inner, np.ones((3, 3), np.uint8))) & ~certain
     count, labels = cv2.connectedComponents(middle.astype(np.uint8))
     thin = np.zeros(count, dtype=bool)
-    thin[labels[middle & (distance_to(certain) > THIN_BANDS * band_px)]] = True
+    thin[labels[middle & (distance_to(certain) > MIN_THIN_BANDS * band_px)]] = True
     trimap[middle & thin[labels]] = cv2.GC_FGD
     return grabcut(image, trimap, EDGE_WIDTH_PX, 1) if mask.any() else mask
 
 
-def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None, smallest_share: float = 0.02) -> Mask:
+def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None) -> Mask:
     """The mask (H, W) without specks and holes: parts smaller than a share of the mask's area change side.
 
     With the photo (H, W, 3), holes through which one sees what is around the mask stay: pinholes aside, those whose
@@ -262,7 +251,7 @@ def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None, smallest_share: 
     for side in (True, False):
         count, labels, parts, _ = cv2.connectedComponentsWithStats((mask == side).astype(np.uint8), connectivity=4)
         if count > 2:
-            small = parts[:, cv2.CC_STAT_AREA] < smallest_share * area
+            small = parts[:, cv2.CC_STAT_AREA] < SPECK_SHARE * area
             small[0] = False
             gaps = small & (parts[:, cv2.CC_STAT_AREA] >= PINHOLE_SHARE * area)
             if image is not None and not side and gaps.any():
@@ -270,7 +259,7 @@ def cleaned(mask: Mask, image: NDArray[np.uint8] | None = None, smallest_share: 
                 for gap in np.flatnonzero(gaps):
                     x, y, width, height = parts[gap, : cv2.CC_STAT_AREA]
                     window = np.s_[y : y + height, x : x + width]
-                    small[gap] = colours.evidence(image[window])[labels[window] == gap].mean() >= -GAP_EVIDENCE
+                    small[gap] = colours.evidence(image[window])[labels[window] == gap].mean() >= -GAP_EVIDENCE_NATS
             mask = np.where(small[labels], not side, mask)
     return mask
 
@@ -279,7 +268,7 @@ def _colours_of(image: NDArray[np.uint8], mask: Mask, unsure: Mask) -> Colours:
     """The colours of a mask (H, W), beside those around it; some thousands of pixels of each are enough."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     longest = max(width, height)
-    grow, step = int(AROUND * longest), max(1, longest // COLOURS_WIDTH_PX)
+    grow, step = int(SURROUNDINGS_SHARE * longest), max(1, longest // COLOURS_WIDTH_PX)
     near = np.s_[max(0, y - grow) : y + height + grow : step, max(0, x - grow) : x + width + grow : step]
     return learn_colours([image[near]], [mask[near]], [~mask[near] & ~unsure[near]])
 

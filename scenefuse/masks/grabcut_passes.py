@@ -16,30 +16,29 @@ from scenefuse.masks.grabcut import (
     grabcut,
     grow_seeds,
     learn_colours,
-    prefer_colour,
     second_trimap,
     stamp_seeds,
 )
-from scenefuse.masks.parts import prompted_parts
+from scenefuse.masks.prompts import Prompts, prompted_parts
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import Rows, View, Workspace
 
+# Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one.
 FIRST_ROUNDS = 4
-"""Rounds of learning colours and cutting in the first cut; later ones start from a good mask and take one."""
+# Seeds grow along paths in photos at most this wide.
 PATHS_WIDTH_PX = 320
-"""Seeds grow along paths in photos at most this wide."""
-REFERENCE_WIDTH_PX = 640
-"""Photo width that `band_px` is meant for."""
-SEED_RADIUS = 0.003
-"""Radius of the disc that a sparse point makes certain, as a share of the photo's width: about two pixels at 640."""
-BOX_SLACK = 0.04
-"""Outside a clicked box nothing is object from this share of its longer side on: a person's corners miss."""
-SEED_EDGE = 0.06
-"""Longest side of a triangle of sparse points that is filled, as a share of the box's diagonal: holes are larger."""
+# Half width of the band along the hull's outline where a photo's own evidence decides, as a share of its width.
+HULL_BAND_SHARE = 5 / 640
+# Radius of the disc that a sparse point makes certain, as a share of the photo's width: about two pixels at 640.
+SEED_RADIUS_SHARE = 0.003
+# Outside a clicked box nothing is object from this share of its longer side on: a person's corners miss.
+MAX_BOX_MISS_SHARE = 0.04
+# Longest side of a triangle of sparse points that is filled, as a share of the box's diagonal: holes are larger.
+MAX_SEED_EDGE_SHARE = 0.06
 
 
 def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mapping[int, PhotoClicks]) -> list[Mask]:
-    """First masks (H, W), seeded by the prompts, the sparse points, and the colours of both over all photos.
+    """First masks (H, W), seeded by the prompts and the sparse points.
 
     Args:
         target: box, prompts and sparse points of the object.
@@ -47,59 +46,43 @@ def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mappin
         width_px: photos are cut at most this wide.
         clicked: clicks by row of the photo.
     """
-    trimaps = []
+    masks = []
     for k, (view, seen, seen_at) in enumerate(zip(photos.views, photos.seen, photos.seen_at)):
         outline, spanning = target.outline(view), view.project(target.spanning)[0]
-        trimaps.append(first_trimap((view.height, view.width), outline, spanning))
-        stamp(trimaps[-1], target, view, seen, seen_at, clicked.get(k))
+        trimap = first_trimap((view.height, view.width), outline, spanning)
+        stamp(trimap, target, view, seen, seen_at, clicked.get(k))
         if clicked:
-            grow_seeds(view.pixels, trimaps[-1], PATHS_WIDTH_PX)
-    images = [view.pixels for view in photos.views]
-    colours = learn_colours(images, [t == cv2.GC_FGD for t in trimaps], [t == cv2.GC_BGD for t in trimaps])
-    masks = []
-    for image, trimap in zip(images, trimaps):
-        prefer_colour(trimap, colours.evidence(image))
-        masks.append(cleaned(grabcut(image, trimap, width_px, FIRST_ROUNDS)))
+            grow_seeds(view.pixels, trimap, PATHS_WIDTH_PX)
+        masks.append(cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS)))
     return masks
 
 
-def ask_grabcut(
-    width_px: int,
-    view: View,
-    inside: tuple[Array, Array],
-    outside: tuple[Array, Array],
-    box_px: Array | None,
-    likely_px: Array | None,
-) -> tuple[list[Mask], Array]:
+def query_grabcut(width_px: int, view: View, prompts: Prompts, box: Array | None) -> tuple[list[Mask], Array]:
     """One mask (H, W) of a photo by GrabCut, and its quality: 1, or 0 where it is empty or all of the photo.
 
     Args:
         width_px: photos are cut at most this wide.
         view: the photo, with RGB pixels.
-        inside: (N, 2) pixels clicked on the object and (M, 2) carried on to it; what they span is likely object.
-        outside: the same off the object.
-        box_px: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
-        likely_px: the same of a box in which the object probably is: nothing comes of it, as colours would fill it.
+        prompts: what those inside span is likely object.
+        box: (2, 2) corners of a box, upper left first, outside of which nothing is object; or None.
     """
-    if likely_px is not None:
-        return [], np.zeros(0)
-    on, off = np.concatenate(inside), np.concatenate(outside)
+    on, off = prompts.inside, prompts.outside
     trimap = np.full((view.height, view.width), cv2.GC_PR_BGD, dtype=np.uint8)
-    if box_px is not None:
-        trimap[_off_box(trimap, box_px, BOX_SLACK)] = cv2.GC_BGD
-        trimap[~_off_box(trimap, box_px, 0)] = cv2.GC_PR_FGD
+    if box is not None:
+        trimap[_off_box(trimap, box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
+        trimap[~_off_box(trimap, box, 0)] = cv2.GC_PR_FGD
     elif len(on) >= 3:
         fill_hull(trimap, on, cv2.GC_PR_FGD)
-    _discs(trimap, off, on, SEED_RADIUS * view.width)
+    _discs(trimap, off, on, SEED_RADIUS_SHARE * view.width)
     grow_seeds(view.pixels, trimap, PATHS_WIDTH_PX)
     mask = cleaned(grabcut(view.pixels, trimap, width_px, FIRST_ROUNDS))
     return [mask], np.array([float(mask.any() and not mask.all())])
 
 
-def _off_box(trimap: Trimap, box_px: Array, slack: float) -> Mask:
+def _off_box(trimap: Trimap, box: Array, slack: float) -> Mask:
     """(H, W) what lies outside a box (2, 2) in pixels, grown on all sides by a share of its longer side."""
-    grow = slack * float((box_px[1] - box_px[0]).max())
-    (left, top), (right, bottom) = np.maximum(box_px + [[-grow], [grow]], 0).astype(int)
+    grow = slack * float((box[1] - box[0]).max())
+    (left, top), (right, bottom) = np.maximum(box + [[-grow], [grow]], 0).astype(int)
     off = np.ones(trimap.shape, dtype=bool)
     off[top : bottom + 1, left : right + 1] = False
     return off
@@ -117,7 +100,6 @@ def second_cuts(
     masks: list[Mask],
     photos: Workspace,
     hull: Hull,
-    band_px: float,
     clicked: Mapping[int, PhotoClicks],
 ) -> list[Mask]:
     """GrabCut once more, where a photo's mask and the hull do not agree.
@@ -127,7 +109,6 @@ def second_cuts(
         masks: (H, W) per photo.
         photos: views with RGB pixels.
         hull: of these masks.
-        band_px: half width of the band along its outline that is never certain, at a photo width of 640.
         clicked: clicks by row of the photo.
     """
     outlines = [silhouette(hull, view) for view in photos.views]
@@ -135,8 +116,7 @@ def second_cuts(
     colours = learn_colours([view.pixels for view in photos.views], own, others)
     cut = []
     for k, (view, mask, outline) in enumerate(zip(photos.views, masks, outlines)):
-        band = band_px * view.width / REFERENCE_WIDTH_PX
-        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), band)
+        trimap = second_trimap(outline, mask, colours.evidence(view.pixels), HULL_BAND_SHARE * view.width)
         stamp(trimap, target, view, photos.seen[k], photos.seen_at[k], clicked.get(k))
         if not outline.any():
             cut.append(outline)
@@ -165,7 +145,7 @@ def stamp(
         seen_at: (K, 2) pixels where it does.
         clicks: made in this photo, if any.
     """
-    radius, edge = SEED_RADIUS * view.width, SEED_EDGE * target.box.diagonal
+    radius, edge = SEED_RADIUS_SHARE * view.width, MAX_SEED_EDGE_SHARE * target.box.diagonal
     stamp_seeds(trimap, seen_at, target.sparse[seen], target.kind[seen], radius, edge)
     pixels, depth = view.project(target.spanning)
     for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
@@ -174,5 +154,5 @@ def stamp(
     if clicks is None:
         return
     if clicks.box is not None:
-        trimap[_off_box(trimap, clicks.box, BOX_SLACK)] = cv2.GC_BGD
+        trimap[_off_box(trimap, clicks.box, MAX_BOX_MISS_SHARE)] = cv2.GC_BGD
     _discs(trimap, clicks.off, clicks.on, radius)

@@ -7,6 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import (
@@ -23,7 +24,6 @@ from scenefuse.core.stage import (
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import read_points
 from scenefuse.masks.algebra import kept_part, mask_folders
-from scenefuse.masks.contact_sheet import draw_contact_sheet
 from scenefuse.masks.prompted import Prompted, masks_from_prompts
 from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
@@ -33,6 +33,9 @@ from scenefuse.masks.target import points_in_masks, target_from_points
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.pictures import write_picture
 from scenefuse.photos.workspace import View, Workspace, read_workspace
+
+# Width of a photo on the contact sheet, and photos side by side.
+TILE_WIDTH_PX, TILE_COLUMNS = 240, 8
 
 
 @dataclass(frozen=True)
@@ -100,7 +103,7 @@ def make_masks(
             write_picture(folder / f"{Path(name).stem}.png", made.masks[name].astype(np.uint8) * 255)
         files = manifest(folder)
     with atomic_file(contact_sheet) as path:
-        write_picture(path, _sheet(photos.views, made))
+        write_picture(path, _contact_sheet(photos.views, made))
     content = _report(made, found, len(photos.views), kept, settings) | by
     print(f"{len(kept)} of {len(photos.views)} masks, median agreement {value(content, 'median_agreement'):.3f}")
     write_json(report, content | {"files": files})
@@ -115,7 +118,7 @@ def _make(
     by = {"method": quantity(settings.method, "")}
     if settings.method == "supplied":
         masks, photos, unusable = _supplied(inputs, photos)
-        target = target_from_points(points_in_masks(photos, masks, up), photos, up, seed)
+        target = target_from_points(points_in_masks(photos, masks), photos, up, seed)
         found = Prompted(masks, target, {}, [])
     else:
         if inputs.prompts is None:
@@ -182,11 +185,28 @@ def _kept(made: ScoredMasks, keep: str, sparse: Path, views: list[View]) -> Scor
     return replace(made, masks=masks, dropped=dropped)
 
 
-def _sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
-    """All masks over their photos, (H, W, 3) RGB."""
-    notes = [f"{made.scores[v.name]:.2f}" if v.name in made.scores else "no mask" for v in views]
-    masks = [made.masks.get(view.name, np.zeros((view.height, view.width), dtype=bool)) for view in views]
-    return draw_contact_sheet(views, masks, notes, [view.name in made.dropped for view in views])
+def _contact_sheet(views: list[View], made: ScoredMasks) -> NDArray[np.uint8]:
+    """(H, W, 3) RGB, all masks for a person to check in ten seconds: the background dimmed, the outline green, or red
+    where the photo is left out, and the mask's agreement with the hull beside its name."""
+    tiles = []
+    for view in views:
+        mask = made.masks.get(view.name, np.zeros((view.height, view.width), dtype=bool))
+        note = f"{made.scores[view.name]:.2f}" if view.name in made.scores else "no mask"
+        color = (255, 0, 0) if view.name in made.dropped else (0, 255, 0)
+        picture = np.where(mask[..., None], view.pixels, view.pixels // 3).astype(np.uint8)
+        picture[mask & ~ndimage.binary_erosion(mask, iterations=max(1, view.width // 640))] = color
+        height = round(TILE_WIDTH_PX * view.height / view.width)
+        tile = cv2.resize(picture, (TILE_WIDTH_PX, height), interpolation=cv2.INTER_AREA)
+        if view.name in made.dropped:
+            cv2.rectangle(tile, (0, 0), (TILE_WIDTH_PX - 1, height - 1), color, 3)
+        cv2.putText(tile, f"{Path(view.name).stem} {note}", (5, 14), cv2.FONT_HERSHEY_SIMPLEX, 0.42, (255,) * 3, 1)
+        tiles.append(tile)
+    columns, tallest = min(TILE_COLUMNS, len(tiles)), max(len(tile) for tile in tiles)
+    sheet = np.zeros((-(-len(tiles) // columns) * tallest, columns * TILE_WIDTH_PX, 3), dtype=np.uint8)
+    for k, tile in enumerate(tiles):
+        row, column = divmod(k, columns)
+        sheet[row * tallest :, column * TILE_WIDTH_PX :][: len(tile), :TILE_WIDTH_PX] = tile
+    return sheet
 
 
 def _report(made: ScoredMasks, found: Prompted, photos: int, kept: list[str], settings: MaskSettings) -> dict[str, Any]:

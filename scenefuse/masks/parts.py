@@ -1,6 +1,6 @@
-"""Connected and separate parts of a mask, told by the pixels that prompt it."""
+"""Parts of the object that a photo's mask lacks: of several things that are prompted, a network takes the clearest."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import cv2
 import numpy as np
@@ -11,100 +11,84 @@ from scipy.spatial import cKDTree
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.masks.grabcut import cleaned
-from scenefuse.masks.pixels import distance_to, held, pixel_of, share_in
-from scenefuse.masks.votes import LEAST_QUALITY, SURE
+from scenefuse.masks.prompts import (
+    NO_PIXELS,
+    Prompts,
+    Segmenter,
+    agreement,
+    distance_to,
+    held,
+    pixel_of,
+    prompted_parts,
+)
+from scenefuse.masks.votes import MIN_QUALITY, MIN_VOTE_SHARE
 from scenefuse.photos.workspace import View
 
-LEAST_KNOWN = 4
-"""Points known to be on the object that a photo has to see to be prompted by them."""
-PART_GAP = 0.05
-"""Pixels that a mask lacks are of one part if they are this near each other, as a share of the photo's longer side."""
-PART_AGREEMENT = 0.5
-"""A mask that agrees less with what prompts it does not lack parts: it is another thing."""
-PART_REACH = 0.1
-"""Pixels outside prompt a part if they are this near it, likewise."""
-NEAR_MISS = 0.015
-"""A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part."""
-NEAREST_PX = 0.03
-"""A part's colours are compared with what is this near it, likewise, or within twice its radius where that is more."""
+# Points known to be on the object that prompt a photo, or a part, by themselves.
+MIN_KNOWN_POINTS = 4
+# Pixels that a mask lacks are of one part if they are this near each other, as a share of the photo's longer side.
+PART_GAP_SHARE = 0.05
+# A mask that agrees less with what prompts it does not lack parts: it is another thing.
+MIN_WHOLE_AGREEMENT = 0.5
+# Pixels outside prompt a part if they are this near it, as a share of the photo's longer side.
+PART_REACH_SHARE = 0.1
+# A click off a mask by less than this share of the photo's longer side missed its outline; others are on a part.
+NEAR_MISS_SHARE = 0.015
+# A part's colours are compared with what is this near it, likewise, or within twice its radius where that is more.
+COLOR_REACH_SHARE = 0.03
+# Bins of a histogram of colours along each axis of CIELAB.
 COLOR_BINS = 8
-"""Bins of a histogram of colours along each axis of CIELAB."""
-CLEAR, LEAST_REACH = 2.0, 0.4
-"""Mean logarithm of how much likelier a part's colours are in the mask near it than around, or the reverse, by which
-they decide; where they do not, how far the points in a part reach from the mask, over how far it does, does. Of 99
-parts on four objects with true masks the two rules leave out 49, of which 45 were at most half on the object (sky
-between an arm and a leg, the hill behind a roof), and keep 50, of which 47 were more."""
-
-Ask = Callable[[View, tuple[Array, Array], tuple[Array, Array], Array | None, Array | None], tuple[list[Mask], Array]]
-"""Masks (H, W) of a photo with RGB pixels and their qualities, from pixels on the object, pixels off it, each (N, 2)
-clicked and (M, 2) carried on, a box (2, 2) that was drawn or None, and one in which the object probably is or None:
-what comes of that, if anything, is told by itself."""
+# Mean logarithm of how much likelier a part's colours are in the mask near it than around, or the reverse, from which
+# they decide; where they do not, how far the points in a part reach from the mask, over how far the part does, does.
+# Of 99 parts on four objects with true masks the two rules leave out 49, of which 45 were at most half on the object
+# (sky between an arm and a leg, the hill behind a roof), and keep 50, of which 47 were more.
+CLEAR_COLOR_NATS, MIN_REACH_SHARE = 2.0, 0.4
 
 
-def with_parts(
-    ask: Ask,
-    view: View,
-    mask: Mask,
-    inside: tuple[Array, Array],
-    outside: tuple[Array, Array],
-    enclosed: Array,
-    tolerance_px: float,
-) -> Mask:
-    """A mask with the parts that it lacks: of several things that prompt it, a network takes the clearest.
+def with_parts(segment: Segmenter, view: View, mask: Mask, prompts: Prompts, tolerance_px: float) -> Mask:
+    """A mask (H, W) with the parts that it lacks.
 
-    Each group of pixels inside that the mask does not hold, near each other, prompts alone. What it gives is a part of
-    the object if it holds them, few pixels known to be outside beside those known to be inside, and is no larger than
-    the mask. Unless it was clicked, its colours have to be the mask's, not those around it, or where this is not clear
-    its points must reach into it: a few next to an outline may be mismatched. Pixels of points that the object's
-    enclose, (N, 2), are asked about likewise.
+    Each group of pixels inside that the mask does not hold, near each other, prompts alone. The answer is a part of
+    the object if it holds them, holds few pixels outside beside those inside, and is no larger than the mask. Unless
+    it was clicked, its colours have to be the mask's rather than those around it, or, where they are like both, its
+    points must reach into it: a few next to an outline may be mismatched.
     """
-    whole = mask
-    if agrees(mask, inside, outside, tolerance_px) < PART_AGREEMENT:
-        return whole
-    missed_px = max(tolerance_px, NEAR_MISS * max(mask.shape))
-    perhaps = np.concatenate([inside[1], enclosed])
-    lacking = inside[0][~held(mask, inside[0], missed_px)], perhaps[~held(mask, perhaps, 0)]
-    for group in _groups(*lacking, PART_GAP * max(mask.shape)):
-        on = np.concatenate(group)
-        # What is clicked in a photo beats what other photos say of it.
-        certain, voted = outside if not len(group[0]) else (outside[0], outside[1][:0])
-        off = np.concatenate([certain, voted])
-        # Far from a part, they say nothing of it and mislead the network.
-        reach = cKDTree(on), PART_REACH * max(mask.shape)
-        masks, quality = ask(view, group, (_near(certain, *reach), _near(voted, *reach)), None, None)
+    if agreement(mask, prompts, tolerance_px) < MIN_WHOLE_AGREEMENT:
+        return mask
+    whole, side_px = mask, max(mask.shape)
+    perhaps = np.concatenate([prompts.known, prompts.enclosed])
+    clicked = prompts.clicked[~held(mask, prompts.clicked, max(tolerance_px, NEAR_MISS_SHARE * side_px))]
+    for group in _groups(clicked, perhaps[~held(mask, perhaps, 0)], PART_GAP_SHARE * side_px):
+        on = group.inside
+        # What is clicked in a photo beats what other photos know of it.
+        off = prompts if not len(group.clicked) else prompts._replace(known_off=NO_PIXELS)
+        # Far from a part, pixels outside say nothing of it and mislead the network.
+        reach = cKDTree(on), PART_REACH_SHARE * side_px
+        near = group._replace(clicked_off=_near(off.clicked_off, *reach), known_off=_near(off.known_off, *reach))
+        masks, quality = segment(view, near, None)
         for row in np.argsort(-quality):
-            part = prompted_parts(cleaned(masks[row], view.pixels), on, off)
-            own, foreign = (held(part, pixels, 0).sum() for pixels in (np.concatenate([inside[0], perhaps]), off))
-            holds = part.any() and share_in(part, on, 1.0) >= SURE
-            sound = quality[row] >= LEAST_QUALITY and holds and own >= SURE * (own + foreign)
-            sound = sound and part.sum() <= mask.sum()
-            if sound and (len(group[0]) or _vouched(view.pixels, mask, part & ~mask, on)):
+            part = prompted_parts(cleaned(masks[row], view.pixels), on, off.outside)
+            own = held(part, np.concatenate([prompts.clicked, perhaps]), 0).sum()
+            sound = quality[row] >= MIN_QUALITY and part.any() and part.sum() <= mask.sum()
+            sound = sound and held(part, on, 0).mean() >= MIN_VOTE_SHARE
+            sound = sound and own >= MIN_VOTE_SHARE * (own + held(part, off.outside, 0).sum())
+            if sound and (len(group.clicked) or _looks_alike(view.pixels, mask, part & ~mask, on)):
                 whole = whole | part
                 break
     return whole
 
 
-def agrees(mask: Mask, inside: tuple[Array, Array], outside: tuple[Array, Array], tolerance_px: float) -> float:
-    """Share of the pixels inside that a mask holds, less the share of those outside that it holds.
-
-    Of those inside one more counts as held: where four are known, one that is wrong is no reason to doubt the mask.
-    """
-    within = np.concatenate([held(mask, inside[0], tolerance_px), held(mask, inside[1], 0)])
-    spared = np.concatenate([held(~mask, outside[0], tolerance_px), held(~mask, outside[1], 0)])
-    return float((within.sum() + 1) / (len(within) + 1) - ((~spared).mean() if len(spared) else 0.0))
-
-
-def _vouched(image: NDArray[np.uint8], mask: Mask, part: Mask, on: Array) -> bool:
-    """Whether the colours of a part (H, W) outside a mask, and how far the pixels (N, 2) in it lie from this, speak for
-    it."""
+def _looks_alike(image: NDArray[np.uint8], mask: Mask, part: Mask, on: Array) -> bool:
+    """Whether the colours of a part (H, W) outside a mask are the mask's, or, where they are not clear, the pixels
+    (N, 2) that prompt it reach into it."""
     if not part.any():
         return True
     own = own_colors(image, mask, part)
-    if abs(own) >= CLEAR:
+    if abs(own) >= CLEAR_COLOR_NATS:
         return own > 0
     away = distance_to(mask)
     u, v = pixel_of(on, mask)
-    return bool(np.percentile(away[v, u], 90) >= LEAST_REACH * np.percentile(away[part], 90))
+    return bool(np.percentile(away[v, u], 90) >= MIN_REACH_SHARE * np.percentile(away[part], 90))
 
 
 def own_colors(image: NDArray[np.uint8], mask: Mask, part: Mask) -> float:
@@ -116,7 +100,7 @@ def own_colors(image: NDArray[np.uint8], mask: Mask, part: Mask) -> float:
         mask: (H, W).
         part: (H, W), outside the mask, not empty.
     """
-    reach = max(NEAREST_PX * max(mask.shape), 2 * float(np.sqrt(part.sum() / np.pi)))
+    reach = max(COLOR_REACH_SHARE * max(mask.shape), 2 * float(np.sqrt(part.sum() / np.pi)))
     rows, columns = (np.flatnonzero(part.any(axis)) for axis in (1, 0))
     box = tuple(slice(max(0, int(k[0] - reach)), int(k[-1] + reach) + 1) for k in (rows, columns))
     image, mask, part = image[box], mask[box], part[box]
@@ -135,25 +119,13 @@ def _near(pixels: Array, others: cKDTree, reach_px: float) -> Array:
     return pixels[others.query(pixels)[0] < reach_px] if len(pixels) else pixels
 
 
-def _groups(clicked: Array, carried: Array, gap_px: float) -> Iterator[tuple[Array, Array]]:
-    """Pixels (N, 2) clicked and (M, 2) carried on, those near each other together; a few carried ones say nothing."""
-    pixels = np.concatenate([clicked, carried])
+def _groups(clicked: Array, known: Array, gap_px: float) -> Iterator[Prompts]:
+    """Pixels (N, 2) clicked and (M, 2) known, those near each other together; a few known ones alone are left out."""
+    pixels = np.concatenate([clicked, known])
     if len(pixels):
         tree = cKDTree(pixels)
         _, group = connected_components(tree.sparse_distance_matrix(tree, gap_px))
         for number in range(group.max() + 1):
-            of_group = np.split(group == number, [len(clicked)])
-            if of_group[0].any() or of_group[1].sum() >= LEAST_KNOWN:
-                yield clicked[of_group[0]], carried[of_group[1]]
-
-
-def prompted_parts(mask: Mask, inside: Array, outside: Array) -> Mask:
-    """The connected parts of a mask (H, W) that hold one of (N, 2) pixels inside, and not as many of (M, 2) outside;
-    all of it where no pixel inside is known."""
-    if not len(inside):
-        return mask
-    count, labels = cv2.connectedComponents(mask.astype(np.uint8), connectivity=4)
-    on, off = (np.bincount(labels[v, u], minlength=count) for u, v in (pixel_of(p, mask) for p in (inside, outside)))
-    wanted = on > off
-    wanted[0] = False
-    return wanted[labels]
+            of_clicked, of_known = np.split(group == number, [len(clicked)])
+            if of_clicked.any() or of_known.sum() >= MIN_KNOWN_POINTS:
+                yield Prompts(clicked=clicked[of_clicked], known=known[of_known])

@@ -14,25 +14,23 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
-from scenefuse.masks.click_depth import with_depth
-from scenefuse.masks.grabcut_passes import ask_grabcut
-from scenefuse.masks.parts import Ask, prompted_parts
-from scenefuse.masks.propagation import carry, one_photo
-from scenefuse.masks.sam2 import Sam2, ask_sam2
+from scenefuse.masks.grabcut_passes import query_grabcut
+from scenefuse.masks.prompts import Segmenter, prompted_parts
+from scenefuse.masks.propagation import propagate
+from scenefuse.masks.sam2 import Sam2, query_sam2
 from scenefuse.masks.segmentation import MaskSettings, segment_again, segment_by_grabcut, segment_by_sam2
 from scenefuse.masks.stereo_points import with_stereo_points
 from scenefuse.masks.target import Target, target_from_points, target_from_votes
-from scenefuse.masks.votes import near_most
 from scenefuse.photos.workspace import Workspace, read_model
 
-LEAST_POINTS = 3
-"""Prompts that span an object."""
-SLOPPY = 0.03
-"""Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
-a hand misses, or that are none (a hat's brim)."""
-CARRIED_WIDTHS = 2
-"""GrabCut carries masks on at photos so many times as wide as those of its first cut: what one mask lacks is missing
-from the next."""
+# Points clicked in several photos that span an object.
+MIN_POINTS = 3
+# Clicks on a point that miss each other by this share of what is clicked still say where the object ends: corners that
+# a hand misses, or that are none (a hat's brim).
+MAX_MISS_SHARE = 0.03
+# GrabCut propagates masks in photos so many times as wide as those of its first cut: what one mask lacks is missing
+# from the next.
+PROPAGATION_WIDTHS = 2
 
 
 @dataclass(frozen=True)
@@ -83,26 +81,18 @@ def masks_from_prompts(
     """
     if isinstance(marked, Clicks) and marked.kind == "labels":
         own, left_out = clicks_per_photo(marked, sparse, photos.views, sizes)
-        ask: Ask = (
-            partial(ask_sam2, network) if network else partial(ask_grabcut, CARRIED_WIDTHS * settings.grabcut_width_px)
-        )
-        limit = settings.max_click_residual_px
-        first = {k: one_photo(ask, photos.views[k], clicks, limit)[0] for k, clicks in own.items() if clicks.enough}
-        clicked = with_depth(photos, own, first)
+        width_px = PROPAGATION_WIDTHS * settings.grabcut_width_px
+        segment: Segmenter = partial(query_sam2, network) if network else partial(query_grabcut, width_px)
         photos = with_stereo_points(photos) if network else photos
-        carried = carry(ask, photos, clicked, limit)
-        placed = np.concatenate([np.zeros((0, 3)), *(clicks.placed for clicks in carried.clicked.values())])
-        placed = placed[near_most(placed, photos.points[carried.kind > 0])]
-        # GrabCut's carried masks leak: what two of them agree on is no end of the object.
-        ends = carried.ends if network else carried.ends[:0]
-        target = target_from_votes(carried.kind, photos, up, seed, placed, ends)
+        found = propagate(segment, photos, own, settings.max_click_residual_px)
+        target = target_from_votes(found.kind, photos, up, seed)
         if network:
-            masks = segment_again(network, target, carried.masks, photos, settings, carried.clicked)
+            masks = segment_again(network, target, found.masks, photos, settings, found.clicked)
         else:
-            masks = segment_by_grabcut(target, photos, settings, carried.clicked)
-        masks = [_own_parts(mask, target, photos, k, carried.clicked.get(k)) for k, mask in enumerate(masks)]
-        names = tuple(photos.views[k].name for k, clicks in carried.clicked.items() if clicks.enough)
-        return Prompted(masks, target, carried.reasons, left_out + carried.left_out, clicked=names)
+            masks = segment_by_grabcut(target, photos, settings, found.clicked)
+        masks = [_own_parts(mask, target, photos, k, found.clicked.get(k)) for k, mask in enumerate(masks)]
+        names = tuple(photos.views[k].name for k, clicks in found.clicked.items() if clicks.enough)
+        return Prompted(masks, target, found.reasons, left_out + found.left_out, clicked=names)
     points, exact, left_out, notes = _points(marked, sparse, sizes, settings.max_click_residual_px)
     target = replace(target_from_points(points, photos, up, seed), inexact=np.flatnonzero(~exact))
     if network:
@@ -132,7 +122,7 @@ def _points(
         names, points, exact = marked.points, marked.positions, np.ones(len(marked.points), dtype=bool)
     else:
         model = read_model(sparse)
-        limit = max(max_residual_px, SLOPPY * marked_size(marked, model, sizes))
+        limit = max(max_residual_px, MAX_MISS_SHARE * marked_size(marked, model, sizes))
         names, points, residuals, left_out = triangulate_consistent(marked, model, limit, sizes)
         exact = residuals <= max_residual_px
         off = [f"{name} {px:.1f} px" for name, px in zip(names, residuals) if px > max_residual_px]
@@ -141,7 +131,7 @@ def _points(
                 f"the clicks on {len(off)} of {len(names)} points miss each other by more than {max_residual_px:g} px"
                 f" ({', '.join(off)}): these points say how far the object reaches, and do not prompt SAM 2",
             )
-    if len(points) < LEAST_POINTS:
+    if len(points) < MIN_POINTS:
         wrong = f" ({'; '.join(left_out)})" if left_out else ""
         raise StageError(
             f"{marked.path} holds {len(names)} points on the object that can be used, three or more are needed{wrong};"

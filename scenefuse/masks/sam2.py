@@ -15,24 +15,22 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask, mask_iou
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.grabcut import cleaned
+from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart
 from scenefuse.masks.sam2_weights import DECODER, DECODER_SHA256, ENCODER, ENCODER_SHA256, why_unavailable
-from scenefuse.masks.target import Target, far_apart
+from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View
 
-SIDE_PX = 1024
-"""Side of the square image the network takes."""
-LOGITS_PX = 256
-"""Side of the masks it gives and takes."""
-BOX_GROWTH = 0.05
-"""Growth of the box around the prompts, as a share of its longer side."""
-MOST_INSIDE, MOST_OUTSIDE = 10, 6
-"""Points carried on from other photos that prompt a photo at most: far apart, they say as much as hundreds."""
-FEW_INSIDE = 4
-"""In the middle of the object, so many prompt it as well, with the box around all: by points on all its ends and off
-it, the network is sure of nothing."""
-NEAR = 0.3
-"""Points off the object prompt only this near the box around those on it, as a share of its longer side."""
-NONE = np.zeros((0, 2))
+# Sides of the square image that the network takes, and of the masks that it gives and takes.
+SIDE_PX, LOGITS_PX = 1024, 256
+# Growth of the box around the prompts, as a share of its longer side.
+BOX_GROWTH_SHARE = 0.05
+# Known points that prompt a photo at most: far apart, they say as much as hundreds.
+MAX_POINTS_INSIDE, MAX_POINTS_OUTSIDE = 10, 6
+# Points in the middle of the object that prompt it as well, with the box around all: by points on all its ends and off
+# it, the network is sure of nothing.
+MIDDLE_POINTS = 4
+# Points off the object prompt only this near the box around those on it, as a share of its longer side.
+MAX_OUTSIDE_DISTANCE_SHARE = 0.3
 
 
 class Sam2(Protocol):
@@ -42,7 +40,12 @@ class Sam2(Protocol):
         """Features of a (H, W, 3) uint8 RGB photo, for any number of prompts."""
 
     def masks(
-        self, features: Any, size: tuple[int, int], points_px: Array, box_px: Array | None, outside_px: Array = NONE
+        self,
+        features: Any,
+        size: tuple[int, int],
+        points_px: Array,
+        box: Array | None,
+        outside_px: Array = NO_PIXELS,
     ) -> tuple[list[Mask], Array]:
         """Three masks (H, W), a part, a larger part and the whole, and how good the network thinks they are, (3,).
 
@@ -50,7 +53,7 @@ class Sam2(Protocol):
             features: of the photo.
             size: its (height, width).
             points_px: (P, 2) pixels on the object.
-            box_px: (2, 2) corners of a box around it, upper left first.
+            box: (2, 2) corners of a box around it, upper left first.
             outside_px: (Q, 2) pixels not on it.
         """
 
@@ -83,11 +86,11 @@ class Sam2Onnx:
         features: dict[str, NDArray[np.float32]],
         size: tuple[int, int],
         points_px: Array,
-        box_px: Array | None,
-        outside_px: Array = NONE,
+        box: Array | None,
+        outside_px: Array = NO_PIXELS,
     ) -> tuple[list[Mask], Array]:
         """See Sam2."""
-        points, labels = _prompts(size, points_px, box_px, outside_px)
+        points, labels = _prompts(size, points_px, box, outside_px)
         inputs = features | {
             "point_coords": points[None],
             "point_labels": labels[None],
@@ -139,11 +142,11 @@ class Sam2Transformers:
         features: list[torch.Tensor],
         size: tuple[int, int],
         points_px: Array,
-        box_px: Array | None,
-        outside_px: Array = NONE,
+        box: Array | None,
+        outside_px: Array = NO_PIXELS,
     ) -> tuple[list[Mask], Array]:
         """See Sam2."""
-        prompts = _prompts(size, points_px, box_px, outside_px)
+        prompts = _prompts(size, points_px, box, outside_px)
         points, labels = (torch.from_numpy(a)[None, None].to(self._device) for a in prompts)
         with torch.inference_mode():
             found = self._network(
@@ -161,14 +164,14 @@ def _blob(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 
 
 def _prompts(
-    size: tuple[int, int], points_px: Array, box_px: Array | None, outside_px: Array
+    size: tuple[int, int], points_px: Array, box: Array | None, outside_px: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels in the network's own, and their labels: 1 on the object, 0 off it, the box's corners 2 and 3.
 
     Where there is no box, a point labelled -1 stands for it, as the network was trained.
     """
     height, width = size
-    corners, names = (np.zeros((1, 2)), [-1.0]) if box_px is None else (box_px, [2.0, 3.0])
+    corners, names = (np.zeros((1, 2)), [-1.0]) if box is None else (box, [2.0, 3.0])
     points = np.concatenate([points_px, outside_px, corners]) * [SIDE_PX / width, SIDE_PX / height]
     labels = [1.0] * len(points_px) + [0.0] * len(outside_px) + names
     return points.astype(np.float32), np.array(labels, dtype=np.float32)
@@ -208,9 +211,9 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
     exact[target.inexact] = False
     spanned = pixels[front] if outline is None or not outline.any() else np.argwhere(outline)[:, ::-1] + 0.5
     low, high = spanned.min(0), spanned.max(0)
-    grow = BOX_GROWTH * (high - low).max()
+    grow = BOX_GROWTH_SHARE * (high - low).max()
     box = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1])
-    on, off = pixels[exact if exact.any() else inside], NONE
+    on, off = pixels[exact if exact.any() else inside], NO_PIXELS
     if clicks is not None:
         on, off, box = np.concatenate([clicks.on, on]), clicks.off, box if clicks.box is None else clicks.box
     found, quality = network.masks(network.encode(view.pixels), size, on, box, off)
@@ -220,37 +223,31 @@ def segment(network: Sam2, target: Target, view: View, outline: Mask | None, cli
     return cleaned(found[int(np.argmax([m[v, u].mean() * q for m, q in zip(found, quality)]))], view.pixels)
 
 
-def ask_sam2(
-    network: Sam2,
-    view: View,
-    inside: tuple[Array, Array],
-    outside: tuple[Array, Array],
-    box_px: Array | None,
-    likely_px: Array | None,
-) -> tuple[list[Mask], Array]:
-    """SAM 2's masks (H, W) of a photo and its own opinion of them (M,): three from pixels all over the object, and
-    where there are more than ten of these, three from four in its middle and the box around all.
+def query_sam2(network: Sam2, view: View, prompts: Prompts, box: Array | None) -> tuple[list[Mask], Array]:
+    """SAM 2's masks (H, W) of a photo and its own estimate of their IoU: three from pixels all over the object, and
+    where there are many of these, three from a few in its middle and the box around all.
 
     Args:
         network: SAM 2.
         view: the photo, with RGB pixels.
-        inside: (N, 2) pixels clicked on the object, and (M, 2) carried on to it, of which a few far apart count.
-        outside: the same off the object; of those carried on, the near ones.
-        box_px: (2, 2) corners of a box around it, upper left first, or None.
-        likely_px: the same of a box in which it probably is, that prompts in its place; or None.
+        prompts: all clicks prompt it, and a few of the known points, far apart; of those off the object the near ones.
+        box: (2, 2) corners of a box around it, upper left first, or None.
     """
     features, size = network.encode(view.pixels), (view.height, view.width)
-    box_px = likely_px if box_px is None else box_px
-    around = np.concatenate(inside) if box_px is None else box_px
+    inside = prompts.inside
+    around = inside if box is None else box
     low, high = around.min(0), around.max(0)
-    reach = NEAR * (high - low).max()
-    near = outside[1][((outside[1] > low - reach) & (outside[1] < high + reach)).all(1)]
-    off = far_apart(outside[0], near if len(near) else outside[1], MOST_OUTSIDE)
-    masks, quality = network.masks(features, size, far_apart(inside[0], inside[1], MOST_INSIDE), box_px, off)
-    if len(np.concatenate(inside)) > MOST_INSIDE:
-        grow = BOX_GROWTH * (high - low).max()
-        around_px = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1]) if box_px is None else box_px
-        more, their_quality = network.masks(features, size, _middle(np.concatenate(inside)), around_px)
+    side = float((high - low).max())
+    reach = MAX_OUTSIDE_DISTANCE_SHARE * side
+    known_off = prompts.known_off
+    near = known_off[((known_off > low - reach) & (known_off < high + reach)).all(1)]
+    off = far_apart(prompts.clicked_off, near if len(near) else known_off, MAX_POINTS_OUTSIDE)
+    on = far_apart(prompts.clicked, prompts.known, MAX_POINTS_INSIDE)
+    masks, quality = network.masks(features, size, on, box, off)
+    if len(inside) > MAX_POINTS_INSIDE:
+        grow = BOX_GROWTH_SHARE * side
+        grown = np.clip(np.stack([low - grow, high + grow]), 0, size[::-1]) if box is None else box
+        more, their_quality = network.masks(features, size, _middle(inside), grown)
         masks, quality = [*masks, *more], np.concatenate([quality, their_quality])
     return masks, quality
 
@@ -258,7 +255,7 @@ def ask_sam2(
 def _middle(pixels: Array) -> Array:
     """A few of (N, 2) pixels: the middle one, and of the half nearest to it those far apart."""
     order = np.argsort(np.linalg.norm(pixels - np.median(pixels, axis=0), axis=1), kind="stable")
-    return far_apart(pixels[order[:1]], pixels[order[: (len(order) + 1) // 2]], FEW_INSIDE)
+    return far_apart(pixels[order[:1]], pixels[order[: (len(order) + 1) // 2]], MIDDLE_POINTS)
 
 
 def load_network(encoder: Path, decoder: Path, checkpoint: Path | None, threads: int) -> tuple[Sam2, str]:

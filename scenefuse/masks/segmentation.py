@@ -16,17 +16,12 @@ from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target
 from scenefuse.photos.workspace import View, Workspace
 
-HULL_TOLERANCE = 0.1
-"""Share of the photos that may contradict a voxel of the hull: some masks are wrong somewhere."""
-FIRST_TOLERANCE = 2 * HULL_TOLERANCE
-"""The same for the first masks, which are made photo by photo."""
-AS_OTHERS = 0.9
-"""Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more."""
-EDGE_LOGITS = 1.0
-"""The network's masks are moved to edges of the photo this near, in pixels of the 256 x 256 that it decides on."""
+# Share of the photos that may contradict a voxel of the hull, as some masks are wrong somewhere: of the last masks, of
+# first masks, which are made photo by photo, and for the hull by which masks are trusted.
+MAX_WRONG_SHARE, MAX_WRONG_FIRST_SHARE, MAX_WRONG_UNTRUSTED_SHARE = 0.1, 0.2, 0.34
+# Share of the median mask's agreement with the hull below which SAM 2 makes a mask once more.
+MIN_SHARE_OF_MEDIAN = 0.9
 NOTHING: Mapping[int, PhotoClicks] = {}
-TRUST_TOLERANCE = 0.34
-"""The same for the hull that tells which masks count for the final one: a third of them may be wrong all over."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +42,6 @@ class MaskSettings:
     sam2_checkpoint: str | None = setting(None)
     """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
     is one (`pip install transformers==5.23.0`); nothing is downloaded."""
-    band_px: float = setting(5, unit="px", least=0)
-    """For grabcut: half width of the band along the hull's outline where a photo's own evidence decides, at a photo
-    width of 640."""
     min_agreement: float = setting(0.6, least=0, most=1)
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
@@ -89,9 +81,9 @@ def segment_by_grabcut(
     Clicks, by row of the photo, are certain in their own photo.
     """
     masks = first_cuts(target, photos, settings.grabcut_width_px, clicked)
-    for tolerance in (FIRST_TOLERANCE, HULL_TOLERANCE):
+    for tolerance in (MAX_WRONG_FIRST_SHARE, MAX_WRONG_SHARE):
         hull = carve_trusted(target, photos.views, masks, settings, tolerance)
-        masks = second_cuts(target, masks, photos, hull, settings.band_px, clicked)
+        masks = second_cuts(target, masks, photos, hull, clicked)
     return masks
 
 
@@ -112,10 +104,10 @@ def segment_again(
     """SAM 2 once more, with the visual hull's box and the photo's own clicks, where one of the masks (H, W) disagrees
     with the hull, or much more than most; then all of them at the photo's resolution."""
     masks = list(masks)
-    hull = carve_trusted(target, photos.views, masks, settings, FIRST_TOLERANCE)
+    hull = carve_trusted(target, photos.views, masks, settings, MAX_WRONG_FIRST_SHARE)
     outlines = [silhouette(hull, view) for view in photos.views]
     agreement = [mask_iou(mask, outline) for mask, outline in zip(masks, outlines)]
-    least = max(settings.min_agreement, AS_OTHERS * float(np.median(agreement)))
+    least = max(settings.min_agreement, MIN_SHARE_OF_MEDIAN * float(np.median(agreement)))
     for k, (view, outline) in enumerate(zip(photos.views, outlines)):
         if agreement[k] < least:
             again = segment(network, target, view, outline, clicked.get(k))
@@ -129,14 +121,14 @@ def _at_full_size(view: View, mask: Mask) -> Mask:
     """A mask (H, W) at its photo's resolution. Small parts of it stay: they were asked for, by a click or by points of
     other photos; small parts that the edges leave do not."""
     assert view.pixels is not None
-    edges = along_edges(view.pixels, mask, EDGE_LOGITS * max(view.width, view.height) / LOGITS_PX)
+    edges = along_edges(view.pixels, mask, max(view.width, view.height) / LOGITS_PX)
     asked = mask & ~cleaned(mask)
     return np.asarray(cleaned(edges, view.pixels) | (edges & asked))
 
 
 def score_masks(masks: list[Mask], target: Target, views: list[View], settings: MaskSettings) -> ScoredMasks:
     """The masks of V views with their agreement with their visual hull; empty and contradicting ones are dropped."""
-    hull = carve_trusted(target, views, masks, settings, HULL_TOLERANCE)
+    hull = carve_trusted(target, views, masks, settings, MAX_WRONG_SHARE)
     scores = {view.name: mask_iou(mask, silhouette(hull, view)) for view, mask in zip(views, masks)}
     dropped = {}
     for view, mask in zip(views, masks):
@@ -159,7 +151,7 @@ def carve_trusted(
     """
     trusted = [replace(view, pixels=mask) for view, mask in zip(views, masks) if mask.any()]
     hull: Hull | None = None
-    for share in (max(tolerance, TRUST_TOLERANCE), tolerance):
+    for share in (max(tolerance, MAX_WRONG_UNTRUSTED_SHARE), tolerance):
         if hull is not None:
             trusted = [v for v in trusted if mask_iou(v.pixels, silhouette(hull, v)) >= settings.min_agreement]
         if len(trusted) < 2:

@@ -1,4 +1,4 @@
-"""Points by coarse stereo beside the sparse ones: parts without features are carried from photo to photo by these."""
+"""Points by coarse stereo beside the sparse ones: they propagate parts without features from photo to photo."""
 
 from dataclasses import replace
 
@@ -12,14 +12,12 @@ from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.view_selection import select_views
 from scenefuse.photos.workspace import Rows, View, Workspace
 
+# As coarse as masks need it: points next to an outline do not vote.
 SETTINGS = DepthMapSettings(max_image_size_px=200, sources=4, planes=64, window_px=5, min_score=0.6)
-"""As coarse as masks need it: points next to an outline do not vote."""
+# Photos of that size get a point in each square of so many pixels in which they see none.
 CELL_PX = 3
-"""Photos of that size get a point in each square of so many pixels in which they see none."""
-AGREEMENT = 0.01
-"""Depths are the same that differ by this share."""
-LEAST_PHOTOS = 3
-"""Photos whose depths agree on a point."""
+# Relative difference of depths that agree, and photos whose depths agree on a point.
+MAX_DEPTH_DIFFERENCE, MIN_PHOTOS = 0.01, 3
 
 DepthMap = NDArray[np.float32]
 
@@ -47,7 +45,7 @@ def with_stereo_points(photos: Workspace) -> Workspace:
         agree = np.zeros(len(new), dtype=np.int64)
         for other in maps:
             agree[_shown(*other, new)] += 1
-        points = np.concatenate([points, new[agree >= LEAST_PHOTOS]])
+        points = np.concatenate([points, new[agree >= MIN_PHOTOS]])
     count = len(photos.points)
     print(f"{len(points) - count} points by stereo beside {count} sparse ones", flush=True)
     seen, seen_at = list(photos.seen), list(photos.seen_at)
@@ -83,4 +81,4 @@ def _shown(view: View, depth: DepthMap, points: Array) -> Rows:
     """Rows (K,) of points (N, 3) that lie on a depth map (H, W)."""
     rows, pixels, away = view.visible(points)
     there = depth[pixels[:, 1], pixels[:, 0]]
-    return rows[np.abs(away - there) <= AGREEMENT * there]
+    return rows[np.abs(away - there) <= MAX_DEPTH_DIFFERENCE * there]

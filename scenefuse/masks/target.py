@@ -9,23 +9,21 @@ from scipy.spatial import Delaunay
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.ground import Ground
-from scenefuse.geometry.visual_hull import Box, Mask
-from scenefuse.masks.box import find_ground, in_hull, span, upright_box
+from scenefuse.geometry.visual_hull import NO_POINTS, Box, Mask
+from scenefuse.masks.box import GROUND_SCATTER_SHARE, find_ground, in_hull, span, upright_box
+from scenefuse.masks.prompts import far_apart
+from scenefuse.masks.votes import MIN_VOTE_SHARE, without_outermost
 from scenefuse.photos.workspace import View, Workspace
 
-BOX_MARGIN = 0.15
-"""Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends."""
-GROUND_MARGIN = 0.02
-"""A sparse point is the object's only this much above the ground, as a share of the box's diagonal: as the ground
-scatters."""
-PART_EDGE = 0.12
-"""Longest edge between prompts that enclose a part of the object, as a share of the box's diagonal: close clicks mark
-the corners of a small part."""
-MOST_SPANNING = 64
-"""Sparse points, far apart, that stand for the object where masks voted for thousands."""
-NOTHING_CLICKED = np.zeros((0, 3))
-LEAST_OWN = 10
-"""Sparse points on the object that supplied masks have to hold: fewer do not tell its extent."""
+# Growth of the box of the object's points on each side, as a share of its diagonal: they seldom mark its ends.
+BOX_MARGIN_SHARE = 0.15
+# Longest edge between prompts that enclose a part of the object, as a share of the box's diagonal: close clicks mark
+# the corners of a small part.
+MAX_PART_EDGE_SHARE = 0.12
+# Sparse points, far apart, that stand for the object where masks voted for thousands.
+SPANNING_POINTS = 64
+# Sparse points on the object that masks have to hold: fewer do not show its extent.
+MIN_OBJECT_POINTS = 10
 
 
 @dataclass(frozen=True)
@@ -76,19 +74,19 @@ def target_from_points(points: Array, photos: Workspace, up: Array, seed: int) -
         up: (3,) the direction against gravity.
         seed: seed of the ground's RANSAC.
     """
-    sparse, box = photos.points, upright_box(points, up, BOX_MARGIN)
+    sparse, box = photos.points, upright_box(points, up, BOX_MARGIN_SHARE)
     x_in_box = box.to_box(sparse)
     ground, found = find_ground(x_in_box, box, box.to_box(points), seed)
     height = ground.height_of(x_in_box)
-    above = GROUND_MARGIN * box.diagonal
-    grow = BOX_MARGIN * float(np.linalg.norm(np.ptp(points, axis=0)))
+    above = GROUND_SCATTER_SHARE * box.diagonal
+    grow = BOX_MARGIN_SHARE * float(np.linalg.norm(np.ptp(points, axis=0)))
     kind = np.zeros(len(sparse), dtype=np.int8)
     kind[~in_hull(sparse, span(points, grow))] = -1
     if found:
         kind[height < 0.5 * above] = -1
     kind[in_hull(sparse, span(points, 0.25 * grow)) & (height > above)] = 1
     kind[np.bincount(np.concatenate(photos.seen), minlength=len(sparse)) < 3] = 0
-    return Target(box, ground, found, points, grow, _parts(points, PART_EDGE * box.diagonal), sparse, kind)
+    return Target(box, ground, found, points, grow, _parts(points, MAX_PART_EDGE_SHARE * box.diagonal), sparse, kind)
 
 
 def target_from_votes(
@@ -96,11 +94,8 @@ def target_from_votes(
     photos: Workspace,
     up: Array,
     seed: int,
-    clicked: Array = NOTHING_CLICKED,
-    ends: Array = NOTHING_CLICKED,
 ) -> Target:
-    """Where the object is, by the sparse points that the photos' masks vote for, those whose kind (P,) is 1, and by the
-    points (N, 3) that were clicked; (E, 3) ends say how far it reaches, and no more.
+    """Where the object is, by the sparse points that the photos' masks vote for, those whose kind (P,) is 1.
 
     What these points do not decide is decided as in `target_from_points`, whose other arguments they are: a vote
     against a point says less, as a part of the object that one mask lacks is missing from the next ones too.
@@ -109,15 +104,14 @@ def target_from_votes(
         StageError: fewer than ten points are on the object.
     """
     own = photos.points[kind > 0]
-    if len(own) < LEAST_OWN:
+    if len(own) < MIN_OBJECT_POINTS:
         raise StageError(
-            f"only {len(own)} points of the sparse model lie in the masks that the clicks lead to, {LEAST_OWN} are"
-            " needed; click in a photo that shows more of the object, or in several. If it has no texture, there are"
-            " none: light from the side may bring some out"
+            f"only {len(own)} points of the sparse model lie in the masks that the clicks lead to,"
+            f" {MIN_OBJECT_POINTS} are needed; click in a photo that shows more of the object, or in several. If it has"
+            " no texture, there are none: light from the side may bring some out"
         )
-    reach = np.concatenate([own, ends])
-    target = target_from_points(np.concatenate([clicked, _without_outermost(reach, up)]), photos, up, seed)
-    spanning = far_apart(clicked, target.spanning, MOST_SPANNING)
+    target = target_from_points(without_outermost(own), photos, up, seed)
+    spanning = far_apart(NO_POINTS, target.spanning, SPANNING_POINTS)
     return replace(
         target,
         spanning=spanning,
@@ -126,19 +120,7 @@ def target_from_votes(
     )
 
 
-def far_apart(first: Array, others: Array, count: int) -> Array:
-    """The first (N, D) points, and of the others those farthest from all before, up to `count` together."""
-    chosen = list(first) if len(first) else list(others[:1])
-    gaps = np.full(len(others), np.inf)
-    for point in chosen:
-        gaps = np.minimum(gaps, np.linalg.norm(others - point, axis=1))
-    while len(chosen) < count and gaps.max(initial=0) > 0:
-        chosen.append(others[gaps.argmax()])
-        gaps = np.minimum(gaps, np.linalg.norm(others - chosen[-1], axis=1))
-    return np.array(chosen).reshape(-1, others.shape[1])
-
-
-def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
+def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
     """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
 
     Raises:
@@ -149,20 +131,13 @@ def points_in_masks(photos: Workspace, masks: list[Mask], up: Array) -> Array:
         u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
         np.add.at(seen, rows, 1)
         np.add.at(hit, rows, mask[v, u])
-    own = photos.points[(seen >= 2) & (hit > 0.8 * seen)]
-    if len(own) < LEAST_OWN:
+    own = photos.points[(seen >= 2) & (hit > MIN_VOTE_SHARE * seen)]
+    if len(own) < MIN_OBJECT_POINTS:
         raise StageError(
             f"only {len(own)} sparse points lie in the supplied masks; "
             "are they white on the object, and of these photos?"
         )
-    return _without_outermost(own, up)
-
-
-def _without_outermost(own: Array, up: Array) -> Array:
-    """The (N, 3) points without the outermost half per cent at each side: some are mismatched."""
-    x = upright_box(own, up, 0.0).to_box(own)
-    low, high = np.percentile(x, 0.5, axis=0, method="lower"), np.percentile(x, 99.5, axis=0, method="higher")
-    return own[((x >= low) & (x <= high)).all(1)]
+    return without_outermost(own)
 
 
 def _parts(points: Array, max_edge: float) -> NDArray[np.intp]:

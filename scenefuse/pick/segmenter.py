@@ -12,17 +12,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, scratch_directory, threads
-from scenefuse.pick.edits import Rows
-from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
+from scenefuse.pick.clicks import Rows
+from scenefuse.pick.photo_tiles import Picture, at_most, read_upright
 
 if TYPE_CHECKING:
     from scenefuse.marks.photo_clicks import PhotoClicks
 
 Mask = NDArray[np.bool_]
-# Photos whose features are kept; 17 MB each, and the photo.
-KEPT_PHOTOS = 24
-# Without a click for so long, photos that are not shown are prepared.
+KEPT = 24
+"""Photos whose features are kept; 17 MB each, and the photo."""
 IDLE_S = 4.0
+"""Without a click for so long, photos that are not shown are prepared."""
+AHEAD = 6
+"""Photos whose features are computed before anybody clicks in them."""
 
 
 class _Remembering:
@@ -38,7 +40,7 @@ class _Remembering:
         if id(image) not in self._features:
             # The array is kept, too: another one would get its identity.
             self._features[id(image)] = image, self._network.encode(image)
-            while len(self._features) > KEPT_PHOTOS:
+            while len(self._features) > KEPT:
                 self._features.popitem(last=False)
         return self._features[id(image)][1]
 
@@ -52,14 +54,15 @@ class Segmenter:
         trouble: why it is not what the settings ask for, or why there is nothing; "" where all is well.
     """
 
-    def __init__(self, settings: Mapping[str, Any], photo_px: int) -> None:
+    def __init__(self, settings: Mapping[str, Any], side_px: int, photo_px: int) -> None:
         """Nothing is loaded yet.
 
         Args:
             settings: `object.masks`.
+            side_px: longer side of the photos that masks are made in.
             photo_px: longest side of an undistorted photo in the workflow.
         """
-        self._settings, self._photo_px = settings, photo_px
+        self._settings, self._side_px, self._photo_px = settings, side_px, photo_px
         self._photos: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
         self._network: _Remembering | None = None
         self._ask: Callable[..., Any] | None = None
@@ -74,14 +77,14 @@ class Segmenter:
 
         The weights are fetched, as the workflow would, where nothing has tried that yet.
         """
-        from scenefuse.masks.grabcut_passes import ask_grabcut
+        from scenefuse.masks.grabcut_passes import query_grabcut
 
         settings = self._settings
         with self._busy:
             if self.method:
                 return
             if settings["method"] in ("auto", "sam2"):
-                from scenefuse.masks.sam2 import ask_sam2, load_network
+                from scenefuse.masks.sam2 import load_network, query_sam2
                 from scenefuse.masks.sam2_weights import UnavailableError
 
                 checkpoint = settings["sam2_checkpoint"]
@@ -91,15 +94,15 @@ class Segmenter:
                         self._fetch_once({encoder, decoder})
                     network, _ = load_network(encoder, decoder, checkpoint and Path(checkpoint), threads())
                     self._network = _Remembering(network)
-                    self._ask, self.method = partial(ask_sam2, self._network), "SAM 2"
+                    self._ask, self.method = partial(query_sam2, self._network), "SAM 2"
                     return
                 except (StageError, UnavailableError, OSError) as error:
                     self.trouble = f"Masks are shown by GrabCut, not by SAM 2: {error}"
-            from scenefuse.masks.prompted import CARRIED_WIDTHS
+            from scenefuse.masks.prompted import PROPAGATION_WIDTHS
             from scenefuse.masks.segmentation import MaskSettings
 
-            width = CARRIED_WIDTHS * MaskSettings().grabcut_width_px
-            self._ask, self.method = partial(ask_grabcut, width), "GrabCut"
+            width = PROPAGATION_WIDTHS * MaskSettings().grabcut_width_px
+            self._ask, self.method = partial(query_grabcut, width), "GrabCut"
 
     def _fetch_once(self, paths: set[Path]) -> None:
         """Put the shipped weights to their place, if these are they and nothing has tried it yet, neither meanwhile.
@@ -120,11 +123,11 @@ class Segmenter:
     def compute_ahead(self, wanted: Callable[[], list[Picture]]) -> None:
         """Compute features until closed, in the order wanted; run in a thread of its own.
 
-        While a person clicks, only those of the first photo are computed.
+        Only those of the first photo are computed while a person clicks.
         """
         self.load()
         while not self._closed:
-            photos = wanted()[: None if self.is_idle() else 1] if self._network else []
+            photos = wanted()[: AHEAD if self.is_idle() else 1] if self._network else []
             missing = [p for p in photos if p.name not in self._photos]
             if self._waiting or not missing:
                 time.sleep(0.2)
@@ -146,13 +149,13 @@ class Segmenter:
         self._closed = True
 
     def mask(self, picture: Picture, rows: Rows) -> tuple[Mask, list[str]]:
-        """(H, W) mask of a photo from its own clicks, at most MASK_PX large, and what is wrong with it.
+        """(H, W) mask of a photo from its own clicks, at most `side_px` large, and what is wrong with it.
 
         Raises:
             StageError: the photo cannot be read.
         """
         from scenefuse.masks.propagation import one_photo
-        from scenefuse.masks.votes import LEAST_AGREEMENT, LEAST_QUALITY
+        from scenefuse.masks.votes import MIN_AGREEMENT, MIN_QUALITY
         from scenefuse.photos.workspace import View
 
         self.load()
@@ -172,23 +175,25 @@ class Segmenter:
         finally:
             self._waiting -= 1
         notes = []
-        if self.method == "GrabCut" and clicks.box is None and clicks.inside.all():
-            notes.append("GrabCut separates colours: click beside the object too, or drag a box around it")
+        if self.method == "GrabCut" and not any(
+            row.photo == picture.name and row.label in ("outside", "box") for row in rows
+        ):
+            notes.append("GrabCut tells colours apart: click beside the object too, or drag a box around it")
         if left_out:
             clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
             notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
-        if quality < LEAST_QUALITY:
-            notes.append(f"its quality is {quality:.2f}, at least {LEAST_QUALITY} is needed: add clicks")
-        elif agreement < LEAST_AGREEMENT:
-            notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {LEAST_AGREEMENT} is needed")
+        if quality < MIN_QUALITY:
+            notes.append(f"its quality is {quality:.2f}, at least {MIN_QUALITY} is needed: add clicks")
+        elif agreement < MIN_AGREEMENT:
+            notes.append(f"it agrees with {agreement:.2f} of the clicks, at least {MIN_AGREEMENT} is needed")
         return mask, notes
 
     def _pixels(self, picture: Picture) -> NDArray[np.uint8]:
         """The photo as the network sees it; always the same array while it is kept."""
         if picture.name not in self._photos:
-            pixels = at_most(read_upright(picture.path, MASK_PX), MASK_PX)
+            pixels = at_most(read_upright(picture.path, self._side_px), self._side_px)
             self._photos[picture.name] = np.ascontiguousarray(pixels)
-            while len(self._photos) > KEPT_PHOTOS:
+            while len(self._photos) > KEPT:
                 self._photos.popitem(last=False)
         return self._photos[picture.name]
 

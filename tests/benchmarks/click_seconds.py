@@ -12,7 +12,7 @@ import numpy as np
 from scenefuse.core.stage import run
 from scenefuse.marks.photo_clicks import PhotoClicks
 from scenefuse.masks.propagation import one_photo
-from scenefuse.masks.sam2 import Sam2Onnx, ask_sam2
+from scenefuse.masks.sam2 import Sam2Onnx, query_sam2
 from scenefuse.masks.segmentation import MaskSettings
 from scenefuse.photos.pictures import read_rgb
 from scenefuse.photos.workspace import View
@@ -40,7 +40,7 @@ def click_seconds(*, photo: Path, weights: Path, clicks: int = 5, threads: int =
         for _ in range(REPEATS):
             start = time.perf_counter()
             given = PhotoClicks(places[:count], np.ones(count, dtype=bool))
-            one_photo(partial(ask_sam2, network), view, given, MaskSettings().max_click_residual_px)
+            one_photo(partial(query_sam2, network), view, given, MaskSettings().max_click_residual_px)
             took.append(time.perf_counter() - start)
         print(f"{width} x {height}, {count} clicks: {np.median(took):.2f} s (worst {max(took):.2f})", flush=True)
 

@@ -269,11 +269,11 @@ class TrueNetwork:
         self.segmented.append(k)
         return k
 
-    def masks(self, k, size, points_px, box_px, outside_px):
+    def masks(self, k, size, points_px, box, outside_px):
         ball = look(camera_pose(k))[0]
         assert size == ball.shape
         assert cv2.dilate(ball.astype(np.uint8), np.ones((5, 5)))[tuple(points_px.astype(int).T[::-1])].all()
-        assert (points_px > box_px[0]).all() and (points_px < box_px[1]).all()
+        assert (points_px > box[0]).all() and (points_px < box[1]).all()
         if k == 5 and self.segmented.count(5) == 1:
             return [self.first(ball)] * 3, np.ones(3)
         half = ball & (np.arange(size[1]) < points_px[:, 0].mean())
@@ -380,8 +380,8 @@ def test_points_that_are_not_exact_give_the_box_but_no_prompt(capture, monkeypat
         def encode(self, image):
             return None
 
-        def masks(self, image, size, points_px, box_px, outside_px):
-            asked.append((points_px, box_px))
+        def masks(self, image, size, points_px, box, outside_px):
+            asked.append((points_px, box))
             return [np.ones(size, dtype=bool)] * 3, np.ones(3)
 
     photos = read_workspace(capture / "undistorted")
