@@ -22,10 +22,10 @@ SMALL_PX = 96
 RENDER_SAMPLES = 32
 # A place is compared in the photos taken nearest to the one it is found in, where both show it: depths differ by less
 # than this share.
-COMPARED, SAME_DEPTH = 24, 0.02
-LEAST_OPACITY = 0.9
+COMPARED_PHOTOS, MAX_DEPTH_DIFFERENCE = 24, 0.02
+MIN_OPACITY = 0.9
 # Darker pixels are mostly noise, and brighter ones mostly clipped.
-DARKEST, BRIGHTEST = 0.04, 0.98
+MIN_COLOR, MAX_COLOR = 0.04, 0.98
 # Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
 LOG_DELTA = 0.05
 # Pull of gains towards 1, as a share of the pairs that determine them; of the vignetting, of all pairs.
@@ -34,13 +34,13 @@ ROUNDS = 10
 # The pull on a gain that is fitted to a finished render, in squared colour per pixel.
 RIDGE = 1e-4
 # A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
-LIKE_NEAREST = 2
+GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than the first Gaussian's sigma with those between the two, in pixels.
 FINE_PX, COARSE_PX = 1.0, 3.0
 # It is read so far inside the mask: the object's outline is sharp in a blurred photo's mask too.
-INSIDE_PX = 3
+MASK_INSET_PX = 3
 # A photo is compared with so many from nearby, and is blurred with less than this share of their median sharpness.
-NEAREST, BLURRED_BELOW = 8, 0.7
+SHARPNESS_NEIGHBOURS, MIN_SHARPNESS_SHARE = 8, 0.7
 
 
 @dataclass
@@ -87,7 +87,7 @@ def find_appearance(field: Field, occupancy: Occupancy, photos: PhotoTensors) ->
         render_view(field, occupancy, small.camera(view), mask, RENDER_SAMPLES, colored=False)
         for view, mask in enumerate(small.masks)
     ]
-    depths = torch.stack([torch.where(view.opacity > LEAST_OPACITY, view.depth, 0.0) for view in views])
+    depths = torch.stack([torch.where(view.opacity > MIN_OPACITY, view.depth, 0.0) for view in views])
     shared = shared_colors(small, depths)
     found = solved(shared, len(photos))
     device = field.table.device
@@ -108,7 +108,7 @@ def shrunk(photos: PhotoTensors) -> PhotoTensors:
 
 def shared_colors(photos: PhotoTensors, depths: Tensor) -> SharedColors:
     """Pairs of pixels (V, h, w) that show one place, from depths (V, h, w) along z, 0 for none."""
-    near = nearest(photos.center, COMPARED)
+    near = nearest(photos.center, COMPARED_PHOTOS)
     parts = [_shared(photos, depths, view, int(other)) for view in range(len(photos)) for other in near[view]]
     if not parts:
         none = torch.zeros(0, dtype=torch.int64)
@@ -128,8 +128,8 @@ def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tenso
     u, v = (there[:, axis].clamp(0, size - 1).long() for axis, size in ((0, width), (1, height)))
     ours, theirs = (photos.images[view, y, x] / 255.0 for view, y, x in ((a, rows, columns), (b, v, u)))
     kept = (x[:, 2] > 0) & ((there > 0) & (there < torch.tensor([width, height]))).all(1)
-    kept &= (depths[b, v, u] - x[:, 2]).abs() < SAME_DEPTH * x[:, 2]
-    kept &= (torch.minimum(ours, theirs) > DARKEST).all(1) & (torch.maximum(ours, theirs) < BRIGHTEST).all(1)
+    kept &= (depths[b, v, u] - x[:, 2]).abs() < MAX_DEPTH_DIFFERENCE * x[:, 2]
+    kept &= (torch.minimum(ours, theirs) > MIN_COLOR).all(1) & (torch.maximum(ours, theirs) < MAX_COLOR).all(1)
     radius2 = [squared_radius(p, k.expand(len(p), 3, 3), width, height) for p, k in ((uv, k_a), (there, k_b))]
     index = torch.ones(int(kept.sum()), dtype=torch.int64)
     return index * a, index * b, torch.stack(radius2, 1)[kept], (ours[kept] / theirs[kept]).log()
@@ -210,7 +210,7 @@ def gains_nearby(log_gain: Tensor, center: Tensor, trained: Tensor) -> Tensor:
         trained: (T,) indices of the photos trained on.
     """
     distance = torch.cdist(center, center[trained])
-    nearest = distance.topk(min(LIKE_NEAREST, len(trained)), largest=False).indices
+    nearest = distance.topk(min(GAIN_NEIGHBOURS, len(trained)), largest=False).indices
     return log_gain[nearest].mean(1).index_copy(0, trained, log_gain)
 
 
@@ -234,8 +234,8 @@ def photo_weights(sharpness: Tensor, center: Tensor) -> Tensor:
     count = len(sharpness)
     if count < 2:
         return torch.ones(count)
-    share = sharpness / torch.quantile(sharpness[nearest(center, NEAREST)], 0.5, dim=1).clamp(min=1e-9)
-    return torch.where(share < BLURRED_BELOW, (share / BLURRED_BELOW) ** 2, torch.ones(count))
+    share = sharpness / torch.quantile(sharpness[nearest(center, SHARPNESS_NEIGHBOURS)], 0.5, dim=1).clamp(min=1e-9)
+    return torch.where(share < MIN_SHARPNESS_SHARE, (share / MIN_SHARPNESS_SHARE) ** 2, torch.ones(count))
 
 
 def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
@@ -245,7 +245,7 @@ def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
     Photos with too little in their mask get the median of the others.
     """
     found = torch.full((len(images),), torch.nan)
-    for index, (image, mask) in enumerate(zip(images, dilate(masks, -INSIDE_PX))):
+    for index, (image, mask) in enumerate(zip(images, dilate(masks, -MASK_INSET_PX))):
         if mask.sum() < 2:
             continue
         gray = image.float().mean(2)

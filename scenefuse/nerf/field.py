@@ -11,10 +11,10 @@ from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
 # Of the density network's 16 outputs the first is the density's logarithm (Mueller et al. 2022, section 5.4).
 GEOMETRY_FEATURES = 15
 # exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
-LARGEST_LOG_DENSITY = 11.0
-FIRST_FEATURE = 1e-4  # initial features are uniform in +-1e-4, as in instant-ngp
+MAX_LOG_DENSITY = 11.0
+INITIAL_FEATURE = 1e-4  # initial features are uniform in +-1e-4, as in instant-ngp
 # Training from coarse to fine begins with half of the levels, and with so many at least.
-LEVELS_AT_START = 4
+MIN_OPEN_LEVELS = 4
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Field(nn.Module):
         super().__init__()
         self.settings = settings
         self.grid = hash_grid(settings.levels, settings.log2_table, settings.coarsest, settings.finest)
-        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * FIRST_FEATURE)
+        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * INITIAL_FEATURE)
         width, inputs = settings.width, 2 * settings.levels
         self.density_in = _linear(inputs, width, generator)
         self.density_out = _linear(width, 1 + GEOMETRY_FEATURES, generator)
@@ -59,7 +59,7 @@ class Field(nn.Module):
         inside = x.clamp(0.0, 1.0 - 1e-6)
         features = encode(inside, self.table, self.grid, self.level_weight)
         out = self.density_out(torch.relu(self.density_in(features)))
-        return torch.exp(out[:, 0].clamp(max=LARGEST_LOG_DENSITY)), out
+        return torch.exp(out[:, 0].clamp(max=MAX_LOG_DENSITY)), out
 
     def color(self, features: Tensor, direction: Tensor) -> Tensor:
         """RGB (R, S, 3) in 0..1 from features (R S, 16) of S samples on each of R rays with unit directions (R, 3)."""
@@ -79,7 +79,7 @@ def coarse_to_fine(field: Field, progress: float, finished: float) -> None:
     The window is linear; Park et al. 2021 (Nerfies) and Lin et al. 2021 (BARF) use a cosine.
     """
     levels = field.settings.levels
-    first = max(LEVELS_AT_START, levels // 2)
+    first = max(MIN_OPEN_LEVELS, levels // 2)
     opened = levels if finished <= 0 else first + (levels - first) * progress / finished
     field.level_weight.copy_((opened - torch.arange(levels, device=field.level_weight.device)).clamp(0.0, 1.0))
 

@@ -21,16 +21,13 @@ except ImportError:  # the PyTorch twins do the work
 
 AVAILABLE = nb is not None
 PRIMES = (1, 2654435761, 805459861)
-ZERO = np.float32(0.0)
-ONE = np.float32(1.0)
-HALF = np.float32(0.5)
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
 PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
-DIAGONAL, FAR = np.float32(1.7320508), np.float32(1e9)  # of the unit cube, and beyond it
-PARALLEL, TINY = np.float32(1e-9), np.float32(1e-12)  # a direction that never meets a face; no divisor is smaller
-LEAST_KNOWN = np.float32(1e-4)  # as in `render`
+# Sum of compositing weights below which the grid knows no surface on a ray.
+MIN_KNOWN_WEIGHT = np.float32(1e-4)
 RAYS_A_BLOCK = 64  # rays that share a thread's buffers
-AHEAD = 16  # samples
-NEAR_ROWS = 1 << 17  # a level of so many rows, one MiB, stays in a core's cache
+PREFETCHED_SAMPLES = 16  # samples
+CACHED_ROWS = 1 << 17  # a level of so many rows, one MiB, stays in a core's cache
 
 
 def _jit(function):  # type: ignore[no-untyped-def]
@@ -107,7 +104,7 @@ def _prefetch(typing, array, row):  # type: ignore[no-untyped-def]
 
 @_inline
 def _is_far(stride, mask):
-    return (stride * stride * stride if stride > 0 else mask) >= NEAR_ROWS
+    return (stride * stride * stride if stride > 0 else mask) >= CACHED_ROWS
 
 
 @_inline
@@ -145,7 +142,7 @@ def _encode(threads, x, table, levels, out):
             far = _is_far(step, bits)
             for n in range(first, last):
                 if far:
-                    _fetch(table, x[min(n + AHEAD, last - 1)], size, step, start, bits)
+                    _fetch(table, x[min(n + PREFETCHED_SAMPLES, last - 1)], size, step, start, bits)
                 ix, fx = _cell(x[n, 0], size)
                 iy, fy = _cell(x[n, 1], size)
                 iz, fz = _cell(x[n, 2], size)
@@ -184,7 +181,7 @@ def _encode_backward(threads, x, gradient, levels, out):
             far = _is_far(step, bits)
             for n in range(x.shape[0]):
                 if far:
-                    _fetch(out, x[min(n + AHEAD, x.shape[0] - 1)], size, step, start, bits)
+                    _fetch(out, x[min(n + PREFETCHED_SAMPLES, x.shape[0] - 1)], size, step, start, bits)
                 ga, gb = weight * gradient[n, 2 * level], weight * gradient[n, 2 * level + 1]
                 if ga == ZERO and gb == ZERO:
                     continue
@@ -207,10 +204,10 @@ def _encode_backward(threads, x, gradient, levels, out):
 @_inline
 def _span(origin, direction, r):
     """Where ray r enters the unit cube and leaves it; it misses the cube where it leaves first."""
-    low, high = ZERO, FAR
+    low, high = ZERO, np.float32(1e9)
     for k in range(3):
         o, d = origin[r, k], direction[r, k]
-        if abs(d) < PARALLEL:
+        if abs(d) < np.float32(1e-9):
             if o < ZERO or o > ONE:
                 high = -ONE
         else:
@@ -237,7 +234,7 @@ def _shares(uniform, prior, near_count, total):
     share_prior = prior if near_count > 0 else ZERO
     share_uniform = uniform * (ONE - share_prior)
     share_weight = (ONE - share_prior) - share_uniform
-    if total < LEAST_KNOWN:
+    if total < MIN_KNOWN_WEIGHT:
         share_uniform += share_weight
         share_weight = ZERO
     return share_uniform, share_weight, share_prior
@@ -259,14 +256,14 @@ def _walk(ray, span, occupancy, expected, width, buffers):
     used, near_count = 0, 0
     transmittance, total = ONE, ZERO
     for i in range(min(int(np.ceil((high - low) / step)), len(start) - 1)):
-        t = low + (np.float32(i) + HALF) * step
+        t = low + (np.float32(i) + np.float32(0.5)) * step
         ix, iy, iz = _index(ox, dx, t, scale, grid), _index(oy, dy, t, scale, grid), _index(oz, dz, t, scale, grid)
         if blocks_used[ix >> 2, iy >> 2, iz >> 2] == 0:
             continue
         opacity = alpha[ix, iy, iz]
         if opacity < ZERO:
             continue
-        start[used] = t - HALF * step
+        start[used] = t - np.float32(0.5) * step
         raw[used] = transmittance * opacity
         total += raw[used]
         transmittance *= ONE - opacity
@@ -287,7 +284,7 @@ def _place(r, jitter, shares, near_count, used, step, buffers, out):
     blurred = ZERO
     for i in range(used):
         blurred += _peak(raw, i, used)
-    blurred = max(blurred, TINY)
+    blurred = max(blurred, np.float32(1e-12))
     k = -1
     before, after, edge = ZERO, ZERO, ZERO
     for s in range(samples):
@@ -299,7 +296,7 @@ def _place(r, jitter, shares, near_count, used, step, buffers, out):
             if near[k] == 1:
                 mass += share_prior / np.float32(near_count)
             after = before + mass
-        inside = (goal - before) / max(after - before, TINY)
+        inside = (goal - before) / max(after - before, np.float32(1e-12))
         end = np.float32(k) + min(max(inside, ZERO), ONE)
         if s == samples - 1:
             end = np.float32(used)
@@ -327,7 +324,7 @@ def march(rays, occupancy, jitter, uniform, prior, out):
     origin, direction = rays
     distance, width, share = prior
     step, out_hit = occupancy[2], out[2]
-    longest = int(DIAGONAL / step) + 3
+    longest = int(np.float32(1.7320508) / step) + 3
     for block in prange((origin.shape[0] + RAYS_A_BLOCK - 1) // RAYS_A_BLOCK):
         buffers = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.uint8)
         for r in range(block * RAYS_A_BLOCK, min((block + 1) * RAYS_A_BLOCK, origin.shape[0])):

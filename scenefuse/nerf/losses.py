@@ -12,7 +12,7 @@ from torch.nn.functional import huber_loss
 # Colours in 0..1 that differ by more than this count linearly: reflections and shadows are no noise.
 COLOR_DELTA = 0.1
 # Below this opacity a ray has no depth to speak of.
-SOLID = 0.5
+SOLID_OPACITY = 0.5
 # Absolute depth is quadratic within this distance of the prior, in nerf units (the cube's side is 1).
 DEPTH_DELTA = 0.01
 
@@ -48,7 +48,7 @@ def depth_loss(distance: Tensor, opacity: Tensor, prior: Tensor, weight: Tensor)
 
     In units of DEPTH_DELTA; mean over all rays with a prior.
     """
-    valid = (weight > 0) & (opacity.detach() > SOLID)
+    valid = (weight > 0) & (opacity.detach() > SOLID_OPACITY)
     error = huber_loss(distance[valid], prior[valid], reduction="none", delta=DEPTH_DELTA) / DEPTH_DELTA
     return (error * weight[valid]).sum() / (weight > 0).sum().clamp(min=1)
 

@@ -26,11 +26,11 @@ from scenefuse.photos.views import Views, load_views
 Maps = NDArray[np.float32]
 
 # Fewer points than these are no surface.
-LEAST_POINTS = 100
+MIN_POINTS = 100
 # A point may lie this far beyond another photo's mask: masks are cut off a little.
 MASK_REACH_PX = 2
 # A point is as far from the others as the mean of its distances to so many.
-NEAR_POINTS = 8
+OUTLIER_NEIGHBOURS = 8
 # Voxels are no larger than so many pixels: windows of five pixels, which the depths were matched by, tell no more.
 VOXEL_PIXELS = 2
 # Points belong to one group where steps of this many spacings lead from one to the other.
@@ -115,7 +115,7 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
     refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
     maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
     raw, diagonal = fuse_depths(_neutral(views, saved), poses, maps, settings)
-    if len(raw) < LEAST_POINTS:
+    if len(raw) < MIN_POINTS:
         raise StageError(
             f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
             "or lower min_views"
@@ -196,7 +196,7 @@ def footprint(depths: Maps, intrinsics: NDArray[np.float64]) -> float:
 
 def clean(cloud: Cloud, deviations: float, min_component: float, step: float) -> Cloud:
     """Drop points with far neighbours, then small groups that no chain of steps of 3 x `step` joins to the rest."""
-    near = min(NEAR_POINTS + 1, len(cloud))
+    near = min(OUTLIER_NEIGHBOURS + 1, len(cloud))
     distance = cKDTree(cloud.points).query(cloud.points, k=near, workers=threads())[0][:, 1:].mean(1)
     cloud = cloud[distance <= distance.mean() + deviations * distance.std()]
     pairs = cKDTree(cloud.points).query_pairs(MAX_STEP * step, output_type="ndarray")

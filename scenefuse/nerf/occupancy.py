@@ -13,9 +13,9 @@ STEP_IN_CELLS = 0.75
 # The grid's upkeep follows Mueller et al. 2022, appendix E.2: random cells are evaluated now and then, an old density
 # decays before the larger of it and the new one is kept, and cells below an opacity are left out.
 DECAY = 0.9
-LEAST_OPACITY = 0.005
+MIN_OPACITY = 0.005
 # Half of the hull's cells at a time, but never many more than a training step has samples.
-CELLS_AT_LEAST, CELLS_MORE_AT_MOST = 4096, 65536
+MIN_CELLS, MAX_MORE_CELLS = 4096, 65536
 
 
 @dataclasses.dataclass
@@ -76,7 +76,7 @@ def updated(occupancy: Occupancy, field: Field, seed: int, step: int, prune: boo
     flat[chosen] = torch.maximum(flat[chosen] * DECAY, field.density(x))
     if not prune:
         return Occupancy(occupancy.hull, density, occupancy.occupied)
-    solid = 1 - torch.exp(-density / occupancy.size) > LEAST_OPACITY
+    solid = 1 - torch.exp(-density / occupancy.size) > MIN_OPACITY
     return Occupancy(occupancy.hull, density, occupancy.hull & _with_neighbours(solid))
 
 
@@ -84,7 +84,7 @@ def _drawn_cells(occupancy: Occupancy, seed: int, step: int) -> tuple[Tensor, Te
     """Flat indices (N,) of random hull cells, and a random position (N, 3) in each."""
     rng = np.random.default_rng((seed, step, 1))
     inside = torch.nonzero(occupancy.hull.flatten())[:, 0]
-    count = min(len(inside) // 2, CELLS_MORE_AT_MOST) + CELLS_AT_LEAST
+    count = min(len(inside) // 2, MAX_MORE_CELLS) + MIN_CELLS
     chosen = inside[torch.from_numpy(rng.integers(0, len(inside), min(count, 2 * len(inside))))].unique()
     size = occupancy.size
     index = torch.stack([chosen // (size * size), chosen // size % size, chosen % size], dim=1)

@@ -14,11 +14,8 @@ from scenefuse.nerf.rays import camera_rays
 
 # Share of a ray's samples that is spread evenly over its occupied part: what the grid does not know yet is seen too.
 UNIFORM_SHARE = 0.25
-# Sum of compositing weights below which the grid knows no surface on a ray.
-LEAST_KNOWN = 1e-4
 # Rays that a view is rendered in at a time: the samples of more would leave the processor's caches.
 RAYS_AT_ONCE = 4096
-TINY = 1e-12
 
 
 @dataclass(frozen=True)
@@ -94,7 +91,7 @@ def march_reference(
     goal = ((torch.arange(samples, device=origin.device) + 1) / samples).expand(len(origin), samples).contiguous()
     k = torch.searchsorted(cdf, goal).minimum(used - 1).clamp(min=0)
     before = (cdf - mass).gather(1, k)
-    end = k + ((goal - before) / mass.gather(1, k).clamp(min=TINY)).clamp(0, 1)
+    end = k + ((goal - before) / mass.gather(1, k).clamp(min=1e-12)).clamp(0, 1)
     end[:, -1:] = used.to(end.dtype)
     edge = torch.cat([torch.zeros_like(end[:, :1]), end[:, :-1]], 1)
     position = edge + (end - edge) * jitter
@@ -134,11 +131,11 @@ def _mass(middle: Tensor, alpha: Tensor, valid: Tensor, uniform: float, prior: R
     near = valid & ((middle - prior.distance[:, None]).abs() <= prior.width[:, None])
     near_count = near.sum(1, keepdim=True)
     share_prior = torch.where(near_count > 0, prior.share[:, None], torch.zeros_like(raw[:, :1]))
-    known = raw.sum(1, keepdim=True) >= LEAST_KNOWN
+    known = raw.sum(1, keepdim=True) >= float(kernels.MIN_KNOWN_WEIGHT)
     share_uniform = torch.where(known, uniform * (1 - share_prior), 1 - share_prior)
     return (
         share_uniform / valid.sum(1, keepdim=True).clamp(min=1) * valid
-        + (1 - share_prior - share_uniform) * peak / peak.sum(1, keepdim=True).clamp(min=TINY)
+        + (1 - share_prior - share_uniform) * peak / peak.sum(1, keepdim=True).clamp(min=1e-12)
         + share_prior / near_count.clamp(min=1) * near
     )
 

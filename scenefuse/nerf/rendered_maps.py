@@ -12,7 +12,7 @@ from torch import Tensor
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
-from scenefuse.nerf.appearance import falloff_map, fitted_log_gain, gains_nearby
+from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
 from scenefuse.nerf.prior.confirmed import MAP_AGREEMENT
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
@@ -26,7 +26,7 @@ Maps = NDArray[np.float32]
 # Views are rendered so far beyond their masks: what the object shows beyond them counts against it.
 BEYOND_MASK_PX = 4
 # A rendered depth counts where the ray is opaque and its weights lie within a few hundredths of the cube (method N13).
-LEAST_OPACITY, LARGEST_DEVIATION = 0.9, 0.05
+MAX_DEVIATION = 0.05
 # Normals come from depths two pixels apart, unless these jump by more than 3 %.
 NORMAL_STEP_PX, NORMAL_JUMP = 2, 0.03
 # Structural similarity looks at windows of 11 pixels: these reach 5 beyond the mask.
@@ -102,7 +102,7 @@ def render_maps(
     depths: Any = np.stack([_solid_depth(view).numpy() for view in rendered]) / scale
     if not (depths > 0).any():
         raise StageError(
-            f"the NeRF found no surface: no ray reached an opacity of {LEAST_OPACITY}; check the masks and the cameras"
+            f"the NeRF found no surface: no ray reached an opacity of {MIN_OPACITY}; check the masks and the cameras"
         )
     diagonal = extent(
         np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, views.object_from_cam)])
@@ -249,7 +249,7 @@ def silhouette_iou(opacity: Tensor, mask: Tensor) -> float:
 
 def _solid_depth(rendered: RenderedView) -> Tensor:
     """(H, W) median depth, 0 where the ray is not opaque or its weights are spread."""
-    keep = (rendered.opacity > LEAST_OPACITY) & (rendered.deviation < LARGEST_DEVIATION)
+    keep = (rendered.opacity > MIN_OPACITY) & (rendered.deviation < MAX_DEVIATION)
     return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth))
 
 

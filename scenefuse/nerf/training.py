@@ -32,7 +32,7 @@ PRUNE_FROM = 0.1
 # Samples fall to their last number by the middle of the training, when the grid knows the surface.
 SAMPLES_FALL_UNTIL = 0.5
 # The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
-LOWEST_RATE = 0.02
+FINAL_RATE_SHARE = 0.02
 # Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
 # again when they are better. A warm training finds them at its start too.
 APPEARANCE_AT = (0.15, 0.4)
@@ -302,7 +302,7 @@ def _descend(
     added = training.additions
     weights = {**training.weights.by_name(), **({} if added is None else added.weights)}
     torch.stack([weights[name] * term for name, term in terms.items() if name != "psnr"]).sum().backward()
-    factor = learning_rate_factor(step, training.steps, training.warmup_steps, LOWEST_RATE)
+    factor = learning_rate_factor(step, training.steps, training.warmup_steps, FINAL_RATE_SHARE)
     rates = training.recipe.grid_learning_rate, training.recipe.learning_rate
     for group, rate in zip(optimizer.param_groups, rates):
         group["lr"] = rate * factor

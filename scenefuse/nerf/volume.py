@@ -28,18 +28,18 @@ MARGIN = 0.02
 # The first, rough cube is half as wide again as the masks' extents ask for.
 ROUGH_FACTOR = 1.5
 # A mask of fewer pixels does not show where the object is.
-LEAST_PIXELS = 16
+MIN_MASK_PIXELS = 16
 # Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
 HALF_DIAGONAL = 0.87
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
-FRAMED = 0.3
+MIN_FRAMING_SHARE = 0.3
 # The rough cube around the object's own points is wider than these by this share of their diagonal on each side.
-REACH = 0.25
+ROUGH_MARGIN = 0.25
 # Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
-FORGIVING = 12
+TOLERANT_PHOTOS = 12
 # Photos that must have a cell on the mask, no deeper behind the surface than this share of the cube's side, where some
 # have it behind the surroundings: what lies behind these and the object is no part of it that one could see.
-LEAST_OPEN, BEYOND = 3, 0.05
+MIN_OPEN_PHOTOS, MAX_DEPTH_BEHIND = 3, 0.05
 
 
 @dataclass(frozen=True)
@@ -134,7 +134,7 @@ def _rough_cube(views: list[View], own: Array) -> Sim3:
     if len(own) < MIN_OWN_POINTS or sum(is_whole(view.pixels) for view in views) >= MIN_WHOLE_SHARE * len(views):
         return cube_from_cameras(views)
     low, high = np.percentile(own, [1, 99], axis=0)
-    side = float((high - low).max() + 2 * REACH * np.linalg.norm(high - low))
+    side = float((high - low).max() + 2 * ROUGH_MARGIN * np.linalg.norm(high - low))
     return Sim3(1 / side, np.eye(3), 0.5 - (low + high) / (2 * side))
 
 
@@ -149,7 +149,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
     normal, right, centres, angles = np.zeros((3, 3)), np.zeros(3), [], []
     for view in views:
         rows, columns = np.nonzero(view.pixels)
-        if len(rows) < LEAST_PIXELS:
+        if len(rows) < MIN_MASK_PIXELS:
             continue
         # A few stray pixels of a mask do not count.
         box = np.percentile(columns, [0.5, 99.5]), np.percentile(rows, [0.5, 99.5])
@@ -200,18 +200,18 @@ def visual_hull(
     """
     object_from_unit = unit_from_object.inverse()
     count = size // 4
-    quorum = least_framing([outline.view for outline in outlines], own, FRAMED)
+    quorum = least_framing([outline.view for outline in outlines], own, MIN_FRAMING_SHARE)
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
         reach = object_from_unit.scale * HALF_DIAGONAL / count
         grown = (_grown(outline, points, reach) for outline in outlines)
-        found = count_silhouettes(points, grown, object_from_unit.scale * BEYOND)
+        found = count_silhouettes(points, grown, object_from_unit.scale * MAX_DEPTH_BEHIND)
         # Of a coarse cell that is hidden one part may be in sight.
         shown = found.shown + (found.hidden if count < size else 0)
-        kept = (found.missed <= np.maximum(tolerance * shown, shown >= FORGIVING)) & (shown >= quorum)
+        kept = (found.missed <= np.maximum(tolerance * shown, shown >= TOLERANT_PHOTOS)) & (shown >= quorum)
         if count == size:
-            kept &= (found.hidden == 0) | (found.open >= LEAST_OPEN)
+            kept &= (found.hidden == 0) | (found.open >= MIN_OPEN_PHOTOS)
         cells = cells[kept]
         if count == size or len(cells) == 0:
             hull = np.zeros((size, size, size), dtype=bool)

@@ -25,7 +25,7 @@ NEAR, FAR = 0.5, 2.0
 # Photos are compared at these fractions of their size one after the other, in equal parts of the training.
 SHRINKS = (4, 2, 1)
 # Frames that differ less on the object, on the mean, show no motion: two grey levels.
-LEAST_CHANGE = 2 / 255
+MIN_CHANGE = 2 / 255
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def neighbours(trained: NDArray[np.bool_]) -> NDArray[np.int64]:
 def _check_motion(frames: DepthPhotos) -> None:
     """StageError where no frame differs from the next: depth and poses are learned from parallax alone."""
     change = (frames.images - frames.images[frames.sources[:, 1]]).abs().mean(1, keepdim=True)
-    if float(masked_mean(change, frames.masks)) < LEAST_CHANGE:
+    if float(masked_mean(change, frames.masks)) < MIN_CHANGE:
         raise StageError(
             "the object looks the same in all frames: without motion of the camera there is no parallax to learn depth "
             "and poses from; walk around the object, or set object.frames.frame_step higher"

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from scenefuse.nerf.encoding import encode
 from scenefuse.nerf.field import Field
-from scenefuse.nerf.losses import SOLID
+from scenefuse.nerf.losses import SOLID_OPACITY
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.training import Nerf, Rendered
 
@@ -119,7 +119,7 @@ def rank_loss(
     grouped = uv.view(images, -1, 2)
     apart = (grouped[:, -2 * half : -half] - grouped[:, -half:]).norm(dim=-1) >= apart_px
     sign = torch.sign(p2 - p)
-    valid = apart & (w > 0) & (w2 > 0) & (o > SOLID) & (o2 > SOLID) & ((p2 - p).abs() > RANK_MARGIN)
+    valid = apart & (w > 0) & (w2 > 0) & (o > SOLID_OPACITY) & (o2 > SOLID_OPACITY) & ((p2 - p).abs() > RANK_MARGIN)
     hinge = torch.relu(RANK_MARGIN - sign * (d2 - d)) / RANK_MARGIN
     return (hinge * torch.minimum(w, w2) * valid).sum() / valid.sum().clamp(min=1)
 

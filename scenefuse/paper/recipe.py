@@ -7,7 +7,6 @@ from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.training import NerfRecipe
 
-EPOCHS = 60
 BATCH_PHOTOS = 24
 WARMUP_EPOCHS = 2
 LEARNING_RATE = 1e-3

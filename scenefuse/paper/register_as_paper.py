@@ -50,10 +50,10 @@ RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 # ICP: the paper's pairing distance in voxels; the spacing in voxels; the paper's iterations.
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
-MUTUAL_SHARE = 0.1
+MIN_MUTUAL_SHARE = 0.1
 # Matches that determine a similarity, and how much the sizes of object and crop, which is cut to it, may differ then:
 # matches that are wrong shrink the object into a spot. Triples that are drawn at once.
-LEAST_MATCHES, LARGEST_FACTOR, AT_ONCE = 3, 2.0, 1 << 14
+MIN_MATCHES, MAX_SCALE_FACTOR, TRIPLES_AT_ONCE = 3, 2.0, 1 << 14
 
 
 def register_as_paper(
@@ -153,7 +153,7 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
     agree = agreeing(*matched, RANSAC_DISTANCE * VOXEL_FRACTION, seed)
     said = f"{agree.sum()} of {len(pairs)} mutual matches agree"
     print(said, flush=True)
-    if agree.sum() < LEAST_MATCHES:
+    if agree.sum() < MIN_MATCHES:
         return None, [f"{said}, too few: the scale is the RMS ratio of the whole clouds"]
     ratio = rms(matched[1][agree]) / rms(matched[0][agree])
     return ratio * scene.diagonal / cloud.diagonal, [said]
@@ -163,7 +163,7 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
     """Which matches (N, 3) and (N, 3) a similarity explains within `distance`: the most that RANSAC finds.
 
     Triples of different matches, on either side as in space, of which every edge is by the same factor longer or
-    shorter than its match, but for the ratio that Open3D asks of edges, and by a factor of `LARGEST_FACTOR` at most:
+    shorter than its match, but for the ratio that Open3D asks of edges, and by a factor of `MAX_SCALE_FACTOR` at most:
     a similarity that shrinks the object into a spot explains everything.
     """
     best = np.zeros(len(source), dtype=bool)
@@ -171,14 +171,14 @@ def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArra
         return best
     rng, drawn, wanted = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES)
     while drawn < wanted:
-        triples = rng.integers(0, len(source), (AT_ONCE, RANSAC_POINTS))
-        drawn += AT_ONCE
+        triples = rng.integers(0, len(source), (TRIPLES_AT_ONCE, RANSAC_POINTS))
+        drawn += TRIPLES_AT_ONCE
         a, b = source[triples], target[triples]
         edges = [np.linalg.norm(side - np.roll(side, 1, axis=1), axis=2) for side in (a, b)]
         with np.errstate(divide="ignore", invalid="ignore"):
             factor = edges[1] / edges[0]
             alike = factor.min(1) / factor.max(1) >= EDGE_LENGTH  # not so where an edge has no length
-        likely = alike & (factor.min(1) > 1 / LARGEST_FACTOR) & (factor.max(1) < LARGEST_FACTOR)
+        likely = alike & (factor.min(1) > 1 / MAX_SCALE_FACTOR) & (factor.max(1) < MAX_SCALE_FACTOR)
         for one, other in zip(a[likely], b[likely]):
             try:
                 pose = fit_sim3(one, other)
@@ -207,7 +207,7 @@ def paper_coarse(problem: Problem) -> tuple[Sim3, list[str]]:
     # A ratio of 0: this call counts the mutual matches and takes no others in their place, as RANSAC does below.
     matches = o3d.pipelines.registration.correspondences_from_features(source_features, target_features, True, 0.0)
     notes = []
-    if len(matches) < MUTUAL_SHARE * len(source.points):
+    if len(matches) < MIN_MUTUAL_SHARE * len(source.points):
         notes.append(
             f"{len(matches)} mutual matches are too few for {len(source.points)} points:"
             " Open3D falls back to one-way matches"

@@ -15,18 +15,15 @@ from scenefuse.nerf.prior.networks import depth_from_disparity, disparity_from_d
 from scenefuse.nerf.prior.self_supervision import points_in_cam, warp
 from scenefuse.photos.workspace import View
 
-# Side of the matching windows at full and at half size: small, because the cut photos are small.
+# Side of the matching windows at full and at half size: small, because the cut photos are small. A median of the larger
+# one leaves out single pixels that matched elsewhere, and masks are widened by its radius.
 WINDOW_PX = 5
 COARSE_WINDOW_PX = 3
-# Single pixels that matched elsewhere are left out by a median.
-MEDIAN_PX = 5
 # Photos that a photo is matched with, and of these the ones that count: others may not see the place.
 SWEEP_SOURCES, BEST_SOURCES = 4, 2
 # Windows this small hold little contrast: what the matcher allows for flat ones must not outweigh theirs, and the slow
 # changes of brightness are kept.
 SMALL_WINDOW_FLAT = NOISE_VARIANCE / 16
-# Masks are widened by this window's radius before a depth may be outside them.
-HULL_PX = 5
 WHOLE = (slice(None), slice(None))
 # Finer hypotheses tried at full size on each side of the one found at half size.
 FINE_STEPS = 3
@@ -140,7 +137,7 @@ def _best_hypothesis(
     before, here, after = (scores.gather(0, (best + step).clamp(0, last))[0] for step in (-1, 0, 1))
     shift = ((after - before) / (2 * (2 * here - before - after)).clamp_min(1e-6)).clamp(-0.5, 0.5)
     found = hypotheses.gather(0, best)[0] + shift * (hypotheses[1] - hypotheses[0])
-    smooth = cv2.medianBlur(found.cpu().numpy().astype(np.float32), MEDIAN_PX)
+    smooth = cv2.medianBlur(found.cpu().numpy().astype(np.float32), WINDOW_PX)
     return torch.from_numpy(smooth).to(found.device), here.clamp(0.0, 1.0)
 
 
@@ -162,7 +159,7 @@ def _outside_silhouettes(masks: Tensor, depths: Tensor, moves: Tensor, reference
     """
     count, size = len(sources), (sources[0].height, sources[0].width)
     shrink = round(masks.shape[2] / size[0])
-    silhouettes = _smaller(functional.max_pool2d(masks, HULL_PX, 1, HULL_PX // 2), shrink)
+    silhouettes = _smaller(functional.max_pool2d(masks, WINDOW_PX, 1, WINDOW_PX // 2), shrink)
     of_reference, *of_sources = (
         torch.as_tensor(v.intrinsics, dtype=depths.dtype, device=depths.device) for v in (reference, *sources)
     )

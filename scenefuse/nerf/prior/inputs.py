@@ -10,20 +10,17 @@ from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from scenefuse.core.stage import StageError
+from scenefuse.mvs.photo_refinement import BEST_ANGLE_DEG
 from scenefuse.photos.views import Views
 
-# Photos seen under about this angle match well and still fix depth (after MVSNet's pair score, Yao et al. 2018).
-BEST_ANGLE_DEG = 15.0
 # Every tenth SfM point is kept from training, to measure with.
 CHECK_EVERY = 10
 # A point belongs to the object when this share of the photos that observe it have it in their mask.
-SHARE_IN_MASKS = 0.7
+MIN_IN_MASKS_SHARE = 0.7
 # The depth range spans these percentiles of the points' depths, widened at both ends by shares of the range and of the
-# farthest depth; the box around the object spans the percentiles of BOX.
-RANGE, BOX = (1, 99), (2, 98)
-WIDER, WIDER_FAR = 0.15, 1e-3
-# Points nearer than this, in object units, are behind the camera or in it.
-MIN_DEPTH = 1e-6
+# farthest depth; the box around the object spans the percentiles of BOX_PERCENTILES.
+DEPTH_PERCENTILES, BOX_PERCENTILES = (1, 99), (2, 98)
+RANGE_MARGIN, FAR_MARGIN = 0.15, 1e-3
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
 MARGIN = 0.06
 # The canvas fits the boxes of this percentage of the photos; larger ones are shrunk.
@@ -33,7 +30,7 @@ MIN_CANVAS_PX = 32
 MAX_ASPECT = 2.0
 # A pixel of a moved map has a depth when at least this share of what it is made of has one; it is interpolated unless
 # that differs from the nearest depth by more than this share, as at an edge.
-MIN_KNOWN, EDGE = 0.3, 0.02
+MIN_KNOWN_SHARE, EDGE_JUMP = 0.3, 0.02
 Map = NDArray[np.float32]
 
 
@@ -120,8 +117,8 @@ def _moved(source: Map, target_from_source: NDArray[np.float64], size: tuple[int
     share = _remap(valid, x, y, cv2.INTER_LINEAR)
     smooth = _remap(source, x, y, cv2.INTER_LINEAR) / np.maximum(share, 1e-6)
     nearest = _remap(source, x, y, cv2.INTER_NEAREST)
-    edge = (nearest > 0) & (np.abs(smooth - nearest) > EDGE * nearest)
-    return np.where(share > MIN_KNOWN, np.where(edge, nearest, smooth), 0.0).astype(np.float32)
+    edge = (nearest > 0) & (np.abs(smooth - nearest) > EDGE_JUMP * nearest)
+    return np.where(share > MIN_KNOWN_SHARE, np.where(edge, nearest, smooth), 0.0).astype(np.float32)
 
 
 def _remap(source: Map, x: Map, y: Map, interpolation: int) -> Map:
@@ -184,10 +181,10 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
             f"only {len(on_object)} SfM points lie on the object in all photos; depth needs at least 8: "
             "check that the masks show the object, and that the photos are sharp"
         )
-    low, high = np.percentile(views.sparse[on_object], BOX, axis=0)
+    low, high = np.percentile(views.sparse[on_object], BOX_PERCENTILES, axis=0)
     depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
-    closest, farthest = np.percentile(depths, RANGE)
-    margin = WIDER * (farthest - closest) + WIDER_FAR * farthest
+    closest, farthest = np.percentile(depths, DEPTH_PERCENTILES)
+    margin = RANGE_MARGIN * (farthest - closest) + FAR_MARGIN * farthest
 
     def as_tensor(array: NDArray[np.generic]) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=device)
@@ -219,7 +216,7 @@ def _points_on_object(views: Views) -> list[tuple[NDArray[np.int64], NDArray[np.
     for (ids, _), track in zip(seen, views.tracks):
         votes[0, ids] += 1
         votes[1, track] += 1
-    belongs = votes[0] > SHARE_IN_MASKS * votes[1]
+    belongs = votes[0] > MIN_IN_MASKS_SHARE * votes[1]
     return [(ids[belongs[ids]], pixels[belongs[ids]]) for ids, pixels in seen]
 
 
@@ -227,7 +224,7 @@ def _observed(views: Views, index: int) -> tuple[NDArray[np.int64], NDArray[np.f
     """Indices of the SfM points that photo `index` observes on the object, and their column, row and depth."""
     ids = views.tracks[index]
     pixels, depths = views.view(index).project(views.sparse[ids])
-    in_front = depths > MIN_DEPTH
+    in_front = depths > 1e-6
     ids, pixels, depths = ids[in_front], pixels[in_front], depths[in_front]
     height, width = views.masks.shape[1:]
     column, row = np.floor(pixels).astype(int).T
