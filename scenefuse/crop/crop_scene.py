@@ -13,7 +13,7 @@ from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
-from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
+from scenefuse.crop.one_photo import MAX_GROWTH, STRAY_SHARE, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.parts import MIN_PART_SHARE, parts
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
@@ -28,8 +28,8 @@ MIN_FIDUCIALS = 4
 MAX_WHOLE_POINTS = 10_000_000
 # How far from clicks a crop may reach, in their extents: it grows, and looks for ground around what it has become.
 REACH_EXTENTS = 2 * MAX_GROWTH
-# Points of an object's own cloud that mark it, and the outermost share of them on each side, in percent, that does not.
-MAX_OWN_POINTS, STRAY_PERCENT = 20_000, 0.5
+# Points of an object's own cloud that mark it.
+MAX_OWN_POINTS = 20_000
 
 
 @dataclass(frozen=True)
@@ -236,7 +236,7 @@ def crop_by_cloud(scene: TiledCloud, inputs: CropInputs, settings: CropSettings)
     """
     assert inputs.cloud is not None and inputs.alignment_json is not None
     own = read_cloud(inputs.cloud).points
-    low, high = np.percentile(own, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    low, high = np.percentile(own, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
     own = own[((own >= low) & (own <= high)).all(1)]
     marks = _alignment(inputs.alignment_json).apply(own[:: max(1, len(own) // MAX_OWN_POINTS)])
     near = scene.near(*around_marks(marks, settings))[1]

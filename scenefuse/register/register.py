@@ -29,8 +29,6 @@ from scenefuse.register.uncertainty import uncertainty_quantities
 
 # Clouds with more points are thinned at random for the search, which looks at far fewer; files are written in full.
 SEARCHED_POINTS = 500_000
-# Points in which too few different ones are looked for before all are counted.
-SAMPLED_POINTS = 20_000
 # Of `second_place`: what a found pose leaves of a scene, over the object, so that it may show it again; share of the
 # object that the coarse search finds there; distance of both places, over the object's diagonal.
 MIN_REST, MIN_PRECISION, MIN_DISTANCE = 0.3, 0.25, 0.4
@@ -209,7 +207,7 @@ def second_place(
 
 def _check_points(cloud: Cloud, name: str) -> None:
     """StageError where a cloud has too few different points, or where they span no surface."""
-    sample = np.unique(cloud.points[:: max(1, len(cloud) // SAMPLED_POINTS)], axis=0)
+    sample = np.unique(cloud.points[:: max(1, len(cloud) // SEARCHED_POINTS)], axis=0)
     different = len(sample) if len(sample) >= MIN_POINTS else len(np.unique(cloud.points, axis=0))
     if different < MIN_POINTS:
         among = "" if different == len(cloud) else f" among its {len(cloud)} points"
