@@ -14,10 +14,11 @@ from scenefuse.crop.ground import GROUND_FRACTION, ground_under, on_ground
 from scenefuse.crop.parts import LINK_FRACTION, MIN_PART_SHARE, parts
 from scenefuse.geometry.ground import Ground
 
-# Shares of the diagonal of the fiducials' box.
-MARGIN_FRACTION = 0.04  # widening of the box beside `margin`: two pairing distances of the registration
-REACH_FRACTION = 0.05  # a part this near to a fiducial belongs to the object
-# A step that would leave less than this share of the points in the box is left out: the object is there.
+# The box is widened, beside `margin`, by two pairing distances of the registration: a share of its diagonal.
+MARGIN_FRACTION = 0.04
+# A part this near to a fiducial belongs to the object, as a share of the diagonal.
+REACH_FRACTION = 0.05
+# A step is left out if less than this share of the points in the box would be left: the object is there.
 MIN_LEFT = 0.05
 
 

@@ -14,12 +14,14 @@ from scenefuse.geometry.ground import Ground, fit_ground
 FOOT_SHARE = 0.1
 # Ground rises by 20 degrees at most.
 MAX_RISE = float(np.tan(np.radians(20)))
-# Of many marks, the votes of masks for instance, this share at either end does not count: strays.
+# The lowest and highest share of the marks does not count: strays among the votes of masks.
 STRAY_SHARE = 0.01
-# Shares of the diagonal of the fiducials' box.
-RING_FRACTION = 0.5  # width of the ring around the box in which the ground is looked for
-GROUND_FRACTION = 0.015  # points lower than this above the ground are ground
-BESIDE_FRACTION = 0.05  # so far beside a fiducial that is below the surface, nothing is ground
+# Width of the ring around the box in which the ground is looked for, as a share of the marks' diagonal.
+RING_FRACTION = 0.5
+# Points lower than this above the ground are ground, as a share of the diagonal.
+GROUND_FRACTION = 0.015
+# So far beside a mark that is below the surface, nothing is ground, as a share of the diagonal.
+BESIDE_FRACTION = 0.05
 
 
 def ground_under(points: Array, marks: Array, low: Array, high: Array) -> tuple[Ground | None, list[str]]:

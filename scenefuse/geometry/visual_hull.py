@@ -18,12 +18,12 @@ from scenefuse.photos.workspace import View
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int32]
 
+# Photos after which `carve` leaves out the voxels that are decided: most are, early.
 CARVED_PHOTOS = 4
-"""Photos after which `carve` leaves out the voxels that are decided: most are, early."""
+# Photos that must frame a place: a share of those that frame this percentile of the object's own points; never fewer.
 MIN_FRAMING_SHARE, FRAMING_PERCENTILE, MIN_PHOTOS = 0.25, 10, 2
-"""Of `least_framing`: the share; the percentile of the own points; never fewer photos."""
+# With fewer own points, the photos that show the object whole count, or this share of all photos.
 MIN_OWN_POINTS, MIN_WHOLE_SHARE = 20, 1 / 3
-"""Own points that say how many photos have a part; else those with all of it, or so large a share of all photos."""
 NO_POINTS: Array = np.zeros((0, 3))
 
 

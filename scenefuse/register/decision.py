@@ -25,14 +25,18 @@ from scenefuse.register.uncertainty import Uncertainty
 
 DecidedBy = Literal["geometry", "near", "photos", "both"]
 
-# The gate's further thresholds. Right poses of the planted trials pass them with room to spare.
-MIN_RECALL = 0.4  # share of the scene crop that the object explains
-MIN_COLOR = 0.5  # agreement of the colours, where both clouds have colours that vary
-MAX_TILT_DEG = 8.0  # angle between the up directions
-MAX_FREE_SPACE_VIOLATION = 0.25  # share of the object in the scene's free space
-# A motion maps an object onto itself when this share of its points, and this agreement of colours, is left.
+# The gate's further thresholds; right poses of the planted trials pass them with room to spare. The share of the scene
+# crop that the object explains.
+MIN_RECALL = 0.4
+# The agreement of the colours, where both clouds have colours that vary.
+MIN_COLOR = 0.5
+# The angle between the up directions.
+MAX_TILT_DEG = 8.0
+# The share of the object in the scene's free space.
+MAX_FREE_SPACE_VIOLATION = 0.25
+# A motion maps an object onto itself when this share of its points meets others, and its colours agree as much.
 MIN_SELF_OVERLAP, MIN_SELF_COLOR = 0.95, 0.9
-# A pose that may be so far off because the object's own model is bent (`Uncertainty.size`) is none: the model is torn.
+# The pose may be off by this share of the diagonal (`Uncertainty.size`) because the object's own model is bent.
 MAX_BENDING = 0.1
 
 
