@@ -77,16 +77,13 @@ class Landmarks:
         return size
 
 
-def read_landmarks(
-    model: Path, database: Path, most_points: int = MAX_POINTS, descriptors_per_point: int = DESCRIPTORS_PER_POINT
-) -> Landmarks:
+def read_landmarks(model: Path, database: Path, max_points: int = MAX_POINTS) -> Landmarks:
     """Read a sparse model and the descriptors of its points.
 
     Args:
         model: COLMAP model of the original photos (not of undistorted ones).
         database: COLMAP database that it was made from; holds the descriptors.
-        most_points: where the model has more, those with the most observations are kept.
-        descriptors_per_point: observations whose descriptors are kept, spread evenly over the photos that see a point.
+        max_points: where the model has more, those with the most observations are kept.
 
     Raises:
         StageError: the database does not belong to the model.
@@ -103,19 +100,18 @@ def read_landmarks(
                 )
             return found
 
-        return landmarks_of(read_model(model), descriptors, most_points, descriptors_per_point)
+        return landmarks_of(read_model(model), descriptors, max_points)
 
 
 def landmarks_of(
     reconstruction: pycolmap.Reconstruction,
     descriptors_of: Callable[[pycolmap.Image], NDArray[Any]],
-    most_points: int = MAX_POINTS,
-    descriptors_per_point: int = DESCRIPTORS_PER_POINT,
+    max_points: int = MAX_POINTS,
 ) -> Landmarks:
     """The landmarks of a sparse model; `descriptors_of` a photo are (N, 128), one for each of its features."""
     images = {image.image_id: image for image in sorted(posed_images(reconstruction), key=lambda i: i.image_id)}
     view_of = {image_id: k for k, image_id in enumerate(images)}
-    ids = sorted(reconstruction.points3D, key=lambda p: (-reconstruction.points3D[p].track.length(), p))[:most_points]
+    ids = sorted(reconstruction.points3D, key=lambda p: (-reconstruction.points3D[p].track.length(), p))[:max_points]
     ids.sort()
     tracks = [
         sorted((e.image_id, e.point2D_idx) for e in reconstruction.points3D[p].track.elements if e.image_id in view_of)
@@ -123,9 +119,9 @@ def landmarks_of(
     ]
     start = np.concatenate([[0], np.cumsum([len(track) for track in tracks])]).astype(np.int64)
     elements = np.array([element for track in tracks for element in track], dtype=np.int64).reshape(-1, 2)
-    chosen = _spread_evenly(start, descriptors_per_point)
+    chosen = _spread_evenly(start, DESCRIPTORS_PER_POINT)
     rays = np.zeros((len(elements), 2))
-    descriptors = np.zeros((len(ids) * descriptors_per_point, 128), dtype=np.float32)
+    descriptors = np.zeros((len(ids) * DESCRIPTORS_PER_POINT, 128), dtype=np.float32)
     for image_id, image in images.items():
         rows = np.flatnonzero(elements[:, 0] == image_id)
         xy = np.array([image.points2D[k].xy for k in elements[rows, 1]]).reshape(-1, 2)
@@ -138,7 +134,7 @@ def landmarks_of(
         np.array([image.cam_from_world().matrix() for image in images.values()]),
         np.array([reconstruction.cameras[image.camera_id].mean_focal_length() for image in images.values()]),
         np.array([reconstruction.points3D[p].xyz for p in ids]).reshape(-1, 3),
-        descriptors.reshape(len(ids), descriptors_per_point, 128),
+        descriptors.reshape(len(ids), DESCRIPTORS_PER_POINT, 128),
         start,
         np.array([view_of[i] for i in elements[:, 0]], dtype=np.int64),
         rays,

@@ -4,9 +4,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import ScaleRange, moved_about
 from scenefuse.register.landmarks import Landmarks
 from scenefuse.register.uncertainty import Uncertainty
 
@@ -215,5 +215,5 @@ def _pivot(seen: Observations, pose: Sim3) -> Array:
 
 def _moved(seen: Observations, pose: Sim3, step: Array) -> Sim3:
     """The pose after a step of log scale, rotation vector and shift about the pivot."""
-    pivot, turn, scale = _pivot(seen, pose), Rotation.from_rotvec(step[1:4]).as_matrix(), float(np.exp(step[0]))
-    return Sim3(scale, turn, pivot + step[4:] - scale * turn @ pivot) @ pose
+    order = [1, 2, 3, 4, 5, 6, 0]
+    return moved_about(pose, step[order], _pivot(seen, pose), ScaleRange(1.0, np.inf), np.inf)

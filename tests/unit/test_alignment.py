@@ -307,7 +307,7 @@ def test_photos_side_by_side_along_a_front_look_at_what_they_show(tmp_path):
 
 
 def test_refinement_undoes_a_wrong_start(pair):
-    obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
+    obj, scene = (read_landmarks(model, database) for model, database in pair)
     seen = observations(obj, scene, match_landmarks(obj, scene, 0.8))
     truth = OBJECT_FROM_WORLD.inverse()
     seen = seen.subset(match_errors(seen, truth) < 6)
@@ -320,14 +320,14 @@ def test_refinement_undoes_a_wrong_start(pair):
 
 
 def test_a_cap_keeps_the_points_seen_most(pair):
-    few, all_points = (read_landmarks(*pair[1], most, 2) for most in (50, 10000))
+    few, all_points = (read_landmarks(*pair[1], most) for most in (50, 10000))
     assert len(few.points) == 50 < len(all_points.points)
     assert np.diff(few.start).min() >= np.sort(np.diff(all_points.start))[-50]
     assert len(few.rays) == few.start[-1]
 
 
 def test_matching_does_not_depend_on_the_size_of_blocks(pair, monkeypatch):
-    obj, scene = (read_landmarks(model, database, 10000, 3) for model, database in pair)
+    obj, scene = (read_landmarks(model, database) for model, database in pair)
     whole = match_landmarks(obj, scene, 0.85)
     monkeypatch.setattr("scenefuse.register.landmarks.BLOCK_POINTS", 37)
     np.testing.assert_array_equal(match_landmarks(obj, scene, 0.85), whole)
