@@ -12,9 +12,10 @@ from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.free_space import FreeSpace, read_free_space
+from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg
-from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment, read_scales
+from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, read_alignment
 from scenefuse.register.refinement import Outcome, refine_hypotheses
 from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import Uncertainty, uncertainty_quantities, with_bending
@@ -87,7 +88,8 @@ def register_finely(
     prior = read_json(scale_json)
     alignment = read_alignment(known.alignment_json) if settings.use_alignment else None
     constraints = Constraints(inputs.ups(), known.free_space(scene), alignment)
-    problem = Problem(obj, scene, read_scales(prior), constraints, seed)
+    scales = ScaleRange(value(prior, "scale"), value(prior, "width_log"))
+    problem = Problem(obj, scene, scales, constraints, seed)
     outcome = refine_hypotheses(problem, read_candidates(coarse_json), settings)
     bending = known.bending(outcome.ranked[0].pose, obj.points.mean(0))
     outcome = outcome.unless_torn(bending[0], scene.diagonal)

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -137,11 +136,6 @@ def check_extent(cloud: Cloud, name: str) -> None:
     if cloud.diagonal == 0 or extents[1] <= MIN_BREADTH * extents[2]:
         where = "in one place" if cloud.diagonal == 0 else "along one line"
         raise StageError(f"all {len(cloud)} points of {name} lie {where}: a registration needs a surface")
-
-
-def read_scales(scale: dict[str, Any]) -> ScaleRange:
-    """The scale prior of a coarse stage's JSON of the scale."""
-    return ScaleRange(value(scale, "scale"), value(scale, "width_log"))
 
 
 def read_alignment(path: Path | None) -> Alignment | None:
