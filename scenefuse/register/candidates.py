@@ -113,7 +113,7 @@ def upright_candidates(
     """Correlate the occupancy of the turned, scaled object with the scene's, and keep the best shifts.
 
     At each yaw and scale, one fast Fourier transform gives the number of shared surface voxels for all shifts at
-    once; the F-beta of that overlap ranks the poses. Horizontal and vertical surfaces are correlated apart.
+    once; the F-beta of that overlap ranks the poses.
 
     Args:
         obj: the object in its own frame.
@@ -127,14 +127,14 @@ def upright_candidates(
     """
     upright = rotation_between(up_in_object, np.array([0.0, 0.0, 1.0]))
     centre = obj.points.mean(0)
-    points, normals = (obj.points - centre) @ upright.T, obj.normals @ upright.T
+    points = (obj.points - centre) @ upright.T
     factors = scales.centre * np.exp(np.linspace(-scales.width, scales.width, scale_steps if scales.width else 1))
     low = scene.points.min(0)
     reach = 2 * np.linalg.norm(points[:, :2], axis=1).max() * factors.max()
     span = np.maximum([reach, reach, np.ptp(points[:, 2]) * factors.max()], np.ptp(scene.points, axis=0))
     shape = tuple(fft.next_fast_len(int(n), real=True) for n in np.ceil(span / voxel) + 8 + np.ceil(span / voxel) // 2)
-    target, scene_count = _occupancy(scene.points - low, scene.normals, voxel, shape)
-    target_f = fft.rfftn(_blur(target), axes=(1, 2, 3), workers=threads())
+    target, scene_count = _occupancy(scene.points - low, voxel, shape)
+    target_f = fft.rfftn(_blur(target), workers=threads())
     b = RECALL_WEIGHT**2
     found: list[tuple[float, float, float, Array]] = []
     for scale in factors:
@@ -142,9 +142,8 @@ def upright_candidates(
             turn = _about_z(yaw)
             turned = scale * points @ turn.T
             corner = turned.min(0)
-            grid, count = _occupancy(turned - corner, normals @ turn.T, voxel, shape)
-            product = (target_f * np.conj(fft.rfftn(grid, axes=(1, 2, 3), workers=threads()))).sum(0)
-            shared = fft.irfftn(product, shape, workers=threads())
+            grid, count = _occupancy(turned - corner, voxel, shape)
+            shared = fft.irfftn(target_f * np.conj(fft.rfftn(grid, workers=threads())), shape, workers=threads())
             best = np.unravel_index(int(shared.argmax()), shape)
             f_beta = (1 + b) * shared[best] / (b * scene_count + count)
             step = np.array([i - n if i > n // 2 else i for i, n in zip(best, shape)])
@@ -160,24 +159,16 @@ def upright_candidates(
     return [_pose(scale, _about_z(yaw) @ upright, shift, centre) for _, scale, yaw, shift in chosen]
 
 
-def _occupancy(points: Array, normals: Array, voxel: float, shape: tuple[int, ...]) -> tuple[Array, float]:
-    """Occupancy (2, X, Y, Z) of horizontal and vertical surfaces, and the number of occupied voxels.
-
-    The squared z of the normals splits a voxel's unit of occupancy between the two channels.
-    """
-    cells = np.floor(points / voxel).astype(np.int64)
-    flat = np.ravel_multi_index(tuple(cells.T), shape)
-    total = np.bincount(flat, minlength=int(np.prod(shape)))
-    level = np.bincount(flat, normals[:, 2] ** 2, minlength=int(np.prod(shape)))
-    share = np.divide(level, total, out=np.zeros_like(level), where=total > 0)
-    filled = total > 0
-    grid = np.stack([np.sqrt(share), np.sqrt(np.where(filled, 1 - share, 0))]).reshape(2, *shape)
-    return grid.astype(np.float32), float(filled.sum())
+def _occupancy(points: Array, voxel: float, shape: tuple[int, ...]) -> tuple[Array, float]:
+    """Which voxels (X, Y, Z) hold points, and how many do."""
+    grid = np.zeros(shape, np.float32)
+    grid[tuple(np.floor(points / voxel).astype(np.int64).T)] = 1
+    return grid, float(grid.sum())
 
 
 def _blur(grid: Array) -> Array:
     """A (1/4, 1/2, 1/4) kernel along each axis, so that a pose between two voxels still overlaps; periodic."""
-    for axis in (1, 2, 3):
+    for axis in range(3):
         grid = 0.5 * grid + 0.25 * (np.roll(grid, 1, axis) + np.roll(grid, -1, axis))
     return np.minimum(1.6 * grid, 1.0)
 

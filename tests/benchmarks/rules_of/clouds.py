@@ -213,7 +213,6 @@ RULES = [
     Rule("coarse: sweep of headings", f"{R}.coarse._upright", nothing),
     Rule("coarse: features", f"{R}.coarse._from_features", nothing),
     Rule("RANSAC: edges agree on one scale", f"{R}.candidates.MIN_EDGE_RATIO", constant(0.0)),
-    Rule("sweep: level and upright surfaces apart", f"{R}.candidates._occupancy", lambda f: _one_channel(f)),
     Rule("sweep: blurred target", f"{R}.candidates._blur", same),
     Rule("sweep: candidates alike are one", f"{R}.candidates._alike", lambda _: lambda *args: False),
     Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
@@ -257,12 +256,3 @@ RULES = [
     Rule("gate: scale at the prior's edge", f"{G}.icp.ScaleRange.at_edge", lambda _: lambda *args: False),
     Rule("gate: rivals that turn onto itself", f"{R}.decision._turns_onto_itself", lambda _: lambda *args: False),
 ]  # fmt: skip
-
-
-def _one_channel(occupancy: Any) -> Any:
-    """All surfaces in one channel of the sweep."""
-
-    def alike(points: Any, normals: Any, voxel: float, shape: Any) -> Any:
-        return occupancy(points, np.broadcast_to(UP, normals.shape), voxel, shape)
-
-    return alike
