@@ -36,7 +36,7 @@ class Rule:
     name: str
     where: str
     change: Callable[[Any], Any]
-    decided: str = ""
+    decided: str = "kept"
 
 
 @contextmanager
