@@ -1,4 +1,4 @@
-"""The command `scenefuse`: parts that hand over to what does the work; nothing is imported before it is needed."""
+"""The command `scenefuse`: its parts import what they run only when they are called."""
 
 import argparse
 import os
@@ -34,7 +34,7 @@ def main() -> None:
 
 
 def _register() -> None:
-    """lay one cloud on another, and fuse both"""
+    """register one cloud with another, and fuse both"""
     from scenefuse.core.stage import run
     from scenefuse.two_clouds.register import register
 
@@ -50,7 +50,7 @@ def _nerf() -> None:
 
 
 def _pick() -> None:
-    """click in a page what an object is in its photos"""
+    """open a page to click what an object is in its photos"""
     from scenefuse.core.stage import run
     from scenefuse.pick.pick import pick
 
@@ -69,7 +69,7 @@ def _init() -> None:
 
 
 def _need_project(*elsewhere: str) -> None:
-    """End with a sentence where the folder holds no project, and no option with one of these beginnings is given."""
+    """Exit with a sentence where the folder holds no project and no option begins with one of these words."""
     from scenefuse.core.settings import ROOT
 
     if not (SCENES.is_file() or Path.cwd() == ROOT or any(word.startswith(elsewhere) for word in sys.argv[1:])):
@@ -107,7 +107,7 @@ def _run() -> None:
         if not Path(path).is_file():
             sys.exit(f"error: the settings file {path} cannot be read; correct its path")
     words = [*(["--configfile", str(OWN_SETTINGS)] if _takes_own_settings() else []), *sys.argv[1:]]
-    # As `python -m snakemake`, but its help and its complaints name the command that was typed.
+    # As `python -m snakemake`, but its help and errors name the command that was typed.
     start = "import sys; sys.argv[0] = 'scenefuse run'; from snakemake.cli import main; main()"
     command = [sys.executable, "-c", start, "--snakefile", str(ROOT / "Snakefile"), *words]
     # The process becomes Snakemake: signals and the exit status are its own.

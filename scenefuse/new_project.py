@@ -21,17 +21,17 @@ SETTINGS = """\
 README = """\
 # {name}
 
-1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud; or, of a
-   finished project of another program, its photos, its cameras and its dense cloud.
+1. `config/scenes.tsv` needs a row for each scene: the folder of the drone's photos, or a cloud; or the photos, cameras
+   and dense cloud of a finished project of another program.
 2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
    Without a scene, an object's photos become a cloud by themselves.
    In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.
 3. Say what the object is:
-   - of photos: `scenefuse pick --configfile config/config.yaml --object NAME` opens a page to click on it;
+   - for photos: `scenefuse pick --configfile config/config.yaml --object NAME` opens a page to click on it;
    - where the scene or the object is a cloud, and the scene shows much more than the object: name a text file in the
      column `fiducials` with at least four points around the object, a line `x y z` each, in the scene's coordinates.
 4. `scenefuse run -n` says what would run, `scenefuse run --cores 2` runs it; options are Snakemake's.
-5. Of photos, look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
+5. With photos, look at `results/objects/NAME/masks.png` first; then open `results/summary/report.html`.
 """
 
 
@@ -60,10 +60,10 @@ def init(
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise StageError(f"two objects would be called '{twice}'; rename one of their folders or files")
-    lying_in = "" if scene is None else _name(scene)
-    scenes = [] if scene is None else [{"scene": lying_in} | _source(scene, folder, video=False)]
+    scene_name = "" if scene is None else _name(scene)
+    scenes = [] if scene is None else [{"scene": scene_name} | _source(scene, folder, video=False)]
     rows = [
-        {"object": name, "scene": lying_in} | _source(path, folder, video=True) for name, path in zip(names, objects)
+        {"object": name, "scene": scene_name} | _source(path, folder, video=True) for name, path in zip(names, objects)
     ]
     for row in rows:
         # Where `pick` saves what is clicked.
@@ -80,7 +80,7 @@ def init(
     for name, text in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text, encoding="utf-8")
-    for path, name in [*([] if scene is None else [(scene, lying_in)]), *zip(objects, names)]:
+    for path, name in [*([] if scene is None else [(scene, scene_name)]), *zip(objects, names)]:
         renamed = "" if name == _stem(path) else "; names hold only A-Z, a-z, 0-9, _ and -"
         print(f"{path} is called {name} in the tables and results{renamed}", flush=True)
     print(f"{folder}/README.md says what comes next", flush=True)
@@ -97,7 +97,7 @@ def _stem(path: Path) -> str:
 
 
 def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
-    """The cell of a row that names photos or a cloud, relative to the project where it lies in it."""
+    """The cell of a row that names photos or a cloud, relative to the project if it lies inside."""
     wanted = "a folder of photos, a video or a cloud" if video else "a folder of photos or a cloud"
     if not path.exists():
         raise StageError(f"{path} does not exist; give {wanted}")
@@ -117,7 +117,7 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
 
 
 def _table(kind: str, columns: tuple[str, ...], rows: list[dict[str, str]]) -> str:
-    """A table with these columns and rows, and what belongs in all columns that there may be."""
+    """A table with these columns and rows, below comments on all columns that it may have."""
     about = [f"# {name}: {column['description']}" for name, column in schema_of(kind)["properties"].items()]
     lines = ["\t".join(columns), *("\t".join(row.get(name, "") for name in columns) for row in rows)]
     return "\n".join([*about, *lines]) + "\n"

@@ -17,11 +17,11 @@ DECIMAL_COMMA = re.compile(r"[+-]?\d*,\d+")
 def read_table(path: Path, key: str) -> dict[str, Row]:
     """Rows of a tab-separated table by the column `key`; every cell is text, an empty one is ''.
 
-    Lines that begin with #, empty rows and columns, and what else a spreadsheet puts around cells are left out. A cell
-    that begins with ~/ is in the user's folder, as in a shell.
+    Lines that begin with #, empty rows and columns, and a spreadsheet's quotes and blanks are left out. A cell that
+    begins with ~/ is a path in the user's home folder.
 
     Raises:
-        StageError: the file is missing, is no text, has no such column or a column twice, a row has too few or too many
+        StageError: the file is missing or not text, has no such column or a column twice, a row has too few or too many
             cells, or two rows have the same key.
     """
     lines = [line for line in io.StringIO(read_text(path), newline=None) if not _is_comment(line)]
@@ -43,7 +43,7 @@ def read_table(path: Path, key: str) -> dict[str, Row]:
             raise StageError(
                 f"{path}, row {number}: {len(row)} columns, and the header has {len(header)}; separate them by tabs"
             )
-        content = {name: _in_own_folder(cell) for name, cell in zip(header, row)}
+        content = {name: _expanded(cell) for name, cell in zip(header, row)}
         if content[key] in rows:
             raise StageError(f"{path}: '{content[key]}' stands in two rows; names must differ")
         rows[content[key]] = content
@@ -54,7 +54,7 @@ def read_lines(path: Path) -> list[tuple[int, str]]:
     """Lines of a text file with their numbers from 1, without those that are empty or begin with #.
 
     Raises:
-        StageError: the file is missing, or is no text.
+        StageError: the file is missing, or is not text.
     """
     lines = enumerate(read_text(path).splitlines(), 1)
     return [(number, line) for number, line in lines if line.strip() and not _is_comment(line)]
@@ -65,7 +65,7 @@ def read_cells(path: Path) -> list[tuple[int, list[str]]]:
     around them, a spreadsheet's quotes, and empty cells at the end.
 
     Raises:
-        StageError: the file is missing, or is no text.
+        StageError: the file is missing, or is not text.
     """
     rows = []
     for number, line in read_lines(path):
@@ -88,19 +88,19 @@ def _cells(row: list[str]) -> list[str]:
     return cells
 
 
-def _in_own_folder(cell: str) -> str:
-    """A path below the user's folder, where a cell means that."""
+def _expanded(cell: str) -> str:
+    """A cell, as a path where it begins with ~/."""
     return str(Path(cell).expanduser()) if cell.startswith("~/") else cell
 
 
 def comma_advice(cells: list[str]) -> str:
-    """What to add to an error about cells that should be numbers, where one has a decimal comma; "" where none has."""
+    """Advice for an error about cells that should be numbers, where one has a decimal comma; else ""."""
     odd = next((cell for cell in cells if DECIMAL_COMMA.fullmatch(cell)), None)
     return f"; {odd} has a decimal comma, write {odd.replace(',', '.')}" if odd else ""
 
 
 def composed(name: str) -> str:
-    """A photo's name in one spelling, to find it by: macOS writes an umlaut as two characters, others as one."""
+    """A photo's name in one spelling, to compare it: macOS writes an umlaut as two characters, others as one."""
     return unicodedata.normalize("NFC", name)
 
 

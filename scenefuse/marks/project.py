@@ -1,6 +1,6 @@
 """What a run of the workflow works on: settings, scenes, objects and registration variants, all checked.
 
-Imported whenever the workflow is read: nothing here takes long to import.
+The workflow imports this whenever it plans: nothing here takes long to import.
 """
 
 from collections.abc import Mapping
@@ -14,13 +14,13 @@ from scenefuse.core.settings import ROOT, merge, problem, read_differences, sche
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import Row, read_table
 
-# Columns that say something about a row's photos.
-OF_PHOTOS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
-# Columns of an object that are about its scene.
-OF_SCENE = ("fiducials", "truth")
-# Sections that a row's own settings file may hold, and settings in them that concern the whole run all the same.
-OWN = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
-OF_THE_RUN = ("scene.chunks", "object.recipe", "registration.variants")
+# Columns about a row's photos.
+PHOTO_COLUMNS = ("calibration", "cameras", "control", "lengths", "prompts", "masks", "truth")
+# Columns of an object about its scene.
+SCENE_COLUMNS = ("fiducials", "truth")
+# Sections that the settings file of a row may hold, and settings in them that are the same for the whole run.
+OWN_SECTIONS = {"scene": ("scene",), "object": ("object", "registration", "fusion")}
+RUN_SETTINGS = ("scene.chunks", "object.recipe", "registration.variants")
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _cloud_problem(kind: str, row: Row) -> str:
             "has both photos and a cloud, but no cameras, in whose coordinates the cloud would lie; fill the column"
             " cameras, or empty photos or cloud"
         )
-    for column in OF_PHOTOS:
+    for column in PHOTO_COLUMNS:
         if row.get(column):
             return f"is a cloud and has no photos that its {column} could be for; empty that cell, or give photos"
     return ""
@@ -132,8 +132,8 @@ def _scene_problem(row: Row, scenes: Mapping[str, Row], table: str) -> str:
         if row.get("cloud"):
             other = "empty the cell cloud" if row.get("photos") else "give photos"
             return f"is a cloud and lies in no scene, so there is nothing to do; name its scene, or {other}"
-        told = next((column for column in OF_SCENE if row.get(column)), None)
-        return f"lies in no scene that its {told} could be of; empty that cell, or name its scene" if told else ""
+        column = next((column for column in SCENE_COLUMNS if row.get(column)), None)
+        return f"lies in no scene that its {column} could be of; empty that cell, or name its scene" if column else ""
     if scene not in scenes:
         return f"lies in scene '{scene}', which {table} does not list"
     if row.get("truth") and not scenes[scene].get("photos"):
@@ -148,13 +148,13 @@ def _differences(kind: str, name: str, path: str, table: str) -> dict[str, Any]:
         found = read_differences(Path(path) if Path(path).is_file() or not (ROOT / path).is_file() else ROOT / path)
     except StageError as error:
         raise StageError(f"{table}, {kind} '{name}': {error}") from None
-    other = next((key for key in found if key not in OWN[kind]), None)
+    other = next((key for key in found if key not in OWN_SECTIONS[kind]), None)
     if other is not None:
         raise StageError(
-            f"{where}: '{other}' does not concern one {kind}; it may hold {', '.join(OWN[kind])}. Put the rest into the"
-            " settings file of the run"
+            f"{where}: '{other}' does not concern one {kind}; it may hold {', '.join(OWN_SECTIONS[kind])}. Put the rest"
+            " into the settings file of the run"
         )
-    for key in OF_THE_RUN:
+    for key in RUN_SETTINGS:
         part: Any = found
         for step in key.split("."):
             part = part.get(step) if isinstance(part, dict) else None

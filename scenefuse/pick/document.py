@@ -1,22 +1,20 @@
-"""A table of clicks on disk: read, changed, and saved without losing what others wrote."""
+"""A table of clicks on disk: read, changed with undo, and saved without losing what others wrote."""
 
 import csv
-import fcntl
 import hashlib
 import io
-import os
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.tables import composed, read_cells, read_text
 from scenefuse.marks.clicks import HEADERS, Click, Kind, ScenePoints, read_length_clicks, read_points
-from scenefuse.pick.clicks import History, Rows, difference, merged
+from scenefuse.pick.edits import Rows, merged
 
-_BASE = "# unsaved clicks, laid over the file of SHA-256 "
+# Begins the line of a draft that names the state of the file that it was made from.
+BASE = "# unsaved clicks, laid over the file of SHA-256 "
 
 
 class FileChanged(Exception):
@@ -33,7 +31,7 @@ class Document:
     Attributes:
         path: of the file, which need not exist.
         kind: what its rows are; that of the file where it exists.
-        history: the rows, with undo.
+        rows: as edited.
         saved: the rows that the file held when it was last read or written.
         trouble: why the file cannot be read; it is then kept under another name when this is saved. "" where it can.
         fixed: why the file cannot be edited here; "" where it can.
@@ -45,7 +43,9 @@ class Document:
         """Read the file; names of photos are spelled as in `photos`, where the file writes their umlauts otherwise."""
         self.path, self.kind = path, kind
         self._spelled = {composed(name): name for name in photos}
-        self.version, self._drafted = 0, ""
+        self._draft = path.with_name(f"{path.stem}.unsaved{path.suffix}")
+        # The version that the draft holds; 0 where there is none of this page.
+        self.version = self._drafted = 0
         self.notes: list[str] = []
         self.read()
         self._restore()
@@ -53,49 +53,53 @@ class Document:
     def read(self) -> None:
         """Take the rows that the file holds, and forget all others."""
         self.trouble = self.fixed = ""
+        self.rows: Rows = ()
         self._digest = digest(self.path)
         self._comments: list[str] = []
         try:
-            self.saved = self._rows()
+            self.kind, self.rows = self._on_disk()
+            self._comments = [line for line in _lines(self.path) if line.startswith("#")]
+        except NotClicked as error:
+            self.fixed = str(error)
         except StageError as error:
-            self.saved, self.trouble = (), str(error)
-        self.history = History(self.saved)
+            self.trouble = str(error)
+        self.saved = self.rows
+        self._past: list[Rows] = []
+        self._future: list[Rows] = []
         self.version += 1
-
-    @property
-    def rows(self) -> Rows:
-        """The rows as edited."""
-        return self.history.rows
 
     @property
     def unsaved(self) -> bool:
-        """Whether they differ from the file's."""
+        """Whether the rows differ from the file's."""
         return set(self.rows) != set(self.saved)
 
     def change(self, rows: Rows) -> None:
-        """Edit the rows."""
+        """Replace the rows; what was undone can no longer be redone."""
         if self.fixed:
             raise StageError(self.fixed)
-        self.history.change(rows)
+        if rows != self.rows:
+            self._past.append(self.rows)
+            self._future.clear()
+            self.rows = rows
+            self.version += 1
+
+    def undo(self, forward: bool = False) -> bool:
+        """One change back, or forward again; False where there is none."""
+        source, target = (self._future, self._past) if forward else (self._past, self._future)
+        if not source:
+            return False
+        target.append(self.rows)
+        self.rows = source.pop()
         self.version += 1
+        return True
 
     def choose_kind(self, kind: Kind) -> None:
         """Hold rows of the other kind; StageError where there are rows already."""
         if kind != self.kind and (self.rows or self.fixed):
             raise StageError(f"{self.path} holds {self.kind}; remove them all to begin with {kind}")
         self.kind = kind
-        self.history = History(self.rows)
+        self._past, self._future = [], []
         self.version += 1
-
-    def undo(self) -> bool:
-        """One change back."""
-        self.version += 1
-        return self.history.undo()
-
-    def redo(self) -> bool:
-        """One change forward again."""
-        self.version += 1
-        return self.history.redo()
 
     def changed_on_disk(self) -> bool:
         """Whether somebody else wrote, made or removed the file since it was read."""
@@ -110,15 +114,13 @@ class Document:
         """
         if self.fixed:
             raise StageError(self.fixed)
-        with _locked(self.path.parent):
-            if self.changed_on_disk():
-                raise FileChanged(self._what_changed())
-            message = f"{len(self.rows)} rows saved in {self.path}"
-            if self.trouble:
-                message += f"; the unreadable file is kept as {_kept(self.path).name}"
-            lines = ["\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
-            _write(self.path, "\n".join([*self._comments, *lines]) + "\n")
-            self._digest = digest(self.path)
+        if self.changed_on_disk():
+            raise FileChanged(self._what_changed())
+        message = f"{len(self.rows)} rows saved in {self.path}"
+        if self.trouble:
+            message += f"; the unreadable file is kept as {_kept(self.path)}"
+        self._write(self.path, self._comments)
+        self._digest = digest(self.path)
         self.saved, self.trouble = self.rows, ""
         self.keep_draft()
         self.version += 1
@@ -131,98 +133,91 @@ class Document:
             StageError: it holds another kind of rows.
         """
         base, mine, kind = self.saved, self.rows, self.kind
-        with suppress(StageError):  # which `read` notes
-            kind = self._on_disk()[0]
+        try:
+            kind, _ = self._on_disk()
+        except NotClicked:
+            raise
+        except StageError:
+            pass  # which `read` notes
         if mine and kind != self.kind:
             raise StageError(f"{self.path} holds {kind} now, and here are {self.kind}: take one of the two")
         self.read()
-        if self.trouble or self.fixed:
-            self.history.change(mine)
-        else:
-            self.history.change(merged(base, mine, self.saved))
+        self.change(mine if self.trouble else merged(base, mine, self.saved))
         return "Both are shown now; save to write them."
 
     def keep_mine(self) -> str:
         """Save the own rows; the file as somebody else left it is kept under another name."""
-        kept = _kept(self.path).name if self.path.exists() else ""
+        kept = f"; the other version is kept as {_kept(self.path)}" if self.path.exists() else ""
         self._digest, self.trouble = digest(self.path), ""
-        return self.save() + (f"; the other version is kept as {kept}" if kept else "")
+        return self.save() + kept
 
     def keep_draft(self) -> Path | None:
-        """Write unsaved rows beside the file, for the next time; None where there are none, and what this object wrote
-        there goes."""
+        """Write unsaved rows beside the file, for the next time; None where there are none, and an own draft goes."""
         if not self.unsaved:
-            if self._drafted and digest(self._draft) == self._drafted:
+            if self._drafted:
                 self._draft.unlink(missing_ok=True)
-            self._drafted = ""
+            self._drafted = 0
             return None
-        lines = [f"{_BASE}{self._digest}", "\t".join(HEADERS[self.kind]), *map(_line, self.rows)]
-        text = "\n".join(lines) + "\n"
-        if hashlib.sha256(text.encode()).hexdigest() != self._drafted:
-            if self._draft.exists() and digest(self._draft) != self._drafted:
-                _kept(self._draft)  # it is another page's, or could not be read
-            _write(self._draft, text)
-            self._drafted = digest(self._draft)
+        if self._drafted != self.version:
+            self._write(self._draft, [f"{BASE}{self._digest}"])
+            self._drafted = self.version
         return self._draft
-
-    @property
-    def _draft(self) -> Path:
-        return self.path.with_name(f"{self.path.stem}.unsaved{self.path.suffix}")
 
     def _restore(self) -> None:
         """Take up the unsaved rows of the last time; where the file has changed since, beside its own."""
         if not self._draft.is_file() or self.fixed:
             return
         try:
-            base = next((line for line in read_text(self._draft).splitlines() if line.startswith(_BASE)), _BASE)
-            kind, rows = self._read_rows(self._draft) if _holds_rows(self._draft) else (self.kind, ())
+            base = next((line for line in _lines(self._draft) if line.startswith(BASE)), BASE).removeprefix(BASE)
+            kind, rows = self._read_rows(self._draft)
+            if self.saved and kind != self.kind:
+                raise StageError(f"they are {kind}, and {self.path.name} holds {self.kind}")
         except StageError as error:
-            self.notes.append(f"unsaved clicks cannot be read and are left where they are: {error}")
+            self.notes.append(f"unsaved clicks of the last time are kept as {_kept(self._draft)}: {error}")
+            self._draft.unlink()
             return
-        if self.saved and kind != self.kind:
-            self.notes.append(f"unsaved {kind} are left in {self._draft.name}: {self.path.name} holds {self.kind} now")
-            return
-        self._drafted = digest(self._draft)
-        if base.removeprefix(_BASE) == self._digest:
-            self.kind = kind
-            self.history.change(rows)
-        elif set(rows) - set(self.saved):
-            self.kind = kind
-            self.history.change(merged((), rows, self.saved))
+        if base != self._digest and set(rows) - set(self.saved):
             self.notes.append(f"{self.path.name} has changed since clicks were left unsaved: both are shown")
-
-    def _rows(self) -> Rows:
-        try:
-            self.kind, rows = self._on_disk()
-        except NotClicked as error:
-            self.fixed = str(error)
-            return ()
-        if rows:
-            self._comments = [line for line in read_text(self.path).splitlines() if line.startswith("#")]
-        return rows
+        self.kind = kind
+        self.change(rows if base == self._digest else merged((), rows, self.saved))
+        self._drafted = self.version
 
     def _on_disk(self) -> tuple[Kind, Rows]:
         """What the file holds."""
-        return self._read_rows(self.path) if self.path.exists() and _holds_rows(self.path) else (self.kind, ())
+        return self._read_rows(self.path) if self.path.exists() else (self.kind, ())
 
     def _read_rows(self, path: Path) -> tuple[Kind, Rows]:
-        kind, rows = _read(path, self.kind)
-        return kind, tuple(replace(row, photo=self._spelled.get(composed(row.photo), row.photo)) for row in rows)
+        """The rows of a file, and what they are; a table of lengths holds nothing else.
+
+        Raises:
+            NotClicked: points by their coordinates.
+            StageError: it cannot be read.
+        """
+        cells = read_cells(path)
+        if not cells or (len(cells) == 1 and cells[0][1] in HEADERS.values()):
+            return self.kind, ()
+        marked = read_length_clicks(path) if self.kind == "lengths" else read_points(path)
+        if isinstance(marked, ScenePoints):
+            raise NotClicked(f"{path} holds points by their coordinates, which are not clicked; edit it as text")
+        named = tuple(replace(row, photo=self._spelled.get(composed(row.photo), row.photo)) for row in marked.rows)
+        return marked.kind, named
+
+    def _write(self, path: Path, comments: list[str]) -> None:
+        text = "\n".join([*comments, "\t".join(HEADERS[self.kind]), *map(_line, self.rows)]) + "\n"
+        try:
+            # A link stays one: what it points to is replaced.
+            with atomic_file(path.resolve()) as temporary:
+                temporary.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise StageError(f"{path} cannot be written ({error.strerror}); check its folder's permissions") from None
 
     def _what_changed(self) -> str:
         try:
-            return f"{self.path} was changed by someone else: {difference(self.saved, self._on_disk()[1])}"
+            rows = set(self._on_disk()[1])
         except StageError as error:
             return f"{self.path} was changed by someone else, and is no longer readable: {error}"
-
-
-def _holds_rows(path: Path) -> bool:
-    """False for an empty file, or a known header without rows: nothing is marked in it, and nothing is wrong."""
-    try:
-        rows = read_cells(path)
-    except StageError:
-        return True
-    return len(rows) > 1 or (len(rows) == 1 and rows[0][1] not in HEADERS.values())
+        added, removed = len(rows - set(self.saved)), len(set(self.saved) - rows)
+        return f"{self.path} was changed by someone else: {added} added, {removed} removed"
 
 
 def digest(path: Path) -> str:
@@ -233,17 +228,8 @@ def digest(path: Path) -> str:
         return ""
 
 
-def _read(path: Path, kind: Kind) -> tuple[Kind, Rows]:
-    """The rows of a table, and what they are; a table of lengths holds nothing else.
-
-    Raises:
-        NotClicked: points by their coordinates.
-        StageError: it cannot be read.
-    """
-    marked = read_length_clicks(path) if kind == "lengths" else read_points(path)
-    if isinstance(marked, ScenePoints):
-        raise NotClicked(f"{path} holds points by their coordinates, which are not clicked; edit it as text")
-    return marked.kind, marked.rows
+def _lines(path: Path) -> list[str]:
+    return read_text(path).splitlines() if path.exists() else []
 
 
 def _line(click: Click) -> str:
@@ -253,31 +239,10 @@ def _line(click: Click) -> str:
     return line.getvalue()
 
 
-def _write(path: Path, text: str) -> None:
-    try:
-        # A link stays one: what it points to is replaced.
-        with atomic_file(path.resolve()) as temporary:
-            temporary.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StageError(f"{path} cannot be written ({error.strerror}); check its folder's permissions") from None
-
-
-def _kept(path: Path) -> Path:
-    """A copy of a file under the first free name beside it."""
+def _kept(path: Path) -> str:
+    """The name of a copy of a file, the first free one beside it."""
     number = 1
     while (other := path.with_name(f"{path.stem}.kept-{number}{path.suffix}")).exists():
         number += 1
     shutil.copy2(path, other)
-    return other
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that of two pages one after the other looks at the file and writes it."""
-    folder.mkdir(parents=True, exist_ok=True)
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
-        yield
-    finally:
-        os.close(handle)
+    return other.name

@@ -11,14 +11,11 @@ from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.marks.triangulation import triangulate_consistent
 from scenefuse.photos.workspace import posed_images, ray_through, read_model
-from scenefuse.pick.clicks import Sizes
+from scenefuse.pick.edits import Sizes
 
-DEPTHS = 200
-"""Samples of a ray, from near to far."""
+# A ray's ends, as shares of the depths of the nearest and the farthest sparse point that the photo sees.
 NEAR, FAR = 0.3, 4.0
-"""The ray's ends, as shares of the nearest and farthest sparse point that the photo sees."""
-MARGIN = 0.05
-"""How far outside the photo a line is still drawn, as a share of its size: a lens's model holds little farther."""
+RAY_SAMPLES = 200
 
 
 @dataclass(frozen=True)
@@ -97,15 +94,14 @@ class Cameras:
         pose = image.cam_from_world().matrix()
         seen = np.array([self._model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
         depth = seen @ pose[2, :3] + pose[2, 3] if len(seen) else np.ones(1)
-        steps = np.geomspace(NEAR * max(depth.min(), 1e-6), FAR * depth.max(), DEPTHS)
+        steps = np.geomspace(NEAR * max(depth.min(), 1e-6), FAR * depth.max(), RAY_SAMPLES)
         return self._seen((ray * steps[:, None] - pose[:, 3]) @ pose[:, :3], photo)
 
     def _seen(self, points: Array, photo: str) -> Array:
-        """(N, 2) pixels of those points (P, 3) that lie in a photo, or little outside of it."""
-        size = np.array(self._sizes[photo], dtype=float)
+        """(N, 2) pixels of those points (P, 3) that lie in a photo: a lens's model does not hold outside."""
         pixels = [at for point in points if (at := self._projected(point, photo)) is not None]
         found = np.array(pixels).reshape(-1, 2)
-        return found[((found > -MARGIN * size) & (found < (1 + MARGIN) * size)).all(1)]
+        return found[((found >= 0) & (found <= self._sizes[photo])).all(1)]
 
     def _projected(self, point: Array, photo: str) -> Array | None:
         image = self._images[photo]

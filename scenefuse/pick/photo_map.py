@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,25 +11,29 @@ from nicegui.elements.leaflet.leaflet_layer import Layer
 
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click
+from scenefuse.pick.edits import Corners, Rows
 from scenefuse.pick.photo_tiles import Picture
 
-MAGNIFIED = 4
-"""Zoom steps beyond the photo's own pixels."""
+# Zoom steps beyond the photo's own pixels.
+EXTRA_ZOOM = 4
 COLOURS = {"inside": "#00c853", "outside": "#ff1744", "box": "#2979ff"}
 POINT, ACTIVE, EXPECTED = "#2979ff", "#ffd600", "#ff9100"
-NEAR_PX = 14
-"""A click is meant by a pointer this near, on the screen."""
+# A pointer means a click this near to it, on the screen.
+POINTER_PX = 14
 
-Handler = Callable[[float, float], Awaitable[None] | None]
+Handler = Callable[[float, float], None]
 
 
 class PhotoMap:
-    """A photo with its clicks; tells where it is clicked."""
+    """A photo with its clicks; reports where it is clicked."""
 
-    def __init__(
-        self, on_click: Handler, on_remove: Handler, on_box: Callable[[list[tuple[float, float]]], Any]
-    ) -> None:
-        """Build the map inside the current element, without a photo."""
+    def __init__(self, on_click: Handler, on_remove: Handler, on_box: Callable[[Corners], None]) -> None:
+        """Build the map inside the current element, without a photo.
+
+        Args:
+            on_click, on_remove: get the pixel of a click, and of a right click.
+            on_box: gets two opposite corners.
+        """
         options = {
             "attributionControl": False,
             "doubleClickZoom": False,
@@ -52,17 +56,15 @@ class PhotoMap:
         self._masks: dict[str, Layer] = {}
         self._drawing = False
 
-        async def clicked(event: Any, handler: Handler) -> None:
+        def clicked(event: Any, handler: Handler) -> None:
             if self._picture is not None and not self._drawing:
-                found = handler(*self._picture.pixel(event.args["latlng"]["lat"], event.args["latlng"]["lng"]))
-                if found is not None:
-                    await found
+                handler(*self._picture.pixel(event.args["latlng"]["lat"], event.args["latlng"]["lng"]))
 
         def drawn(event: Any) -> None:
             self._drawing = False
             if self._picture is not None:
-                corners = event.args["layer"]["_latlngs"][0]
-                on_box([self._picture.pixel(corner["lat"], corner["lng"]) for corner in (corners[0], corners[2])])
+                start, _, end, _ = event.args["layer"]["_latlngs"][0]
+                on_box((self._picture.pixel(start["lat"], start["lng"]), self._picture.pixel(end["lat"], end["lng"])))
 
         self.widget.on("map-click", lambda event: clicked(event, on_click))
         self.widget.on("map-contextmenu", lambda event: clicked(event, on_remove))
@@ -76,6 +78,7 @@ class PhotoMap:
             picture: the photo.
             tiles: address of its tiles with {z}, {x} and {y}.
         """
+        self.drag_box(False)
         self._picture = picture
         self.widget.clear_layers()
         self._over, self._masks = [], {}
@@ -84,7 +87,7 @@ class PhotoMap:
             url_template=tiles,
             options={
                 "maxNativeZoom": picture.depth,
-                "maxZoom": picture.depth + MAGNIFIED,
+                "maxZoom": picture.depth + EXTRA_ZOOM,
                 "minZoom": 0,
                 "noWrap": True,
                 "bounds": bounds,
@@ -94,7 +97,7 @@ class PhotoMap:
         )
         self.widget.run_map_method("setMaxBounds", None)
         self.widget.run_map_method("setMinZoom", 0)
-        self.widget.run_map_method("setMaxZoom", picture.depth + MAGNIFIED)
+        self.widget.run_map_method("setMaxZoom", picture.depth + EXTRA_ZOOM)
         self.fit()
 
     def fit(self) -> None:
@@ -110,7 +113,7 @@ class PhotoMap:
         """How many pixels of the photo a pointer may miss a click by."""
         picture = self._picture
         zoom = float(self.widget.zoom)
-        return 0.0 if picture is None else NEAR_PX / picture.scale * 2 ** (picture.depth - zoom)
+        return 0.0 if picture is None else POINTER_PX / picture.scale * 2 ** (picture.depth - zoom)
 
     def lay(self, name: str, address: str | None) -> None:
         """Lay a mask over the photo in the place of the former one of this name; None takes it away."""
@@ -122,19 +125,16 @@ class PhotoMap:
         if former is not None:
             self.widget.remove_layer(former)
 
-    def draw_box(self) -> None:
-        """Let a box be dragged."""
-        self._drawing = True
-        ui.run_javascript(
-            f"const map = getElement({self.widget.id}).map; window.boxTool?.disable();"
-            f"window.boxTool = new L.Draw.Rectangle(map, {json.dumps(self._rectangle)}); window.boxTool.enable();"
-        )
-
-    def stop_drawing(self) -> None:
-        """Give up the box."""
-        if self._drawing:
+    def drag_box(self, wanted: bool) -> None:
+        """Let a box be dragged, or give it up."""
+        if wanted and not self._drawing:
+            ui.run_javascript(
+                f"const map = getElement({self.widget.id}).map; window.boxTool?.disable();"
+                f"window.boxTool = new L.Draw.Rectangle(map, {json.dumps(self._rectangle)}); window.boxTool.enable();"
+            )
+        elif self._drawing and not wanted:
             ui.run_javascript("window.boxTool?.disable();")
-        self._drawing = False
+        self._drawing = wanted
 
     def clear(self) -> None:
         """Take away clicks and lines."""
@@ -142,14 +142,12 @@ class PhotoMap:
             self.widget.remove_layer(layer)
         self._over = []
 
-    def draw_labels(self, clicks: Iterable[Click]) -> None:
-        """Draw clicks inside and outside, and boxes."""
-        corners: list[Click] = []
+    def draw_labels(self, clicks: Rows) -> None:
+        """Draw clicks inside and outside, and a box."""
         for click in clicks:
-            if click.label == "box":
-                corners.append(click)
-            else:
+            if click.label != "box":
                 self._dot(click, COLOURS[click.label], "")
+        corners = [click for click in clicks if click.label == "box"]
         if len(corners) == 2:
             ends = [self._place(c.x_px, c.y_px) for c in corners]
             self._add("rectangle", [ends, {"color": COLOURS["box"], "weight": 2, "fill": False, "interactive": False}])
@@ -158,7 +156,7 @@ class PhotoMap:
         """Draw a named point."""
         self._dot(click, ACTIVE if active else POINT, click.name)
 
-    def draw_expected(self, pixels: Array, name: str) -> None:
+    def draw_expected(self, pixels: Array) -> None:
         """Draw where a point is to be expected: a cross-hair for one pixel, a line for more."""
         style = {"color": EXPECTED, "weight": 2, "opacity": 0.9, "interactive": False, "dashArray": "6 5"}
         if len(pixels) == 1:

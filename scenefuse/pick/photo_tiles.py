@@ -3,9 +3,9 @@
 import hashlib
 import math
 import threading
-from collections import OrderedDict
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -17,15 +17,16 @@ from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.photos.frames import sharpness
 
 TILE_PX = 256
-THUMB_PX = 320
-"""Longer side of a thumbnail."""
+# Longer side of a thumbnail.
+THUMBNAIL_PX = 320
+# Longer side of the photos that masks are made and shown in; SAM 2 sees no more.
+MASK_PX = 1024
+# Tiles of levels no larger than this are cut from a copy that a JPEG gives ten times as fast as itself.
 COARSE_PX = 1280
-"""Tiles of levels no larger than this are cut from a copy that a JPEG gives ten times as fast as itself."""
-PYRAMIDS, COARSE_PYRAMIDS = 2, 30
-"""Photos kept decoded, 200 MB each at 50 megapixels, and coarse copies, 5 MB each."""
-JPEG_QUALITY = 88
-BACKGROUND = 32
-"""Grey value beyond the photo's edges, as the page has it."""
+# Photos kept decoded, 200 MB each at 50 megapixels, and coarse copies, 5 MB each.
+FINE_PYRAMIDS, COARSE_PYRAMIDS = 2, 30
+# Beyond the photo's edges.
+BACKGROUND = "#202020"
 
 Pixels = NDArray[np.uint8]
 
@@ -69,18 +70,21 @@ class Picture:
         return (longitude + 180) / 360 * world, (1 - math.asinh(math.tan(math.radians(latitude))) / math.pi) / 2 * world
 
 
-def read_upright(path: Path, least_px: int | None = None) -> Pixels:
+def read_upright(path: Path, min_px: int | None = None) -> Pixels:
     """(H, W, 3) uint8 RGB of a photo as people see it.
 
     Args:
         path: of the photo.
-        least_px: the longer side may be smaller than the photo's, but not than this: a JPEG is then decoded faster.
+        min_px: the longer side may be smaller than the photo's, but not than this: a JPEG is then decoded faster.
+
+    Raises:
+        StageError: it cannot be read.
     """
     try:
         # By handle: opened by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
         with open(path, "rb") as file, Image.open(file) as stored:
-            if least_px is not None:
-                stored.draft("RGB", (least_px, least_px))
+            if min_px is not None:
+                stored.draft("RGB", (min_px, min_px))
             image = ImageOps.exif_transpose(stored)
             # Sixteen-bit grey is not scaled by Pillow's conversion.
             if image.mode.startswith("I;16"):
@@ -94,14 +98,14 @@ def at_most(pixels: Pixels, side_px: int) -> Pixels:
     """The picture, its longer side at most `side_px`."""
     scale = min(1.0, side_px / max(pixels.shape[:2]))
     size = (max(1, round(pixels.shape[1] * scale)), max(1, round(pixels.shape[0] * scale)))
-    return np.asarray(cv2.resize(pixels, size, interpolation=cv2.INTER_AREA), dtype=np.uint8) if scale < 1 else pixels
+    return _resized(pixels, size) if scale < 1 else pixels
 
 
 class Tiles:
     """Tiles of photos, cut from pyramids of those that were looked at last."""
 
     def __init__(self) -> None:
-        self._fine, self._coarse = _Kept(PYRAMIDS), _Kept(COARSE_PYRAMIDS)
+        self._fine, self._coarse = _cached(FINE_PYRAMIDS), _cached(COARSE_PYRAMIDS)
 
     def tile(self, picture: Picture, zoom: int, column: int, row: int) -> bytes:
         """A tile of 256 x 256 pixels, as JPEG; grey beyond the photo's right and lower edge.
@@ -117,40 +121,30 @@ class Tiles:
         if column * TILE_PX >= width or row * TILE_PX >= height:
             raise IndexError
         first = next(k for k in range(picture.depth + 1) if max(picture.size_at(k)) <= COARSE_PX or k == picture.depth)
-        if level >= first > 0:
-            pixels = self._coarse.get(picture, first)[level - first]
-        else:
-            pixels = self._fine.get(picture, 0)[level]
+        pixels = self._coarse(picture, first)[level - first] if level >= first > 0 else self._fine(picture, 0)[level]
         part = pixels[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX]
-        full = np.full((TILE_PX, TILE_PX, 3), BACKGROUND, dtype=np.uint8)
+        full = np.full((TILE_PX, TILE_PX, 3), tuple(bytes.fromhex(BACKGROUND[1:])), dtype=np.uint8)
         full[: part.shape[0], : part.shape[1]] = part
         return jpeg(full)
 
 
-class _Kept:
-    """Pyramids of the photos that were asked for last; each is read once, whoever asks."""
+def _cached(count: int) -> Callable[[Picture, int], list[Pixels]]:
+    """`_pyramid` of the photos that were looked at last; each is read once, however many threads want it."""
+    read, lock = lru_cache(count)(_pyramid), threading.Lock()
 
-    def __init__(self, most: int) -> None:
-        self._most, self._lock = most, threading.Lock()
-        self._pyramids: OrderedDict[Path, list[Pixels]] = OrderedDict()
-        self._reading: dict[Path, threading.Lock] = {}
+    def pyramid(picture: Picture, first: int) -> list[Pixels]:
+        with lock:
+            return read(picture, first)
 
-    def get(self, picture: Picture, first: int) -> list[Pixels]:
-        """A photo at its size halved `first` times, and so on down to a tile."""
-        with self._lock:
-            reading = self._reading.setdefault(picture.path, threading.Lock())
-        with reading:
-            levels = self._pyramids.get(picture.path)
-            if levels is None:
-                levels = [_resized(read_upright(picture.path, max(picture.size_at(first))), picture.size_at(first))]
-                for level in range(first + 1, picture.depth + 1):
-                    levels.append(_resized(levels[-1], picture.size_at(level)))
-            with self._lock:
-                self._pyramids[picture.path] = levels
-                self._pyramids.move_to_end(picture.path)
-                while len(self._pyramids) > self._most:
-                    self._pyramids.popitem(last=False)
-            return levels
+    return pyramid
+
+
+def _pyramid(picture: Picture, first: int) -> list[Pixels]:
+    """A photo at its size halved `first` times, and so on down to a tile."""
+    levels = [_resized(read_upright(picture.path, max(picture.size_at(first))), picture.size_at(first))]
+    for level in range(first + 1, picture.depth + 1):
+        levels.append(_resized(levels[-1], picture.size_at(level)))
+    return levels
 
 
 class Thumbnails:
@@ -162,29 +156,25 @@ class Thumbnails:
         self._failed: set[Path] = set()
         self._lock = threading.Lock()
 
-    def fail(self, picture: Picture) -> None:
-        """Note that a photo cannot be read."""
-        self._failed.add(picture.path)
-
-    def failed(self, picture: Picture) -> bool:
-        """Whether it could not be read."""
-        return picture.path in self._failed
-
     def get(self, picture: Picture) -> tuple[Path, float]:
         """The file of a photo's thumbnail, and how sharp the photo is (variance of the Laplacian).
 
         Raises:
             StageError: the photo cannot be read.
         """
-        key = self._key(picture)
-        if key not in self._known:
-            pixels = read_upright(picture.path, 2 * THUMB_PX)
-            sharp = sharpness(np.ascontiguousarray(pixels[..., ::-1]))
-            path = self._folder / f"{key}_{sharp:.2f}.jpg"
-            with self._lock:
-                with atomic_file(path) as temporary:
-                    temporary.write_bytes(jpeg(at_most(pixels, THUMB_PX)))
-                self._known[key] = path
+        try:
+            key = self._key(picture)
+            if key not in self._known:
+                pixels = read_upright(picture.path, 2 * THUMBNAIL_PX)
+                sharp = sharpness(np.ascontiguousarray(pixels[..., ::-1]))
+                path = self._folder / f"{key}_{sharp:.2f}.jpg"
+                with self._lock:
+                    with atomic_file(path) as temporary:
+                        temporary.write_bytes(jpeg(at_most(pixels, THUMBNAIL_PX)))
+                    self._known[key] = path
+        except (StageError, OSError) as error:
+            self._failed.add(picture.path)
+            raise StageError(str(error)) from None
         return self._known[key], float(self._known[key].stem.split("_")[1])
 
     def sharpness(self, picture: Picture) -> float | None:
@@ -194,6 +184,10 @@ class Thumbnails:
         except OSError:
             return None
         return None if path is None else float(path.stem.split("_")[1])
+
+    def is_missing(self, picture: Picture) -> bool:
+        """Whether a thumbnail is still to be made."""
+        return picture.path not in self._failed and self.sharpness(picture) is None
 
     def sharpest_first(self, pictures: Iterable[Picture]) -> list[Picture]:
         """The photos, those first whose sharpness is known, from sharp to blurred."""
@@ -208,8 +202,7 @@ class Thumbnails:
 
 def jpeg(pixels: Pixels) -> bytes:
     """RGB pixels as JPEG."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
-    return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR), options)[1].tobytes()
+    return cv2.imencode(".jpg", cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
 
 
 def _resized(pixels: Pixels, size: tuple[int, int]) -> Pixels:

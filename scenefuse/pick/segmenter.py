@@ -12,19 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, scratch_directory, threads
-from scenefuse.pick.clicks import Rows
-from scenefuse.pick.photo_tiles import Picture, at_most, read_upright
+from scenefuse.pick.edits import Rows
+from scenefuse.pick.photo_tiles import MASK_PX, Picture, at_most, read_upright
 
 if TYPE_CHECKING:
     from scenefuse.marks.photo_clicks import PhotoClicks
 
 Mask = NDArray[np.bool_]
-KEPT = 24
-"""Photos whose features are kept; 17 MB each, and the photo."""
+# Photos whose features are kept; 17 MB each, and the photo.
+KEPT_PHOTOS = 24
+# Without a click for so long, photos that are not shown are prepared.
 IDLE_S = 4.0
-"""Without a click for so long, photos that are not shown are prepared."""
-AHEAD = 6
-"""Photos whose features are computed before anybody clicks in them."""
 
 
 class _Remembering:
@@ -40,7 +38,7 @@ class _Remembering:
         if id(image) not in self._features:
             # The array is kept, too: another one would get its identity.
             self._features[id(image)] = image, self._network.encode(image)
-            while len(self._features) > KEPT:
+            while len(self._features) > KEPT_PHOTOS:
                 self._features.popitem(last=False)
         return self._features[id(image)][1]
 
@@ -54,15 +52,14 @@ class Segmenter:
         trouble: why it is not what the settings ask for, or why there is nothing; "" where all is well.
     """
 
-    def __init__(self, settings: Mapping[str, Any], side_px: int, photo_px: int) -> None:
+    def __init__(self, settings: Mapping[str, Any], photo_px: int) -> None:
         """Nothing is loaded yet.
 
         Args:
             settings: `object.masks`.
-            side_px: longer side of the photos that masks are made in.
             photo_px: longest side of an undistorted photo in the workflow.
         """
-        self._settings, self._side_px, self._photo_px = settings, side_px, photo_px
+        self._settings, self._photo_px = settings, photo_px
         self._photos: OrderedDict[str, NDArray[np.uint8]] = OrderedDict()
         self._network: _Remembering | None = None
         self._ask: Callable[..., Any] | None = None
@@ -123,11 +120,11 @@ class Segmenter:
     def compute_ahead(self, wanted: Callable[[], list[Picture]]) -> None:
         """Compute features until closed, in the order wanted; run in a thread of its own.
 
-        Only those of the first photo are computed while a person clicks.
+        While a person clicks, only those of the first photo are computed.
         """
         self.load()
         while not self._closed:
-            photos = wanted()[: AHEAD if self.is_idle() else 1] if self._network else []
+            photos = wanted()[: None if self.is_idle() else 1] if self._network else []
             missing = [p for p in photos if p.name not in self._photos]
             if self._waiting or not missing:
                 time.sleep(0.2)
@@ -149,7 +146,7 @@ class Segmenter:
         self._closed = True
 
     def mask(self, picture: Picture, rows: Rows) -> tuple[Mask, list[str]]:
-        """(H, W) mask of a photo from its own clicks, at most `side_px` large, and what is wrong with it.
+        """(H, W) mask of a photo from its own clicks, at most MASK_PX large, and what is wrong with it.
 
         Raises:
             StageError: the photo cannot be read.
@@ -175,10 +172,8 @@ class Segmenter:
         finally:
             self._waiting -= 1
         notes = []
-        if self.method == "GrabCut" and not any(
-            row.photo == picture.name and row.label in ("outside", "box") for row in rows
-        ):
-            notes.append("GrabCut tells colours apart: click beside the object too, or drag a box around it")
+        if self.method == "GrabCut" and clicks.box is None and clicks.inside.all():
+            notes.append("GrabCut separates colours: click beside the object too, or drag a box around it")
         if left_out:
             clicks_lie = "click lies" if len(left_out) == 1 else "clicks lie"
             notes.append(f"{len(left_out)} {clicks_lie} on the wrong side of its outline and would be left out")
@@ -191,9 +186,9 @@ class Segmenter:
     def _pixels(self, picture: Picture) -> NDArray[np.uint8]:
         """The photo as the network sees it; always the same array while it is kept."""
         if picture.name not in self._photos:
-            pixels = at_most(read_upright(picture.path, self._side_px), self._side_px)
+            pixels = at_most(read_upright(picture.path, MASK_PX), MASK_PX)
             self._photos[picture.name] = np.ascontiguousarray(pixels)
-            while len(self._photos) > KEPT:
+            while len(self._photos) > KEPT_PHOTOS:
                 self._photos.popitem(last=False)
         return self._photos[picture.name]
 

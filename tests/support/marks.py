@@ -5,14 +5,14 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.core.transforms import Array, Sim3
 
-OFF = 0.01
-"""How far off the marks are clicked, one standard deviation over the object's diagonal."""
+# One standard deviation of how far marks are off, over the object's diagonal.
+MISS_SHARE = 0.01
 
 
 def marks_of(surface: Array, diagonal: float, seed: int) -> Array:
-    """(6, 3) the ends of a surface (N, 3) along the axes, not quite met."""
+    """(6, 3) the ends of a surface (N, 3) along the axes, missed a little."""
     ends = np.concatenate([surface[surface.argmin(0)], surface[surface.argmax(0)]])
-    return ends + np.random.default_rng(seed).normal(0, OFF * diagonal, ends.shape)
+    return ends + np.random.default_rng(seed).normal(0, MISS_SHARE * diagonal, ends.shape)
 
 
 def frame_of_its_own(seed: int) -> Sim3:

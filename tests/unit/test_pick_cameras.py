@@ -10,8 +10,8 @@ import pytest
 from scenefuse.marks.clicks import Click
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.pick.expected_place import Cameras
-from scenefuse.pick.photo_tiles import Picture
-from scenefuse.pick.workflow_masks import OVERLAY_PX, CarriedMasks
+from scenefuse.pick.photo_tiles import MASK_PX, Picture
+from scenefuse.pick.workflow import WorkflowMasks
 
 ROOF = np.array([0.3, -0.2, 0.1])
 SIZES = {f"{k}.jpg": (1280, 960) for k in (1, 2, 3)}  # twice the model's photos
@@ -101,29 +101,29 @@ def results(model, tmp_path):
 
 
 def test_a_mask_is_bent_as_the_lens_bends(model, results):
-    mask = CarriedMasks(results, results / "accepted.json").mask(Picture("2.jpg", None, 1280, 960))
+    mask = WorkflowMasks(results, results / "accepted.json").mask(Picture("2.jpg", None, 1280, 960))
     camera = model.cameras[1]
     corners = camera.img_from_cam(np.column_stack([(np.array([[520, 340], [600, 440]]) - [320, 240]) / 500, [1, 1]]))
     rows, columns = np.nonzero(mask)
     scale = mask.shape[1] / 640
-    assert max(mask.shape) <= OVERLAY_PX
+    assert max(mask.shape) <= MASK_PX
     assert corners[0, 0] > 523 and abs(columns.min() / scale - corners[0, 0]) < 2
     assert abs(columns.max() / scale - corners[1, 0]) < 2 and abs(rows.max() / scale - corners[1, 1]) < 2
 
 
 def test_photos_without_a_mask_have_no_overlay(results):
-    assert CarriedMasks(results, results / "accepted.json").mask(Picture("1.jpg", None, 1280, 960)) is None
-    assert not CarriedMasks(results / "nowhere", results / "accepted.json")
+    assert WorkflowMasks(results, results / "accepted.json").mask(Picture("1.jpg", None, 1280, 960)) is None
+    assert WorkflowMasks(results / "nowhere", results / "accepted.json").agreement == {}
 
 
 def test_an_accepted_mask_is_so_until_it_changes(results):
-    carried = CarriedMasks(results, results / "pick/accepted.json")
-    assert carried.dropped == {"1.jpg": "disagrees"} and carried.agreement == {"2.jpg": 0.9}
-    carried.accept("2.jpg")
-    again = CarriedMasks(results, results / "pick/accepted.json")
+    masks = WorkflowMasks(results, results / "pick/accepted.json")
+    assert masks.dropped == {"1.jpg": "disagrees"} and masks.agreement == {"2.jpg": 0.9}
+    masks.accept("2.jpg")
+    again = WorkflowMasks(results, results / "pick/accepted.json")
     assert again.is_accepted("2.jpg") and not again.is_accepted("1.jpg")
     cv2.imwrite(str(results / "masks/2.png"), np.zeros((480, 640), dtype=np.uint8))
-    assert not CarriedMasks(results, results / "pick/accepted.json").is_accepted("2.jpg")
+    assert not WorkflowMasks(results, results / "pick/accepted.json").is_accepted("2.jpg")
 
 
 def test_a_click_beyond_what_the_lens_s_model_reaches_says_nothing(model, tmp_path):

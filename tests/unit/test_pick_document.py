@@ -7,8 +7,8 @@ import pytest
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click, read_points
 from scenefuse.marks.lengths import read_ends
-from scenefuse.pick.clicks import with_end, with_length
 from scenefuse.pick.document import Document, FileChanged
+from scenefuse.pick.edits import with_length, with_point
 
 HEAD, FOOT = Click("inside", "Füße 2.jpg", 10.5, 20), Click("outside", "a b.jpg", 3, 4)
 TEXT = "label\tphoto\tx_px\ty_px\n"
@@ -21,6 +21,18 @@ def path(tmp_path):
 
 def names(path):
     return sorted(file.name for file in path.parent.iterdir())
+
+
+def test_undo_and_redo_go_back_and_forth_until_a_new_change(path):
+    document = Document(path, "labels")
+    document.change((HEAD,))
+    document.change((HEAD, FOOT))
+    document.change((HEAD, FOOT))  # no change
+    assert document.undo() and document.rows == (HEAD,) and document.undo() and not document.undo()
+    assert document.undo(forward=True) and document.undo(forward=True) and document.rows == (HEAD, FOOT)
+    assert document.undo() and document.rows == (HEAD,)
+    document.change(())
+    assert not document.undo(forward=True) and document.rows == ()
 
 
 def test_saved_clicks_are_read_back_by_the_page_and_by_the_workflow(path):
@@ -36,7 +48,7 @@ def test_saved_clicks_are_read_back_by_the_page_and_by_the_workflow(path):
 
 def test_known_lengths_are_read_back_by_the_page_and_by_the_workflow_one_end_or_two(path):
     document = Document(path, "lengths")
-    first = with_end((), with_length((), "north door 2.05")[1][0], "a b.jpg", 3, 4, {"a b.jpg": (9, 9)})
+    first = with_point((), with_length((), "north door 2.05")[1][0], "a b.jpg", 3, 4, {"a b.jpg": (9, 9)})
     document.change(first)
     document.save()
     again = Document(path, "lengths")
@@ -218,16 +230,12 @@ def test_a_draft_without_rows_means_that_all_were_removed(path):
     assert Document(path, "labels").rows == () and Document(path, "labels").unsaved
 
 
-def test_a_draft_that_cannot_be_read_changes_nothing_and_stays(path):
+def test_a_draft_that_cannot_be_read_changes_nothing_and_is_kept(path):
     path.write_text(f"{TEXT}outside\ta b.jpg\t3\t4\n")
     (path.parent / "prompts.unsaved.tsv").write_text("mangled\n")
     document = Document(path, "labels")
-    assert document.rows == (FOOT,) and not document.unsaved and "left where they are" in document.notes[0]
-    document.change((FOOT, HEAD))
-    document.save()
-    assert names(path) == ["prompts.tsv", "prompts.unsaved.tsv"]
-    document.change((FOOT,))
-    document.keep_draft()
+    assert document.rows == (FOOT,) and not document.unsaved and "prompts.unsaved.kept-1.tsv" in document.notes[0]
+    assert names(path) == ["prompts.tsv", "prompts.unsaved.kept-1.tsv"]
     assert (path.parent / "prompts.unsaved.kept-1.tsv").read_text() == "mangled\n"
 
 

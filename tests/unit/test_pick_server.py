@@ -8,7 +8,7 @@ from fastapi.testclient import TestClient
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from support.user_project import Project
 
-from scenefuse.pick.server import Guard, add_pictures
+from scenefuse.pick.pick import Guard, add_pictures
 from scenefuse.pick.session import Session
 
 TOKEN, PORT = "a-secret", 8123
@@ -44,7 +44,7 @@ def client(session):
 
 
 def enter(client):
-    assert client.get(f"/overlay/0?token={TOKEN}").status_code == 404
+    assert client.get(f"/nothing?token={TOKEN}").status_code == 404
 
 
 @pytest.mark.parametrize(
@@ -92,13 +92,11 @@ def test_a_websocket_needs_the_cookie_and_its_own_site(client):
         "/tile/0//etc/passwd",
         "/secret.jpg",
         "/close/0.jpg",
-        "/overlay/..%2fsecret.jpg",
         "/thumbnail/0/-1",
         "/thumbnail/0/4",
         "/thumbnail/3/0",
         "/thumbnail/-1/0",
         "/tile/0/0/0/1/0",
-        "/overlay/1",
     ],
 )
 def test_no_address_leads_out_of_the_photos(client, address):
@@ -108,7 +106,7 @@ def test_no_address_leads_out_of_the_photos(client, address):
 
 def test_photos_with_spaces_and_umlauts_are_served(client, session):
     enter(client)
-    number = list(session.boards[0].source.pictures).index("Füße und Kopf.jpg")
+    number = list(session.tables[0].pictures).index("Füße und Kopf.jpg")
     tile = client.get(f"/tile/0/{number}/2/2/1")
     assert tile.status_code == 200 and cv2.imdecode(np.frombuffer(tile.content, np.uint8), 1).shape == (256, 256, 3)
     thumbnail = client.get(f"/thumbnail/0/{number}")
@@ -117,12 +115,6 @@ def test_photos_with_spaces_and_umlauts_are_served(client, session):
 
 def test_a_photo_that_vanished_is_not_found(client, session):
     enter(client)
-    for picture in session.boards[0].source.pictures.values():
+    for picture in session.tables[0].pictures.values():
         picture.path.unlink()
     assert client.get("/thumbnail/0/0").status_code == client.get("/tile/0/0/0/0/0").status_code == 404
-
-
-def test_overlays_are_served_by_number(client, session):
-    enter(client)
-    number = session.overlay(b"a picture")
-    assert client.get(f"/overlay/{number}").content == b"a picture"

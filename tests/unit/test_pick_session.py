@@ -11,10 +11,10 @@ from scenefuse.core.stage import StageError, write_json
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.clicks import Click, label_name
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
-from scenefuse.pick.next_run import as_text, command
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.segmenter import Segmenter
-from scenefuse.pick.session import Session, thumbnails_left
+from scenefuse.pick.session import Session
+from scenefuse.pick.workflow import as_text, command
 
 GRABCUT = {"method": "grabcut", "max_click_residual_px": 4}
 
@@ -33,10 +33,10 @@ def opened(project, name="shed"):
 
 
 def test_an_object_has_its_prompts_and_the_marks_in_its_scene(yard):
-    first, second, _ = opened(yard).boards
-    assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "clicks.tsv")
-    assert list(first.source.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.source.pictures) == 3
-    assert first.source.sizes["0.jpg"] == (64, 48) and first.source.listed and first.cameras is None
+    first, second, _ = opened(yard).tables
+    assert (first.document.path.name, second.document.path.name) == ("prompts.tsv", "clicks.tsv")
+    assert list(first.pictures) == [f"{k}.jpg" for k in range(5)] and len(second.pictures) == 3
+    assert first.sizes["0.jpg"] == (64, 48) and first.listed and first.cameras is None
 
 
 def test_of_several_settings_files_the_last_one_counts(yard):
@@ -48,16 +48,16 @@ def test_of_several_settings_files_the_last_one_counts(yard):
 
 def test_masks_of_one_s_own_are_said_to_count_in_the_place_of_clicks(yard):
     yard.objects = HEADER + "shed\tyard\tclose\tclicks.tsv\tprompts.tsv\tmy masks\t\n"
-    assert any("the column masks is filled (my masks)" in note for note in opened(yard).boards[0].notes)
+    assert any("the column masks is filled (my masks)" in note for note in opened(yard).tables[0].notes)
 
 
 def test_a_photo_without_a_mask_cannot_be_accepted_and_clicks_left_out_are_said(yard):
     report = {"dropped": {"0.jpg": "too small"}, "per_photo": {"0.jpg": {"area": 0.0, "agreement": 0.1}}}
     report |= {"clicks_left_out": {"value": ["the click inside is off"]}, "notes": {"value": []}}
     write_json(yard.path / "results/objects/shed/masks.json", report)
-    carried = opened(yard).carried
-    carried.accept("0.jpg")
-    assert not carried.is_accepted("0.jpg") and carried.notes == ["the click inside is off"]
+    masks = opened(yard).masks
+    masks.accept("0.jpg")
+    assert not masks.is_accepted("0.jpg") and masks.notes == ["the click inside is off"]
 
 
 def test_photos_say_what_the_workflow_makes_of_them(yard):
@@ -69,28 +69,28 @@ def test_photos_say_what_the_workflow_makes_of_them(yard):
     assert [session.standing(0, f"{k}.jpg") for k in range(3)] == [("left out", True), ("0.93", False), ("", False)]
     (yard.path / "results/objects/shed/masks").mkdir()
     cv2.imwrite(str(yard.path / "results/objects/shed/masks/1.png"), np.zeros((48, 64), np.uint8))
-    session.carried.accept("1.jpg")
+    session.masks.accept("1.jpg")
     assert session.standing(0, "1.jpg") == ("0.93 ✓", False) and session.standing(1, "1.jpg") == ("", False)
-    session.boards[0].cameras = {"1.jpg"}
+    session.tables[0].cameras = {"1.jpg"}
     assert [session.standing(0, f"{k}.jpg")[0] for k in range(3)] == ["no camera", "0.93 ✓", "no camera"]
 
 
 def test_a_photo_that_cannot_be_read_does_not_keep_the_others_waiting(yard):
     session = opened(yard)
     (yard.path / "close/2.jpg").write_bytes(b"cut")
-    session._make_thumbnails()
-    assert thumbnails_left(session, 0) == 0 and any("2.jpg" in note for note in session.boards[0].notes)
+    session.make_thumbnails()
+    assert session.thumbnails_left(0) == 0 and any("2.jpg" in note for note in session.tables[0].notes)
 
 
 def test_without_cells_tables_lie_beside_the_table_of_objects_and_it_is_said(yard):
     yard.objects = HEADER + "shed\tyard\tclose\t\t\t\t\n"
-    boards = opened(yard).boards
-    assert [board.source.path.name for board in boards] == [
+    tables = opened(yard).tables
+    assert [table.document.path.name for table in tables] == [
         "shed_prompts.tsv",
         "shed_fiducials.tsv",
         "yard_lengths.tsv",
     ]
-    assert not any(board.source.listed for board in boards)
+    assert not any(table.listed for table in tables)
 
 
 def test_known_lengths_are_clicked_in_the_scene_s_photos(yard):
@@ -98,25 +98,25 @@ def test_known_lengths_are_clicked_in_the_scene_s_photos(yard):
         "length\tmetres\tend\tphoto\tx_px\ty_px\nbar\t1.5\tleft\t0.jpg\t10\t20\nbar\t1.5\tright\t1.jpg\t30\t20\n"
     )
     yard.scenes = "scene\tphotos\tlengths\nyard\tflight\tbars.tsv\n"
-    board = opened(yard).boards[2]
-    assert board.document.kind == "lengths" and board.source.listed and not board.document.trouble
-    assert [label_name(row.label) for row in board.document.rows] == ["bar, 1.5 m: left", "bar, 1.5 m: right"]
-    assert board.source.pictures.keys() == opened(yard).boards[1].source.pictures.keys()
+    table = opened(yard).tables[2]
+    assert table.document.kind == "lengths" and table.listed and not table.document.trouble
+    assert [label_name(row.label) for row in table.document.rows] == ["bar, 1.5 m: left", "bar, 1.5 m: right"]
+    assert table.pictures.keys() == opened(yard).tables[1].pictures.keys()
 
 
 def test_an_object_by_itself_has_known_lengths_in_its_own_photos(yard):
     yard.objects = "object\tphotos\tprompts\nshed\tclose\tprompts.tsv\n"
-    first, second = opened(yard).boards
-    assert (first.source.path.name, second.source.path.name) == ("prompts.tsv", "shed_lengths.tsv")
-    assert second.source.kind == "lengths" and second.source.of == "objects"
-    assert second.source.result.as_posix() == "results/objects/shed/sparse.json"
+    first, second = opened(yard).tables
+    assert (first.document.path.name, second.document.path.name) == ("prompts.tsv", "shed_lengths.tsv")
+    assert second.document.kind == "lengths" and second.of == "objects"
+    assert second.result.as_posix() == "results/objects/shed/sparse.json"
 
 
 def test_photos_have_the_names_that_the_workflow_gives_them(yard):
     (yard.path / "close/ring").mkdir()
     (yard.path / "close/0.jpg").rename(yard.path / "close/ring/0.jpg")
     yard.config["object"] = {"frames": {"frame_step": 2}}
-    assert list(opened(yard).boards[0].source.pictures) == ["1.jpg", "3.jpg", "ring_0.jpg"]
+    assert list(opened(yard).tables[0].pictures) == ["1.jpg", "3.jpg", "ring_0.jpg"]
 
 
 def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
@@ -129,7 +129,7 @@ def test_frames_of_a_video_are_clicked_in_the_video_s_pixels(yard):
     cv2.imwrite(str(frames / "frame_000003.jpg"), np.zeros((300, 400, 3), dtype=np.uint8))
     origin = {"frame_000003.jpg": {"frame": 3, "width": 1600, "height": 1200}}
     write_json(frames.parent / "photos.json", {"origin": {"value": origin, "unit": ""}})
-    picture = opened(yard).boards[0].source.pictures["frame_000003.jpg"]
+    picture = opened(yard).tables[0].pictures["frame_000003.jpg"]
     assert (picture.width, picture.height, picture.scale) == (1600, 1200, 0.25)
 
 
@@ -155,20 +155,20 @@ def test_an_object_without_photos_has_nothing_to_click_in(yard):
 
 def test_what_was_not_saved_is_kept_when_the_page_ends(yard):
     session = opened(yard)
-    session.boards[0].document.change((Click("inside", "0.jpg", 1, 2),))
+    session.tables[0].document.change((Click("inside", "0.jpg", 1, 2),))
     assert any("prompts.unsaved.tsv" in sentence for sentence in session.close())
-    assert opened(yard).boards[0].document.unsaved
+    assert opened(yard).tables[0].document.unsaved
 
 
 def test_results_are_noticed_when_they_come(yard):
     session = opened(yard)
-    assert not session.carried
+    assert not session.masks.agreement
     report = {"dropped": {}, "per_photo": {"0.jpg": {"area": 0.1, "agreement": 0.8}}}
     write_json(yard.path / "results/objects/shed/masks.json", report)
     session.read_results()
-    assert session.carried.agreement == {"0.jpg": 0.8}
+    assert session.masks.agreement == {"0.jpg": 0.8}
     (yard.path / "results/objects/shed/masks.json").write_text("{")
-    assert "cannot be read" in opened(yard).boards[0].notes[0]
+    assert "cannot be read" in opened(yard).masks.notes[0]
 
 
 @pytest.fixture
@@ -186,25 +186,25 @@ def test_clicks_give_the_mask_of_their_photo(ball):
     picture, mask = ball
     rows = tuple(Click("inside", "ball.png", 2 * x, 2 * y) for x, y in ((250, 120), (200, 220), (300, 220)))
     rows += (Click("outside", "ball.png", 1100, 700), Click("inside", "other.png", 3, 3))
-    found, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, rows)
+    found, notes = Segmenter(GRABCUT, 1600).mask(picture, rows)
     assert found.shape == mask.shape and mask_iou(found, mask) > 0.95 and notes == []
 
 
 def test_a_box_gives_a_mask_and_a_click_that_contradicts_it_is_counted(ball):
     picture, mask = ball
     box = (Click("box", "ball.png", 280, 140), Click("box", "ball.png", 720, 580))
-    found, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, box)
+    found, notes = Segmenter(GRABCUT, 1600).mask(picture, box)
     assert mask_iou(found, mask) > 0.95 and notes == []
     rows = (*box, Click("inside", "ball.png", 1100, 700))
-    _, notes = Segmenter(GRABCUT, 600, 1600).mask(picture, rows)
+    _, notes = Segmenter(GRABCUT, 1600).mask(picture, rows)
     assert any("1 click lies on the wrong side" in note for note in notes)
     alone = (Click("inside", "ball.png", 500, 360), Click("outside", "other.png", 3, 3))
-    assert any("click beside the object too" in note for note in Segmenter(GRABCUT, 600, 1600).mask(picture, alone)[1])
+    assert any("click beside the object too" in note for note in Segmenter(GRABCUT, 1600).mask(picture, alone)[1])
 
 
 def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path):
     paths = {"sam2_encoder": str(tmp_path / "no.ort"), "sam2_decoder": "no.onnx", "sam2_checkpoint": None}
-    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 600, 1600)
+    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "no.ort do not exist" in segmenter.trouble
 
@@ -213,7 +213,7 @@ def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_s
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
     settings = {"method": "auto", "sam2_encoder": ENCODER, "sam2_decoder": DECODER, "sam2_checkpoint": None}
-    segmenter = Segmenter(GRABCUT | settings, 600, 1600)
+    segmenter = Segmenter(GRABCUT | settings, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "No such file" in segmenter.trouble
     assert not list((tmp_path / "results/weights").iterdir())

@@ -1,6 +1,10 @@
-"""The masks that the workflow made, as overlays of the original photos, and which of them a person has accepted."""
+"""What the workflow makes of an object's tables: its masks over the original photos, and what it will run next."""
 
 import json
+import re
+import shlex
+import subprocess
+import sys
 from itertools import chain
 from pathlib import Path
 
@@ -8,19 +12,20 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from scenefuse.core.settings import ROOT
 from scenefuse.core.stage import StageError, read_json, write_json
 from scenefuse.photos.pictures import read_mask
 from scenefuse.photos.workspace import read_cameras
 from scenefuse.pick.document import digest
-from scenefuse.pick.photo_tiles import Picture
+from scenefuse.pick.photo_tiles import MASK_PX, Picture
 
 Mask = NDArray[np.bool_]
-OVERLAY_PX = 1200
-"""Longer side of an overlay."""
+# What `scenefuse run` reads by itself.
+OWN_SETTINGS = "config/config.yaml"
 
 
-class CarriedMasks:
-    """What the masks' stage left in an object's results.
+class WorkflowMasks:
+    """What the masks' stage left in an object's results, and which masks a person has accepted.
 
     Attributes:
         agreement: IoU with the visual hull's outline, by photo.
@@ -29,7 +34,7 @@ class CarriedMasks:
     """
 
     def __init__(self, results: Path, accepted: Path) -> None:
-        """Read the report of the masks, which need not be there.
+        """Read the report of the masks, which need not be there; a note says where it cannot be read.
 
         Args:
             results: folder of the object's results.
@@ -43,15 +48,16 @@ class CarriedMasks:
         self.notes: list[str] = []
         self._cameras: tuple[dict, dict] | None = None
         report = results / "masks.json"
-        if report.is_file():
+        if not report.is_file():
+            return
+        try:
             content = read_json(report)
-            self.dropped = content["dropped"]
-            said = [content[key]["value"] for key in ("clicks_left_out", "notes") if key in content]
+            said = (content[key]["value"] for key in ("clicks_left_out", "notes") if key in content)
             self.notes = list(chain.from_iterable(said))
+            self.dropped = content["dropped"]
             self.agreement = {name: entry["agreement"] for name, entry in content["per_photo"].items()}
-
-    def __bool__(self) -> bool:
-        return bool(self.agreement)
+        except (StageError, KeyError) as error:
+            self.notes = [f"the workflow's masks cannot be read: {error}"]
 
     def mask(self, picture: Picture) -> Mask | None:
         """(H, W) mask of a photo at overlay size, bent as its lens bends; None where there is none.
@@ -67,7 +73,7 @@ class CarriedMasks:
         bent, straight = (cameras.get(picture.name) for cameras in self._cameras)
         if bent is None or straight is None:
             return None
-        scale = min(1.0, OVERLAY_PX / max(bent.width, bent.height))
+        scale = min(1.0, MASK_PX / max(bent.width, bent.height))
         width, height = round(bent.width * scale), round(bent.height * scale)
         grid = (np.mgrid[0:height, 0:width][::-1].reshape(2, -1).T + 0.5) * [bent.width / width, bent.height / height]
         rays = np.asarray(bent.cam_from_img(grid))
@@ -82,10 +88,9 @@ class CarriedMasks:
 
     def accept(self, photo: str) -> None:
         """Note that a person has looked at a photo's mask, and that it is right; nothing where there is none."""
-        if not self.has_mask(photo):
-            return
-        self._known = _read_accepted(self._accepted) | {photo: self._digest(photo)}
-        write_json(self._accepted, self._known)
+        if self.has_mask(photo):
+            self._known = _read_accepted(self._accepted) | {photo: self._digest(photo)}
+            write_json(self._accepted, self._known)
 
     def is_accepted(self, photo: str) -> bool:
         """Whether a person has accepted the mask that the photo had when the results were read."""
@@ -107,9 +112,37 @@ def _read_accepted(path: Path) -> dict[str, str]:
         return {}
 
 
-def carried_masks(results: Path, accepted: Path) -> tuple[CarriedMasks, str]:
-    """The masks of an object's results, and why they cannot be shown; "" where they can."""
-    try:
-        return CarriedMasks(results, accepted), ""
-    except (StageError, KeyError) as error:
-        return CarriedMasks(Path("nowhere"), accepted), f"the results' masks cannot be read: {error}"
+def command(configfiles: tuple[Path, ...], target: str) -> list[str]:
+    """The command line that makes a target, as a person types it in the working directory."""
+    words = ["snakemake"]
+    if not Path("Snakefile").is_file():
+        words += ["--snakefile", str(ROOT / "Snakefile")]
+    if configfiles:
+        words += ["--configfile", *map(str, configfiles)]
+    return [*words, "--cores", "2", target]
+
+
+def as_text(words: list[str]) -> str:
+    """A command line of `command` to be pasted into a shell, by `scenefuse run` where the page is of `scenefuse
+    pick`."""
+    if Path(sys.argv[0]).name.startswith("scenefuse"):
+        shipped = ["--snakefile", str(ROOT / "Snakefile")]
+        own = ["--configfile", OWN_SETTINGS, "--cores"]
+        rest = words[3:] if words[1:3] == shipped else words[1:]
+        words = ["scenefuse", "run", *(rest[2:] if rest[:3] == own else rest)]
+    return shlex.join(words)
+
+
+def dry_run(words: list[str]) -> str:
+    """Which rules a command would run now, or why that cannot be said; nothing is run or locked."""
+    done = subprocess.run(
+        [sys.executable, "-m", *words, "--dry-run", "--nolock"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    if done.returncode:
+        return " ".join([line for line in done.stdout.splitlines() if line.strip()][-6:])
+    table = re.findall(r"^([a-z0-9_]+) +(\d+)$", done.stdout, re.MULTILINE)
+    jobs = [rule if count == "1" else f"{rule} ({count})" for rule, count in table if rule != "total"]
+    return f"Will run: {', '.join(jobs) or 'nothing'}."

@@ -1,0 +1,186 @@
+"""The tables of clicks of an object, and the photos to click in, by the settings and results of the workflow."""
+
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Literal
+
+from scenefuse.core.stage import StageError, read_json
+from scenefuse.marks.clicks import Kind
+from scenefuse.marks.project import Project
+from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
+from scenefuse.photos.photos import photo_names, without_copies
+from scenefuse.pick.document import Document
+from scenefuse.pick.edits import Sizes, problems
+from scenefuse.pick.expected_place import Cameras
+from scenefuse.pick.photo_tiles import Picture
+
+FEW_FEATURES = "Needed only where the photos of object and scene share too few features. "
+LENGTH = "Write the name and the metres of a length that you know, and click its two ends, each in two or more photos."
+# What to do, by the column that names the table and its kind.
+ADVICE: dict[tuple[str, Kind], str] = {
+    ("prompts", "labels"): "Click each part of the object, and beside it where something like it touches it. One photo"
+    " is enough to begin with.",
+    ("prompts", "points"): "Mark at least four points on the object that span it, each in two or more photos.",
+    ("fiducials", "labels"): f"{FEW_FEATURES}Click the object's ends, top and foot in one photo, and what it touches as"
+    " outside.",
+    ("fiducials", "points"): f"{FEW_FEATURES}Mark at least four points that bound the object, each in two or more"
+    " photos.",
+    ("lengths", "lengths"): f"Needed only for metres where there are neither GPS nor control points. {LENGTH}",
+}
+# Clicks inside that the workflow needs.
+MIN_INSIDE = {"prompts": 1, "fiducials": 3}
+
+
+class Table:
+    """A table that can be clicked, with the photos to click in.
+
+    Attributes:
+        of: the user's table that names it in a column: of objects, or of scenes.
+        column: that column.
+        title: for the page.
+        pictures: the photos, by name.
+        listed: whether the column names the table; a new one lies beside the user's table.
+        result: what the workflow makes of it.
+        document: its clicks.
+        cameras: of its photos, once the workflow has them; None before.
+        notes: what a person should know, a sentence each.
+    """
+
+    def __init__(
+        self,
+        project: Project,
+        of: Literal["objects", "scenes"],
+        name: str,
+        column: str,
+        *,
+        title: str,
+        pictures: dict[str, Picture],
+        models: tuple[Path, ...],
+        result: Path,
+    ) -> None:
+        """Read the table, which need not exist.
+
+        Args:
+            project: the user's.
+            of, column, title, pictures, result: see the class.
+            name: of the object or scene.
+            models: folders where a COLMAP model of the photos may lie, the best first.
+        """
+        self.of, self.column, self.title, self.pictures, self.result = of, column, title, pictures, result
+        row = (project.objects if of == "objects" else project.scenes)[name]
+        self.listed = bool(row.get(column))
+        path = Path(row[column] if self.listed else Path(project.settings[of]).parent / f"{name}_{column}.tsv")
+        self.document = Document(path, "lengths" if column == "lengths" else "labels", pictures)
+        self.notes = list(self.document.notes)
+        self.models = models
+        self.read_cameras()
+
+    @property
+    def sizes(self) -> Sizes:
+        """Photo name -> (width, height)."""
+        return {name: (p.width, p.height) for name, p in self.pictures.items()}
+
+    @property
+    def advice(self) -> str:
+        """What to do."""
+        return ADVICE[self.column, self.document.kind]
+
+    def problems(self) -> list[str]:
+        """What the workflow would refuse or leave out, a sentence each."""
+        return problems(self.document.rows, self.document.kind, self.sizes, MIN_INSIDE.get(self.column, 1))
+
+    def read_cameras(self) -> None:
+        """Read the cameras that the workflow has found by now."""
+        self.cameras: Cameras | None = None
+        model = next((folder for folder in self.models if folder.is_dir()), None)
+        if model is not None:
+            try:
+                self.cameras = Cameras(model, self.sizes)
+            except StageError as error:
+                self.notes.append(str(error))
+
+
+def tables_of(project: Project, name: str) -> list[Table]:
+    """The tables of an object: its prompts, and fiducials in the scene's photos where it has any; known lengths in
+    these, or in the photos of an object by itself.
+
+    Raises:
+        StageError: there is no such object, or no photos.
+    """
+    if name not in project.objects:
+        known = ", ".join(project.objects) or "none"
+        raise StageError(f"unknown object '{name}'; {project.settings['objects']} lists: {known}")
+    found = [*_in_photos_of_object(project, name), *_in_photos_of_scene(project, name)]
+    if not found:
+        raise StageError(f"object '{name}' and its scene are clouds: there are no photos to click in")
+    return found
+
+
+def _in_photos_of_object(project: Project, name: str) -> Iterator[Table]:
+    row, results = project.objects[name], Path("results/objects") / name
+    if not row.get("photos"):
+        return
+    pictures = _object_pictures(Path(row["photos"]), results, project.of("object", name)["object"]["frames"])
+    where: dict[str, Any] = {"pictures": pictures, "models": (results / "sparse",)}
+    prompts = Table(project, "objects", name, "prompts", title="The object", result=results / "masks.png", **where)
+    if row.get("masks"):
+        prompts.listed = True
+        prompts.notes.append(f"the column masks is filled ({row['masks']}): these masks count, and no clicks")
+    yield prompts
+    if row.get("lengths") or not row.get("scene"):
+        made = results / "sparse.json"
+        yield Table(project, "objects", name, "lengths", title="Lengths on it", result=made, **where)
+
+
+def _in_photos_of_scene(project: Project, name: str) -> Iterator[Table]:
+    scene = project.objects[name].get("scene")
+    if not scene or not project.scenes[scene].get("photos"):
+        return
+    results = Path("results/scenes") / scene
+    source = Path(project.scenes[scene]["photos"])
+    # Those that the workflow turned upright are the same to a person.
+    pictures = _pictures((photo, source / photo) for photo in without_copies(source, photo_names(source))[0])
+    where: dict[str, Any] = {"pictures": pictures, "models": (results / "georeferenced", results / "sparse")}
+    made = Path("results/objects") / name / "fused.ply"
+    yield Table(project, "objects", name, "fiducials", title="In the scene", result=made, **where)
+    yield Table(project, "scenes", scene, "lengths", title="Known lengths", result=results / "residuals.tsv", **where)
+
+
+def _object_pictures(source: Path, results: Path, frames: dict[str, Any]) -> dict[str, Picture]:
+    """The photos around an object, or the frames of its video, by the names that the workflow gives them.
+
+    Args:
+        source: folder of photos, or video.
+        results: folder of the object's results.
+        frames: settings `object.frames`.
+
+    Raises:
+        StageError: there are no photos, one cannot be read, or a video has no frames yet.
+    """
+    if source.is_file():
+        return _video_pictures(source, results)
+    names, _ = without_copies(source, photo_names(source))
+    chosen = [names[k] for k in thin_out(len(names), frames["frame_step"], frames["max_frames"])]
+    return _pictures((frame_name(name), source / name) for name in chosen)
+
+
+def _video_pictures(video: Path, results: Path) -> dict[str, Picture]:
+    """The frames that were extracted. They may be smaller than the video's, whose pixels clicks are in."""
+    listed = results / "photos.json"
+    if not listed.is_file():
+        raise StageError(f"{video} is a video whose frames are not there yet; run: snakemake --cores 2 {listed}")
+    found = {}
+    for name, origin in read_json(listed)["origin"]["value"].items():
+        path = results / "frames" / name
+        scale = upright_size(path)[0] / origin["width"]
+        found[name] = Picture(name, path, origin["width"], origin["height"], scale)
+    return found
+
+
+def _pictures(files: Iterable[tuple[str, Path]]) -> dict[str, Picture]:
+    def picture(file: tuple[str, Path]) -> Picture:
+        return Picture(*file, *upright_size(file[1]))
+
+    with ThreadPoolExecutor() as pool:
+        return {found.name: found for found in pool.map(picture, files)}
