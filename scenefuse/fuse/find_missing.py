@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, voxel_downsample, write_cloud
+from scenefuse.cloud.clouds import Cloud, read_cloud, voxel_downsample, write_cloud
 from scenefuse.cloud.readers.columns import AT_ONCE
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
@@ -99,7 +99,7 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
         inputs, inputs.object_workspace, Sim3.from_matrix(np.array(value(fusion, "scene_from_object")))
     )
     cameras = masks or photos[0].views
-    near, around_it = _surroundings(inputs, obj, cameras)
+    near, around_it = _surroundings(inputs, obj, reach_of_stations(obj, cameras) if cameras else 0.0)
     missing = find_missing_surface(obj, near[around(near, obj)], photos, masks)
     up = np.array(value(read_json(inputs.crop_json), "level_from_scene"))[2]
     plan = plan_stations(missing, obj, around_it, cameras, up)
@@ -109,8 +109,6 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     rows = photo_rows(plan, cameras, up, scene_frame(georeference), gps_higher)
     _write_table(outputs.next_photos, rows)
     _write_geojson(outputs.geojson, rows)
-    if around_it is not near:
-        missing = replace(missing, notes=(*missing.notes, "points far from the object were thinned to plan stations"))
     higher = {row["station"] for row in rows if row["above_close_ups"] > 0}
     content = _report(missing, plan, unit) | {"stations_above_close_ups": quantity(len(higher), "")}
     content |= {"of": quantity("its surface" if masks else "what its own cloud holds", "")}
@@ -118,28 +116,22 @@ def find_missing(*, inputs: MissingInputs, outputs: MissingOutputs) -> None:
     write_json(outputs.report, content)
 
 
-def _surroundings(inputs: MissingInputs, obj: Cloud, cameras: list[View]) -> tuple[Cloud, Cloud]:
-    """The scene after fusion, with normals, beside the object; and as far as anything may stand in a station's way.
+def _surroundings(inputs: MissingInputs, obj: Cloud, reach: float) -> tuple[Cloud, Cloud]:
+    """The scene after fusion within a diagonal of the object, with normals; and the same as far as `reach`.
 
-    Of more than AT_ONCE points, those farther off are thinned to a quarter of a camera's clearance, without normals.
+    What is farther off is thinned to a quarter of a camera's clearance, without normals, part by part.
     """
     scene, changes, added = open_cloud(inputs.scene), read_changes(inputs.checked), added_by(inputs.fused)
-    low, high = (end(obj.points, axis=0) for end in (np.min, np.max))
-    beside, reach = obj.diagonal, reach_of_stations(obj, cameras) if cameras else 0.0
-    tiles = scene.touching(low - max(beside, reach), high + max(beside, reach))
-    if np.diff(scene.starts)[tiles].sum() <= AT_ONCE:
-        whole = with_normals(together(changes.left_of(*scene.read(tiles)), added))
-        return whole, whole
+    low, high, beside = obj.points.min(0), obj.points.max(0), obj.diagonal
     near = with_normals(together(changes.left_of(*scene.near(low - beside, high + beside)), added))
-    far = [Cloud(near.points)]
+    tiles, far = scene.touching(low - reach, high + reach), [near.points]
     for some in np.array_split(tiles, 1 + np.diff(scene.starts)[tiles].sum() // AT_ONCE):
         points = changes.left_of(*scene.read(some)).points
         outside = ((points < low - beside) | (points > high + beside)).any(1)
-        far.append(voxel_downsample(Cloud(points[outside]), CLEARANCE * obj.diagonal / 4))
-    around_it = concatenate(far)
-    normals = np.zeros((len(around_it), 3), np.float32)
+        far.append(voxel_downsample(Cloud(points[outside]), CLEARANCE * obj.diagonal / 4).points)
+    normals = np.zeros((sum(map(len, far)), 3), np.float32)
     normals[: len(near)] = near.normals
-    return near, replace(around_it, normals=normals)
+    return near, Cloud(np.concatenate(far), normals)
 
 
 def _in_scene(inputs: MissingInputs, workspace: Path, pose: Sim3) -> tuple[Cloud, tuple[Photos, Photos], list[View]]:

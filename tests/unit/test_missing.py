@@ -201,23 +201,6 @@ def test_the_stage_writes_cells_photos_and_shares(files):
     assert value(read_json(outputs.report), "of") == "what its own cloud holds"
 
 
-def test_of_a_large_scene_what_is_far_from_the_object_is_thinned(files, monkeypatch):
-    inputs, outputs = files
-    find_missing(inputs=inputs, outputs=outputs)
-    whole = read_json(outputs.report)
-    wide = np.random.default_rng(0).uniform([-50, -50, -9], [50, 50, -8.9], (30000, 3))
-    ground = Cloud(wide, np.tile(np.float32([0, 0, 1]), (len(wide), 1)))
-    own = read_cloud(inputs.scene)
-    write_cloud(inputs.scene, concatenate([own, ground[np.argsort(wide[:, 0])]]))
-    write_changes(inputs.fused.parent, own, own[:0])
-    for name, number in (("tiles.tiled_cloud.WHOLE", 2000), ("tiles.tiled_cloud.TILE", 500)):
-        monkeypatch.setattr(f"scenefuse.cloud.{name}", number)
-    monkeypatch.setattr("scenefuse.fuse.find_missing.AT_ONCE", 3000)
-    find_missing(inputs=inputs, outputs=outputs)
-    found = read_json(outputs.report)
-    assert value(found, "missing") == pytest.approx(value(whole, "missing"), abs=0.02) and value(found, "stations") > 0
-
-
 def test_of_an_unregistered_object_the_stage_writes_the_reason(files):
     inputs, outputs = files
     fusion = {"status": "unregistered", "reason": "too few points", "scene_from_object": None}

@@ -1,0 +1,118 @@
+"""Fusion's rules on a finished demo, in the folder that RESULTS names: its objects as they are, and each one spoilt.
+
+A spoilt object has noise of 1 % of its diagonal and a third of it moved by 10 %; the scene around it is the true
+surface, and the pose is right: whatever fusion changes there is harm.
+"""
+
+import os
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from completed_scene import bad_object, perfect_scene, read_case, scores
+from rules import Rule
+
+from scenefuse.cloud.clouds import Cloud, read_cloud
+from scenefuse.fuse import evidence, measure
+from scenefuse.fuse.modes import FusionSettings
+from scenefuse.fuse.write import together
+from scenefuse.geometry import photo_check, photo_kernel
+from scenefuse.geometry.photo_check import Matches, Photos, moved_photos, read_photos
+from scenefuse.photos.workspace import read_workspace
+
+RESULTS = Path(os.environ.get("RESULTS", "results"))
+OBJECTS = ("house", "balloon", "sculpture")
+TRIALS = 2 * len(OBJECTS)
+
+
+def constant(value: Any) -> Any:
+    """The constant `value`, whatever it is with the rule."""
+    return lambda before: value
+
+
+RULES = [
+    Rule("what photos see through goes", "scenefuse.fuse.compare.THROUGH_PHOTOS", constant(10**9)),
+    Rule("two photos see through, not one", "scenefuse.fuse.compare.THROUGH_PHOTOS", constant(1)),
+    Rule("a share of photos sees through", "scenefuse.fuse.compare.THROUGH_SHARE", constant(0.0)),
+    Rule("that share halved", "scenefuse.fuse.compare.THROUGH_SHARE", lambda share: share / 2),
+    Rule("that share doubled", "scenefuse.fuse.compare.THROUGH_SHARE", lambda share: 2 * share),
+    Rule("what no photo can see goes", "scenefuse.fuse.compare.CONFIRMING_PHOTOS", constant(10**9)),
+    Rule("margin halved", "scenefuse.fuse.compare.MARGIN", lambda margin: margin / 2),
+    Rule("margin doubled", "scenefuse.fuse.compare.MARGIN", lambda margin: 2 * margin),
+    Rule("same place: deviations halved", "scenefuse.fuse.compare.SAME_PLACE_DEVIATIONS", lambda n: n / 2),
+    Rule("same place: deviations doubled", "scenefuse.fuse.compare.SAME_PLACE_DEVIATIONS", lambda n: 2 * n),
+    Rule("the scene is better by a factor", "scenefuse.fuse.compare.BETTER_FACTOR", constant(1.0)),
+    Rule("that factor doubled", "scenefuse.fuse.compare.BETTER_FACTOR", lambda factor: 2 * factor),
+    Rule("roughness adds to the deviation", "scenefuse.fuse.compare._rougher", lambda f: lambda a, b, s: (0.0, 0.0)),
+    Rule("median deviation of neighbours", "scenefuse.fuse.compare._smooth", lambda f: lambda points, sd: sd),
+    Rule("holes of the object's surface", "scenefuse.fuse.compare._beside", lambda f: lambda a, b: np.zeros(len(a))),
+    Rule("most neighbours are measured", "scenefuse.fuse.measure.SUPPORT", constant(0.0)),
+    Rule("neighbours by the diagonal, not eight", "scenefuse.fuse.measure.MAX_NEIGHBOURS", constant(8)),
+    Rule("settling", "scenefuse.fuse.evidence.settle", lambda f: lambda *_: None),
+    Rule("the more certain one of both poses", "scenefuse.fuse.settle.MIN_MISPLACED", constant(0.0)),
+    Rule("the scale settles where it is certain", "scenefuse.fuse.settle.MAX_SPREAD", constant(0.0)),
+    Rule("photos of half the size", "scenefuse.geometry.photo_check.HALVINGS", constant(0)),
+    Rule("a deviation of 1.2 pixels at most", "scenefuse.geometry.photo_check.MAX_DEVIATION_PX", constant(np.inf)),
+    Rule("no other offset is better", "scenefuse.geometry.photo_check.MAX_DROP", constant(9.0)),
+    Rule("other references", "scenefuse.geometry.photo_kernel.REFERENCES", constant(1)),
+    Rule("weights by grey", "scenefuse.geometry.photo_kernel.GREY_FALL", constant(1e9)),
+]
+
+
+@lru_cache(maxsize=1)
+def _scene() -> Cloud:
+    return read_cloud(RESULTS / "scenes/demo/dense.ply")
+
+
+@lru_cache(maxsize=1)
+def _case(trial: int) -> tuple[Any, Cloud, Photos, Photos]:
+    """An object, placed, and the photos of both sides."""
+    case = read_case(RESULTS, OBJECTS[trial % len(OBJECTS)], _scene())
+    if trial >= len(OBJECTS):
+        case = perfect_scene(replace(case, object=bad_object(case)))
+    placed = case.object.transformed(case.pose)
+    own = read_photos(read_workspace(RESULTS / f"objects/{case.name}/undistorted"), case.object.points)
+    theirs = read_photos(read_workspace(RESULTS / "scenes/demo/undistorted"), placed.points)
+    return case, placed, moved_photos(own, case.pose), theirs
+
+
+_known: dict[Any, Matches] = {}
+
+
+def _matched(points: Any, normals: Any, photos: Photos) -> Matches:
+    """`match_in`, kept between rules that do not change it."""
+    key = points.tobytes(), photos.projections.tobytes()
+    if key not in _known:
+        _known[key] = photo_check.match_in(points, normals, photos)
+    return Matches(*(values.copy() for values in vars(_known[key]).values()))
+
+
+def evaluate(trial: int, rule: Rule | None) -> dict[str, Any]:
+    """F-scores of the completed scene at 0.25, 0.5 and 1 % of the diagonal, points added and taken away."""
+    changes_matching = rule is not None and ".geometry." in rule.where
+    if rule is None:
+        _known.clear()
+    _compile(photo_kernel.REFERENCES, photo_kernel.GREY_FALL)
+    measure.match_in = photo_check.match_in if changes_matching else _matched
+    case, placed, own, theirs = _case(trial)
+    fused, _ = evidence.fuse_by_evidence(placed, case.scene, own, theirs, FusionSettings(), case.uncertainty)
+    found = scores(case, together(fused.kept, fused.added))
+    return {
+        "kind": case.name + (", spoilt" if trial >= len(OBJECTS) else ""),
+        **{f"f_{end}": found[f"f_score_{end}"] for end in ("025pct", "05pct", "1pct")},
+        "added": len(fused.added),
+        "removed": len(fused.removed),
+    }
+
+
+_compiled: list[tuple[float, ...]] = [(photo_kernel.REFERENCES, photo_kernel.GREY_FALL)]
+
+
+def _compile(*constants: float) -> None:
+    """Compile the kernel again where constants have changed."""
+    if constants != _compiled[-1]:
+        for name in ("_suitability", "_choose", "_reference_patch", "_match", "_next_reference", "match_points"):
+            getattr(photo_kernel, name).recompile()
+        _compiled.append(constants)
