@@ -14,8 +14,8 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
+from scenefuse.geometry.depth_test import Visibility, see
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_DROP, MIN_MATCH, Matches
-from scenefuse.geometry.visibility import Visibility, see
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]

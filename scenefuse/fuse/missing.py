@@ -15,8 +15,8 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing, voxel_downsample
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import MARGIN, THROUGH_PHOTOS
+from scenefuse.geometry.depth_test import see, shown_in
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
-from scenefuse.geometry.visibility import see, shown_in
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.photos.workspace import View
 

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.transforms import Array, look_at, rotation_between
 from scenefuse.fuse.missing import CONTRADICTED, SPARSEST, UNTEXTURED, Missing
-from scenefuse.geometry.visibility import shown_in
+from scenefuse.geometry.depth_test import shown_in
 from scenefuse.photos.workspace import View
 
 # Directions that are tried, spread evenly over a sphere around the object, at these distances, in those of its

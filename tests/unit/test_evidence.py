@@ -24,8 +24,8 @@ from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence
 from scenefuse.fuse.measure import FIELDS, MEASURED, NERF_ONLY, STEREO_ONLY, Measured, with_pose_uncertainty
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.settle import settle
+from scenefuse.geometry.depth_test import Visibility
 from scenefuse.geometry.photo_check import Matches, moved_photos, pack
-from scenefuse.geometry.visibility import Visibility
 
 NOBODY = pack([])
 

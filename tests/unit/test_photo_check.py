@@ -9,8 +9,8 @@ from support.photographed_plane import BLANK, photographs
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry import photo_check
+from scenefuse.geometry.depth_test import see
 from scenefuse.geometry.photo_check import match_in, moved_photos, pack, read_photos
-from scenefuse.geometry.visibility import see
 from scenefuse.photos.workspace import Workspace
 
 UP = np.array([0.0, 0, 1])
