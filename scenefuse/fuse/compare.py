@@ -14,7 +14,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
-from scenefuse.geometry.depth_test import Visibility, see
+from scenefuse.geometry.depth_test import see
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_DROP, MIN_MATCH, Matches
 from scenefuse.photos.workspace import View
 
@@ -30,11 +30,9 @@ REASONS = {
 }
 # Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
 MARGIN = 0.01
-# Photos that must see through a point, and the share of those that it is open to, where it is not measured: a surface
-# that is wrong itself lies behind good points in some photos; a point that is not there has surfaces behind it in many.
+# Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
+# behind good points in some photos; a point that is not there has surfaces behind it in many.
 THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
-# A measured point that more than this share of the compared photos confirm is not seen through.
-SAFE_SHARE = 0.5
 # Steps along the ray (about a pixel) that the object's pose may be off for its photos to say that they match a single
 # point of the scene elsewhere, and the share of what the scene measured beyond which the pose is off after all.
 MAX_POSE_STEPS, MAX_ELSEWHERE_SHARE = 0.5, 0.1
@@ -60,7 +58,7 @@ class Compared:
 
     Attributes:
         added: (N,) of the object's points that come into the scene.
-        contradicted: (N,) of the object's points that photos see through.
+        contradicted: (N,) of the object's points that are not measured, those that photos see through.
         reason: (M,) uint8 of the scene's points: KEPT, or why it is taken away.
     """
 
@@ -88,36 +86,24 @@ def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], 
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= CONFIRMING_PHOTOS)] = ENCLOSED
     reason[elsewhere & (reason == KEPT)] = ELSEWHERE
-    reason[is_seen_through(seen, scene.matches, scene.surface)] = SEEN_THROUGH
+    # What is measured stays: all photos of a pot before a wall have the wall behind it.
+    is_open = seen.in_view - seen.hidden
+    through = seen.through >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * is_open)
+    reason[through & ~scene.surface] = SEEN_THROUGH
 
     left = scene.surface & (reason == KEPT)
     both = concatenate([surface, scene.cloud[left]])
     behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
-    through = is_seen_through(behind, obj.matches, obj.surface)
-    contradicted = np.where(obj.surface, through, behind.through >= THROUGH_PHOTOS)
-    added = obj.surface & ~contradicted
+    contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
-    worse, better = better_measured(replace(obj, surface=added), replace(scene, surface=left), diagonal, share)
+    worse, better = better_measured(obj, replace(scene, surface=left), diagonal, share)
     reason[worse & (reason == KEPT)] = REPLACED
-    added &= ~better
+    added = obj.surface & ~better
     replaced = np.flatnonzero(left & (reason == REPLACED))
     stays = concatenate([obj.cloud[added], scene.cloud[reason == KEPT]])
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
     reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = KEPT
     return Compared(added, contradicted, reason)
-
-
-def is_seen_through(seen: Visibility, matches: Matches, measured: Mask) -> Mask:
-    """(N,) points where photos see a surface behind them: enough of those they are open to; of measured ones, a larger
-    share than confirms them.
-
-    All photos are tested against a surface, only the best are matched: their numbers cannot be compared. A measured
-    point that most of the compared photos confirm stays: all photos of a pot before a wall have the wall behind it.
-    """
-    confirming = matches.photos / (matches.tested + 1.0)  # the reference is among both
-    least = np.where(measured, confirming, THROUGH_SHARE) * (seen.in_view - seen.hidden)
-    least = np.where(measured & (confirming > SAFE_SHARE), np.inf, least)
-    return np.asarray(seen.through >= np.maximum(THROUGH_PHOTOS, least))
 
 
 def matched_elsewhere(across: Matches, measured: Mask, pose_error: float) -> Mask:

@@ -48,7 +48,7 @@ class Checked:
         moved: RMS distance of that, over the object's diagonal; None where it could not be settled.
         obj: the object's points, moved, with the fields of evidence.
         added: (N,) of the object's points that come into the scene.
-        contradicted: (N,) of the object's points that photos see through.
+        contradicted: (N,) of the object's points that are not measured, those that photos see through.
         scene: the scene's points around it, with the fields of evidence.
         reason: (M,) uint8 of the scene's points: KEPT, or why it is taken away.
         notes: what a user should know.
@@ -172,9 +172,9 @@ def _photo_notes(obj_photos: Photos, scene_photos: Photos) -> list[str]:
 def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[str, Any]:
     """What photos say of both sides' points; without `evidence`, only what was taken away.
 
-    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added, better in the scene, or
-    contradicted. Of the others, `object_unasked` lie where fewer than three photos could be compared. `added_photos`
-    says how many photos confirm the measured points that were added.
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Among
+    the others photos see through `object_contradicted`; `object_unasked` lie where fewer than three could be compared.
+    `added_photos` is how many photos confirm the measured points that were added.
     """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
     content = {"scene_removed": quantity(removed, "points")}
@@ -187,8 +187,7 @@ def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[st
         "object_measured": measured,
         "object_nerf_only": fields["evidence"] == NERF_ONLY,
         "object_contradicted": checked.contradicted,
-        "object_measured_contradicted": measured & checked.contradicted,
-        "object_better_in_scene": measured & ~checked.contradicted & ~checked.added,
+        "object_better_in_scene": measured & ~checked.added,
         "object_added": checked.added,
         "object_unasked": ~measured & np.isnan(fields["match"]),
         "scene_measured": of_scene,
