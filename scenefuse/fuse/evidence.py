@@ -172,8 +172,8 @@ def _photo_notes(obj_photos: Photos, scene_photos: Photos) -> list[str]:
 def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[str, Any]:
     """What photos say of both sides' points; without `evidence`, only what was taken away.
 
-    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Among
-    the others photos see through `object_contradicted`; `object_unasked` lie where fewer than three could be compared.
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Photos
+    see through `object_contradicted` of the others; `object_unasked` of them lie where fewer than three could be compared.
     `added_photos` is how many photos confirm the measured points that were added.
     """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
