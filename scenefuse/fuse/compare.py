@@ -1,7 +1,7 @@
 """Compare: the points of an object and of the scene around it against each other, and what goes and why (F4).
 
-Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through, what
-none of them can see and what the object's photos match elsewhere goes; where both sides measured a place, one stays.
+Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through and
+what none of them can see goes; where both sides measured a place, one stays.
 """
 
 from dataclasses import dataclass, replace
@@ -15,27 +15,23 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
 from scenefuse.geometry.depth_test import see
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, MAX_DROP, MIN_MATCH, Matches
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
 
-KEPT, SEEN_THROUGH, ENCLOSED, REPLACED, ELSEWHERE = 0, 1, 2, 3, 4
+KEPT, SEEN_THROUGH, ENCLOSED, REPLACED = 0, 1, 2, 3
 """What becomes of a point of the scene, field `reason` of those taken away."""
 REASONS = {
     SEEN_THROUGH: "photos see a surface behind it",
     ENCLOSED: "no photo can see it: a measured surface stands before it in all",
     REPLACED: "the object measured the place better",
-    ELSEWHERE: "the object's photos match clearly better before or behind it",
 }
 # Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
 MARGIN = 0.01
 # Photos that must see through a point, and the share of those that it is open to: a surface that is wrong itself lies
 # behind good points in some photos; a point that is not there has surfaces behind it in many.
 THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
-# Steps along the ray (about a pixel) that the object's pose may be off for its photos to say that they match a single
-# point of the scene elsewhere, and the share of what the scene measured beyond which the pose is off after all.
-MAX_POSE_STEPS, MAX_ELSEWHERE_SHARE = 0.5, 0.1
 # Points of both sides show the same place within so many of their common standard deviations, or so many spacings of
 # the sparser side where that is more; never farther than this share of the diagonal.
 SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS, MAX_SAME_PLACE = 5.0, 1.5, 0.02
@@ -67,7 +63,7 @@ class Compared:
     reason: NDArray[np.uint8]
 
 
-def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], share: float = 1.0) -> Compared:
+def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.0) -> Compared:
     """Decide which points of both sides stay.
 
     Measured points are the surface that hides and is seen. What the scene measured goes only where something is left
@@ -76,7 +72,6 @@ def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], 
     Args:
         obj: the object where it settled in the scene.
         scene: the scene's points around it, measured by the photos of both sides.
-        elsewhere: (M,) of the scene's points, see `matched_elsewhere`.
         views: the photos of both sides.
         share: of the scene's points there that are given.
     """
@@ -85,7 +80,6 @@ def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], 
     seen = see(scene.cloud.points, surface, views, spacing(surface.points), MARGIN * diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
     reason[(seen.hidden == seen.in_view) & (seen.in_view >= CONFIRMING_PHOTOS)] = ENCLOSED
-    reason[elsewhere & (reason == KEPT)] = ELSEWHERE
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
     through = seen.through >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * is_open)
@@ -104,23 +98,6 @@ def compare(obj: Measured, scene: Measured, elsewhere: Mask, views: list[View], 
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
     reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = KEPT
     return Compared(added, contradicted, reason)
-
-
-def matched_elsewhere(across: Matches, measured: Mask, pose_error: float) -> Mask:
-    """(N,) points of the scene that the object's photos match clearly better elsewhere along the ray.
-
-    None where the object's pose is uncertain by more than half a pixel, or where that holds for so many that it is off.
-
-    Args:
-        across: matches of the scene's points in the object's photos.
-        measured: (N,) points that the scene's own photos measured.
-        pose_error: how far the object's pose may be off, unit of the points.
-    """
-    better = (across.best >= MIN_MATCH) & (across.best - across.match > MAX_DROP)
-    found = measured & better & (across.photos < CONFIRMING_PHOTOS)
-    both = found | (measured & across.measured)
-    certain = both.any() and pose_error <= MAX_POSE_STEPS * np.median(across.step[both])
-    return found if certain and found.sum() <= MAX_ELSEWHERE_SHARE * both.sum() else np.zeros_like(found)
 
 
 def better_measured(obj: Measured, scene: Measured, diagonal: float, share: float) -> tuple[Mask, Mask]:

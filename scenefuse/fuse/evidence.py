@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing
 from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse.compare import KEPT, REASONS, compare, gaps, matched_elsewhere
+from scenefuse.fuse.compare import KEPT, REASONS, compare, gaps
 from scenefuse.fuse.measure import (
     MEASURED,
     NERF_ONLY,
@@ -135,11 +135,8 @@ def check(
         notes.append("the object stays where the registration put it: that is more certain than what the surfaces say")
     mine, obj_photos = mine.moved(settled), moved_photos(obj_photos, settled)
 
-    own = theirs.matches.measured
-    theirs, across = measure_again(theirs, obj_photos, diagonal)
-    elsewhere = matched_elsewhere(across, own, np.inf if certain is None else certain * diagonal)
-    views = obj_photos.views + scene_photos.views
-    decided = compare(mine, theirs, elsewhere, views, len(chosen) / max(len(scene), 1))
+    theirs = measure_again(theirs, obj_photos, diagonal)
+    decided = compare(mine, theirs, obj_photos.views + scene_photos.views, len(chosen) / max(len(scene), 1))
     added, reason = decided.added, decided.reason
     if nerf_only:
         unconfirmed = ~mine.surface & ~decided.contradicted
@@ -172,8 +169,8 @@ def _photo_notes(obj_photos: Photos, scene_photos: Photos) -> list[str]:
 def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[str, Any]:
     """What photos say of both sides' points; without `evidence`, only what was taken away.
 
-    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Photos
-    see through `object_contradicted` of the others; `object_unasked` of them lie where fewer than three could be compared.
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Of
+    the others, photos see through `object_contradicted`; fewer than three could be compared at `object_unasked`.
     `added_photos` is how many photos confirm the measured points that were added.
     """
     removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}

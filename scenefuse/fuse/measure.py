@@ -49,16 +49,16 @@ def measure(cloud: Cloud, photos: Photos, diagonal: float) -> Measured:
     return Measured(cloud, matches, supported(cloud.points, matches.measured, diagonal))
 
 
-def measure_again(known: Measured, photos: Photos, diagonal: float) -> tuple[Measured, Matches]:
-    """The same cloud by further photos: of each point what those say that confirm it more often, and the smaller
-    standard deviation; and its matches in the further photos alone."""
+def measure_again(known: Measured, photos: Photos, diagonal: float) -> Measured:
+    """The same cloud by further photos: each point has the matches of the photos that confirm it more often, and the
+    smaller standard deviation."""
     one, two = known.matches, match_in(known.cloud.points, known.cloud.normals, photos)
     more = two.photos > one.photos
     best = Matches(**{
         name: np.where(more, getattr(two, name), values) for name, values in vars(one).items()
     } | {"match": np.maximum(one.match, two.match), "deviation": np.minimum(one.deviation, two.deviation)})  # fmt: skip
     surface = supported(known.cloud.points, one.measured | two.measured, diagonal)
-    return Measured(known.cloud, best, surface), two
+    return Measured(known.cloud, best, surface)
 
 
 def supported(points: Array, measured: NDArray[np.bool_], diagonal: float) -> NDArray[np.bool_]:

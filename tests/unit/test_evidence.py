@@ -11,13 +11,11 @@ from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse import compare, evidence
 from scenefuse.fuse.compare import (
-    ELSEWHERE,
     ENCLOSED,
     KEPT,
     REPLACED,
     SEEN_THROUGH,
     better_measured,
-    matched_elsewhere,
 )
 from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence
 from scenefuse.fuse.measure import FIELDS, MEASURED, NERF_ONLY, STEREO_ONLY, Measured, with_pose_uncertainty
@@ -93,26 +91,6 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     last = np.arange(len(obj)) >= len(obj) - len(floating)
     last &= np.abs(obj.points[:, 1]) < 0.6
     assert not found.added[last].any() and found.contradicted[last].all()
-
-
-def test_what_close_ups_match_elsewhere_goes_unless_that_is_said_of_many(near, far, monkeypatch):
-    count = 40
-    match, best, photos = np.full(count, 0.9), np.full(count, 0.95), np.full(count, 6)
-    # Clearly better elsewhere; so, but confirmed; no better; nowhere good; not measured by the scene.
-    match[:5], best[:5], photos[:5] = [0.5, 0.5, 0.9, 0.2, 0.5], [0.9, 0.9, 0.95, 0.5, 0.9], [1, 3, 1, 0, 1]
-    measured = np.arange(count) != 4
-    zeros = np.zeros(count)
-    across = Matches(match, best, photos, np.full(count, 9), zeros, zeros, np.ones(count))
-    assert np.flatnonzero(matched_elsewhere(across, measured, 0.4)).tolist() == [0]
-    assert not matched_elsewhere(across, measured, 0.6).any()
-    across.match[10:20], across.photos[10:20] = 0.5, 1
-    assert not matched_elsewhere(across, measured, 0.4).any()
-
-    obj, scene = sheet(-0.8, -0.2, 0.03), sheet(-0.8, 0.8, 0.06)
-    beyond = scene.points[:, 0] > 0.5
-    monkeypatch.setattr(evidence, "matched_elsewhere", lambda *_: beyond)
-    found = check(obj, scene, near, far, nerf_only=False)
-    assert ((found.reason == ELSEWHERE) == beyond).all()
 
 
 def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(near, far, monkeypatch):
