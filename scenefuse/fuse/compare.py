@@ -1,10 +1,10 @@
 """Compare: the points of an object and of the scene around it against each other, and what goes and why (F4).
 
-Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through and
-what none of them can see goes; where both sides measured a place, one stays.
+Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through goes;
+where both sides measured a place, one stays.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,14 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.measure import MIN_NEIGHBOURS, Measured
 from scenefuse.geometry.depth_test import see
-from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
 
-KEPT, SEEN_THROUGH, ENCLOSED, REPLACED = 0, 1, 2, 3
+KEPT, SEEN_THROUGH, REPLACED = 0, 1, 3
 """What becomes of a point of the scene, field `reason` of those taken away."""
 REASONS = {
     SEEN_THROUGH: "photos see a surface behind it",
-    ENCLOSED: "no photo can see it: a measured surface stands before it in all",
     REPLACED: "the object measured the place better",
 }
 # Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
@@ -79,21 +77,19 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     surface = obj.cloud[obj.surface]
     seen = see(scene.cloud.points, surface, views, spacing(surface.points), MARGIN * diagonal)
     reason = np.zeros(len(scene.cloud), np.uint8)
-    reason[(seen.hidden == seen.in_view) & (seen.in_view >= CONFIRMING_PHOTOS)] = ENCLOSED
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
     through = seen.through >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * is_open)
     reason[through & ~scene.surface] = SEEN_THROUGH
 
-    left = scene.surface & (reason == KEPT)
-    both = concatenate([surface, scene.cloud[left]])
+    both = concatenate([surface, scene.cloud[scene.surface]])
     behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
     contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
-    worse, better = better_measured(obj, replace(scene, surface=left), diagonal, share)
+    worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == KEPT)] = REPLACED
     added = obj.surface & ~better
-    replaced = np.flatnonzero(left & (reason == REPLACED))
+    replaced = np.flatnonzero(scene.surface & (reason == REPLACED))
     stays = concatenate([obj.cloud[added], scene.cloud[reason == KEPT]])
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
     reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = KEPT
@@ -103,7 +99,7 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
 def better_measured(obj: Measured, scene: Measured, diagonal: float, share: float) -> tuple[Mask, Mask]:
     """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
 
-    `surface` of both sides are the measured points that stay so far; share: of the scene's points that are given.
+    share: of the scene's points that are given.
     """
     worse, better = np.zeros(len(scene.cloud), dtype=bool), np.zeros(len(obj.cloud), dtype=bool)
     if not obj.surface.any() or len(scene.cloud) == 0:

@@ -99,7 +99,7 @@ def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin
         margin: how far before or behind the surface a point must lie to count, unit of the frame.
     """
     in_view, hidden, through = (np.zeros(len(points), dtype=np.int64) for _ in range(3))
-    for view in views:
+    for view in views if len(surface) > 1 else ():
         nearest, farthest = _surface_in(surface, view, spacing)
         found = depth_test(points, nearest, margin, farthest)
         in_view += found != OUTSIDE

@@ -40,7 +40,6 @@ RULES = [
     Rule("a share of the photos sees through", f"{COMPARE}.THROUGH_SHARE", constant(0.0)),
     Rule("that share halved", f"{COMPARE}.THROUGH_SHARE", lambda share: share / 2),
     Rule("that share doubled", f"{COMPARE}.THROUGH_SHARE", lambda share: 2 * share),
-    Rule("what no photo can see goes", f"{COMPARE}.CONFIRMING_PHOTOS", constant(10**9)),
     Rule("margin halved", f"{COMPARE}.MARGIN", lambda margin: margin / 2),
     Rule("margin doubled", f"{COMPARE}.MARGIN", lambda margin: 2 * margin),
     Rule("same place: deviations halved", f"{COMPARE}.SAME_PLACE_DEVIATIONS", lambda number: number / 2),
