@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
-from scipy.spatial import Delaunay
 
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.masks.prompts import distance_to
@@ -107,37 +106,6 @@ def second_trimap(outline: Mask, mask: Mask, evidence: NDArray[np.float32], band
     trimap[(inner > band_px) & mask & (colour > 0)] = cv2.GC_FGD
     trimap[(outer > band_px) & ~mask & (colour < 0) | (outer > 2 * band_px)] = cv2.GC_BGD
     return trimap
-
-
-def stamp_seeds(
-    trimap: Trimap,
-    pixels: NDArray[np.float64],
-    positions: NDArray[np.float64],
-    kind: NDArray[np.int8],
-    radius_px: float,
-    max_edge: float,
-) -> None:
-    """Mark what the sparse points make certain, in place: a disc around each, and small triangles between
-    those on the object.
-
-    Args:
-        trimap: (H, W) labels.
-        pixels: (K, 2) where the photo sees the points.
-        positions: (K, 3) of the points.
-        kind: (K,) 1 on the object, -1 not on it, 0 unknown.
-        radius_px: of the discs.
-        max_edge: longest side of a triangle, in the unit of the positions: smaller than the holes of the object.
-    """
-    own = kind > 0
-    if len(np.unique(np.round(pixels, 1), axis=0)) >= 4 and own.sum() >= 3:
-        corners = Delaunay(pixels, qhull_options="Qbb Qc QJ").simplices
-        corners = corners[own[corners].all(1)]
-        edges = np.linalg.norm(positions[corners] - positions[np.roll(corners, 1, axis=1)], axis=2).max(1)
-        for triangle in corners[edges < max_edge]:
-            cv2.fillConvexPoly(trimap, pixels[triangle].astype(np.int32), cv2.GC_FGD)
-    for label, wanted in ((cv2.GC_BGD, kind < 0), (cv2.GC_FGD, own)):
-        for x, y in pixels[wanted]:
-            cv2.circle(trimap, (int(x), int(y)), max(1, round(radius_px)), label, -1)
 
 
 def grow_seeds(image: NDArray[np.uint8], trimap: Trimap, width_px: int) -> None:

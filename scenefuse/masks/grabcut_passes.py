@@ -17,7 +17,6 @@ from scenefuse.masks.grabcut import (
     grow_seeds,
     learn_colours,
     second_trimap,
-    stamp_seeds,
 )
 from scenefuse.masks.prompts import Prompts, prompted_parts
 from scenefuse.masks.target import Target
@@ -33,8 +32,6 @@ HULL_BAND_SHARE = 5 / 640
 SEED_RADIUS_SHARE = 0.003
 # Outside a clicked box nothing is object from this share of its longer side on: a person's corners miss.
 MAX_BOX_MISS_SHARE = 0.04
-# Longest side of a triangle of sparse points that is filled, as a share of the box's diagonal: holes are larger.
-MAX_SEED_EDGE_SHARE = 0.06
 
 
 def first_cuts(target: Target, photos: Workspace, width_px: int, clicked: Mapping[int, PhotoClicks]) -> list[Mask]:
@@ -145,8 +142,8 @@ def stamp(
         seen_at: (K, 2) pixels where it does.
         clicks: made in this photo, if any.
     """
-    radius, edge = SEED_RADIUS_SHARE * view.width, MAX_SEED_EDGE_SHARE * target.box.diagonal
-    stamp_seeds(trimap, seen_at, target.sparse[seen], target.kind[seen], radius, edge)
+    radius, kind = SEED_RADIUS_SHARE * view.width, target.kind[seen]
+    _discs(trimap, seen_at[kind < 0], seen_at[kind > 0], radius)
     pixels, depth = view.project(target.spanning)
     for part in [*target.parts, *np.arange(len(pixels))[:, None]]:
         if (depth[part] > 0).all():

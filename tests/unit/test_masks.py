@@ -21,7 +21,7 @@ from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
 from scenefuse.masks.box import find_ground, upright_box
-from scenefuse.masks.grabcut import cleaned, second_trimap, stamp_seeds
+from scenefuse.masks.grabcut import cleaned, second_trimap
 from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.prompted import masks_from_prompts
@@ -602,7 +602,7 @@ def test_a_hole_through_which_one_sees_the_surroundings_stays_and_a_dark_one_is_
     assert (cleaned(mask) == whole).all()
 
 
-def test_labels_where_hull_mask_and_seeds_meet():
+def test_labels_where_hull_and_mask_meet():
     outline = np.zeros((60, 60), dtype=bool)
     outline[10:50, 10:50] = True
     mask = outline.copy()
@@ -614,15 +614,6 @@ def test_labels_where_hull_mask_and_seeds_meet():
     assert trimap[20, 40] == cv2.GC_PR_FGD
     assert trimap[40, 40] == cv2.GC_PR_BGD
     assert trimap[2, 2] == cv2.GC_BGD
-    pixels = np.array([[20, 20], [40, 20], [30, 40], [5, 55.0]])
-    positions = np.column_stack([pixels / 20, np.zeros(4)])
-    labels = np.full((60, 60), cv2.GC_PR_BGD, np.uint8)
-    stamp_seeds(labels, pixels, positions, np.array([1, 1, 1, -1], np.int8), 1.0, 2.0)
-    assert labels[26, 30] == cv2.GC_FGD
-    assert labels[55, 5] == cv2.GC_BGD
-    labels[:] = cv2.GC_PR_BGD
-    stamp_seeds(labels, pixels, positions, np.array([1, 1, 1, -1], np.int8), 1.0, 0.5)
-    assert labels[26, 30] == cv2.GC_PR_BGD
 
 
 def test_strong_colours_overrule_hull_and_mask():
