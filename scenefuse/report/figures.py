@@ -26,7 +26,7 @@ COLORS = {
     "crop": (40, 95, 185),
     "object": (245, 170, 85),
     NEVER_SEEN: (214, 38, 31),
-    UNTEXTURED: (40, 95, 185),
+    UNTEXTURED: (52, 101, 196),
     CONTRADICTED: (150, 60, 170),
 }
 # Points of an object's 3D view: with three objects and a scene, the page stays well below 15 MB.

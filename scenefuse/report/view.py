@@ -166,7 +166,8 @@ def _with_fields(cloud: Cloud, source: NDArray[np.generic], shown: Shown, after:
 def write_view(folder: Path, view: View) -> None:
     """Write view.ply and view.json into a folder."""
     write_cloud(folder / "view.ply", view.cloud)
-    units = {"low": view.unit, "high": view.unit, "azimuth_deg": "deg", "elevation_deg": "deg"}
+    units = {"low": view.unit, "high": view.unit, "azimuth_deg": "deg", "elevation_deg": "deg", "brighter": "1"}
+    units |= dict.fromkeys(("before_points", "after_points"), "points")
     about = {name: item for name, item in vars(view).items() if name not in ("cloud", "unit")}
     about["sources"] = {str(number): name for number, name in view.sources.items()}
     write_json(folder / "view.json", {name: quantity(item, units.get(name, "")) for name, item in about.items()})
