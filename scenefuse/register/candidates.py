@@ -159,14 +159,14 @@ def upright_candidates(
     return [_pose(scale, _about_z(yaw) @ upright, shift, centre) for _, scale, yaw, shift in chosen]
 
 
-def _occupancy(points: Array, voxel: float, shape: tuple[int, ...]) -> tuple[Array, float]:
+def _occupancy(points: Array, voxel: float, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float]:
     """Which voxels (X, Y, Z) hold points, and how many do."""
     grid = np.zeros(shape, np.float32)
     grid[tuple(np.floor(points / voxel).astype(np.int64).T)] = 1
     return grid, float(grid.sum())
 
 
-def _blur(grid: Array) -> Array:
+def _blur(grid: NDArray[np.float32]) -> NDArray[np.float32]:
     """A (1/4, 1/2, 1/4) kernel along each axis, so that a pose between two voxels still overlaps; periodic."""
     for axis in range(3):
         grid = 0.5 * grid + 0.25 * (np.roll(grid, 1, axis) + np.roll(grid, -1, axis))
