@@ -125,7 +125,7 @@ def test_matches_along_one_line_agree_on_nothing(monkeypatch):
 @pytest.mark.parametrize(("right", "draws"), [(3, 5), (90, 1)])
 def test_no_more_samples_are_drawn_than_the_paper_has_and_fewer_where_many_matches_agree(monkeypatch, right, draws):
     """Three matches of a hundred ask for 250,000 samples."""
-    monkeypatch.setattr(paper, "AT_ONCE", 1000)
+    monkeypatch.setattr(paper, "TRIPLES_AT_ONCE", 1000)
     monkeypatch.setattr(paper, "RANSAC_SAMPLES", 5000)
     rng, drawn = np.random.default_rng(0), []
 
