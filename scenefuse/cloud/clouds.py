@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.formats import read_columns
-from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, Columns, bytes_of, positions
+from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, bytes_of, positions
 from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Sim3
 
 # Share of points that lie where others do, from which it is said.
 MIN_COINCIDING = 0.1
-# Normals may be this far from unit length.
-UNIT_TOLERANCE = 0.05
 # Share of the spacing of points, from which the steps of their coordinates show.
 MAX_STEP = 0.25
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.readers.columns import AT_ONCE
-from scenefuse.cloud.tiled_cloud import TiledCloud
+from scenefuse.cloud.tiled_cloud import TILE, TiledCloud
 from scenefuse.cloud.write_las import LENGTHS, LasLayout
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Array
@@ -27,7 +27,7 @@ from scenefuse.core.transforms import Array
 # A node's grid has 2^7 cells along each axis, as is usual.
 GRID_BITS = 7
 # A cube of no more points is not divided.
-NODE_POINTS = 1 << 16
+NODE_POINTS = TILE
 # Tiles of the source that are kept for the neighbouring cubes.
 TILES_HELD = 32
 # A node in the hierarchy, and the head of the record that holds it.

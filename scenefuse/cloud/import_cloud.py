@@ -29,8 +29,6 @@ from scenefuse.core.transforms import Array, Sim3
 
 # Fewer different points give no features to register by.
 MIN_POINTS = 200
-# Among so many points they are looked for before they are counted among all.
-ENOUGH = 10_000
 # What `backend` says of a scene's cloud that was not made here.
 IMPORTED = "imported"
 
@@ -168,8 +166,8 @@ class ImportedFile:
                 unit_normals = unit_normals is not False and has_unit_normals(part)
 
         whole = summarise(source, columns_in_parts(source, degrees), look)
-        different = len(np.unique(whole.sample[:: max(1, len(whole.sample) // ENOUGH)], axis=0))
-        if different < MIN_POINTS and (different := len(np.unique(whole.sample, axis=0))) < MIN_POINTS:
+        enough = len(np.unique(whole.sample[:, 0])) >= MIN_POINTS
+        if not enough and (different := len(np.unique(whole.sample, axis=0))) < MIN_POINTS:
             raise StageError(
                 f"{source} has only {different} different positions among its {whole.count} points; {MIN_POINTS} or"
                 " more are needed to place it"

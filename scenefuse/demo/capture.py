@@ -18,6 +18,9 @@ from scenefuse.demo.bodies import Body, Exposure, draw_exposure, expose
 from scenefuse.demo.world import MAPPED, ORIGIN, SUN, World, build_world, openness
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 
+# Focal length of a photo in its widths.
+FOCAL_WIDTHS = 0.875
+
 
 @dataclass(frozen=True)
 class FlightSettings:
@@ -33,16 +36,22 @@ class FlightSettings:
     """Height above the ground."""
     width_px: int = setting(800, unit="px", least=0)
     """Columns of a photo."""
-    height_px: int = setting(600, unit="px", least=0)
-    """Rows of a photo."""
-    focal_px: float = setting(700, unit="px", least=0)
-    """Focal length."""
     supersampling: int = 2
     """Samples along each side of a pixel."""
     gps_noise_horizontal: float = 0.5
     """Standard deviation of the EXIF position, east and north, metres."""
     gps_noise_vertical: float = 1.0
     """Standard deviation of the EXIF height, metres."""
+
+    @property
+    def height_px(self) -> int:
+        """Rows of a photo, which is four to three."""
+        return round(0.75 * self.width_px)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length."""
+        return FOCAL_WIDTHS * self.width_px
 
 
 @dataclass(frozen=True)
@@ -57,12 +66,18 @@ class OrbitSettings:
     """Share of the photo's height that the object fills."""
     width_px: int = setting(640, unit="px", least=0)
     """Columns of a photo."""
-    height_px: int = setting(480, unit="px", least=0)
-    """Rows of a photo."""
-    focal_px: float = setting(560, unit="px", least=0)
-    """Focal length."""
     supersampling: int = 2
     """Samples along each side of a pixel."""
+
+    @property
+    def height_px(self) -> int:
+        """Rows of a photo, which is four to three."""
+        return round(0.75 * self.width_px)
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length."""
+        return FOCAL_WIDTHS * self.width_px
 
 
 def render_scene(*, photos: Path, truth: Path, settings: FlightSettings, camera: bodies.Kind, seed: int) -> None:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads
 from scenefuse.photos.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
 from scenefuse.photos.photos import (
-    JPEG_QUALITY,
     below_folder,
     each_photo,
     inspect_photo,
@@ -163,5 +162,5 @@ def _write_frame(
         size = (settings.max_width_px, round(height * scale))
         frame = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
     name = f"frame_{index:06d}.jpg"
-    write_picture(output / name, np.ascontiguousarray(frame[..., ::-1], dtype=np.uint8), JPEG_QUALITY)
+    write_picture(output / name, np.ascontiguousarray(frame[..., ::-1], dtype=np.uint8))
     return {name: {"frame": index, "width": width, "height": height, "sharpness": round(score, 3)}}

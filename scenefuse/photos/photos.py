@@ -14,6 +14,7 @@ from PIL.ExifTags import GPS, IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
 from scenefuse.photos.photo_files import GEO_FILE, in_folders, photo_files
+from scenefuse.photos.pictures import JPEG_QUALITY
 from scenefuse.photos.positions import positions_of, read_geo, rtk_accuracy
 
 # Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
@@ -21,8 +22,6 @@ MAX_PIXELS = 250_000_000
 Image.MAX_IMAGE_PIXELS = MAX_PIXELS
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
-# Of photos that have to be encoded again; loses nothing that SIFT or a mask would notice.
-JPEG_QUALITY = 97
 # What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.
 KEPT_EXIF = {
     IFD.Exif: (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.DateTimeOriginal),

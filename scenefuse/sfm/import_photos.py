@@ -17,7 +17,7 @@ from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.cameras.transforms import PERSPECTIVE
 from scenefuse.photos.photo_files import SUFFIXES, mask_files, stored_size
-from scenefuse.photos.photos import JPEG_QUALITY, SHAPE_TOLERANCE
+from scenefuse.photos.photos import SHAPE_TOLERANCE
 from scenefuse.photos.pictures import matte_of, write_picture
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up
@@ -136,7 +136,7 @@ def _write_photo(
         jpeg = Path(photo.name).suffix.lower() in (".jpg", ".jpeg")
         name = photo.name if jpeg and not exact else f"{stem}.png"
         picture = _bled(picture, matte) if exact else picture
-        write_picture(images / name, picture if straight else undistort_picture(picture, camera, view), JPEG_QUALITY)
+        write_picture(images / name, picture if straight else undistort_picture(picture, camera, view))
     write_picture(mattes / f"{stem}.png", matte if straight else undistort_picture(matte, camera, view))
     return replace(view, name=name)
 

@@ -67,7 +67,7 @@ CENTRED = Lens("centred", None, Freedom(principal_point=True), "principal point 
 RADIAL = Lens("radial", "RADIAL", CENTRED.freedom, "principal point and two radial terms refined")
 BROWN = Lens("brown", "OPENCV", CENTRED.freedom, "principal point and Brown distortion refined")
 RATIONAL = Lens("rational", "FULL_OPENCV", CENTRED.freedom, "principal point and rational distortion refined")
-DISTORTED, STRAIGHT = (HELD, CENTRED, RADIAL, BROWN, RATIONAL), (HELD, CENTRED)
+DISTORTED = (HELD, CENTRED, RADIAL, BROWN, RATIONAL)
 LENSES = {lens.name: lens for lens in (KNOWN, *DISTORTED)}
 
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import atomic_directory, manifest, quantity, read_json, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.photos.photos import JPEG_QUALITY, check_unchanged, read_photos
+from scenefuse.photos.photos import check_unchanged, read_photos
+from scenefuse.photos.pictures import JPEG_QUALITY
 from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.interrupt import cancellable

@@ -23,13 +23,11 @@ FLIGHT = capture.FlightSettings(
     rows=2,
     obliques=2,
     width_px=80,
-    height_px=60,
-    focal_px=60.0,
     supersampling=1,
     gps_noise_horizontal=0.0,
     gps_noise_vertical=0.0,
 )
-ORBIT = capture.OrbitSettings(views=4, width_px=64, height_px=48, focal_px=56.0, supersampling=1)
+ORBIT = capture.OrbitSettings(views=4, width_px=64, supersampling=1)
 # Far more than a camera's, so that a photo of few pixels shows it.
 DISTORTED = Body(shift=(0.06, -0.05), distortion=(-0.15, 0.04, 0.01, -0.008))
 
@@ -122,7 +120,7 @@ def test_what_lies_far_outside_a_photo_is_not_folded_into_it(world: World) -> No
 
 
 def test_clicks_and_masks_lie_on_what_a_distorted_photo_shows(world: World) -> None:
-    settings = replace(ORBIT, width_px=160, height_px=120, focal_px=140.0)
+    settings = replace(ORBIT, width_px=160)
     cameras = capture.orbit(world, "sculpture", settings, DISTORTED, 0)
     undistorted = replace(cameras, distortion=np.zeros(4), intrinsics=pinhole(140.0, 160, 120))
     landmarks = np.array(list(world.landmarks("sculpture").values()))
@@ -315,7 +313,7 @@ def test_noise_fades_out_where_a_pixel_is_larger_than_it() -> None:
     [
         ("castle", ORBIT, "no object 'castle'; use one of house, balloon, sculpture"),
         ("house", replace(ORBIT, views=0), "without photos"),
-        ("house", replace(ORBIT, width_px=4, height_px=4), "4 x 4 pixels"),
+        ("house", replace(ORBIT, width_px=4), "4 x 3 pixels"),
         ("house", replace(ORBIT, elevations_deg=()), "needs an elevation"),
     ],
 )

@@ -11,11 +11,15 @@ Columns = dict[str, NDArray[Any]]
 
 # Rows of a file, or points of a cloud, that are in memory together when all of it is gone through.
 AT_ONCE = 1 << 20
+# Normals may be this far from unit length; other ones say nothing of the surface.
+UNIT_TOLERANCE = 0.05
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
 # What other programs call the same columns, in lower case and without spaces, dots and underscores.
 OTHER_NAMES = {
     **dict(zip(("normalx", "normaly", "normalz"), NORMAL)),
-    **dict(zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), COLOR * 3)),
+    **dict(
+        zip(("r", "g", "b", "rf", "gf", "bf", "diffusered", "diffusegreen", "diffuseblue"), (*COLOR, *COLOR, *COLOR))
+    ),
 }
 
 

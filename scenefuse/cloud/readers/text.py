@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, Columns, common_name
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, common_name
 from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
@@ -168,7 +168,7 @@ def _unnamed(path: Path, rows: NDArray[np.float64]) -> tuple[dict[str, int], lis
         columns |= {"intensity": 3} if start == 4 else {}
     for first in range(start, rows.shape[1] - 2, 3):
         three = rows[:, first : first + 3]
-        unit = np.abs(np.linalg.norm(three, axis=1) - 1) < 0.02
+        unit = np.abs(np.linalg.norm(three, axis=1) - 1) < UNIT_TOLERANCE
         kind = NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR
         if kind[0] in columns or (kind == COLOR and not _may_be_colors(three)):
             break
@@ -197,7 +197,7 @@ def _colors_at(path: Path, rows: NDArray[np.float64]) -> tuple[int, list[str]]:
     whole = [first for first in places if (finite[:, first : first + 3] == np.rint(finite[:, first : first + 3])).all()]
     places = whole if len(whole) == 1 else places
     lengths = {first: np.linalg.norm(finite[:, first : first + 3], axis=1) for first in (3, 4)}
-    unit = [first for first, length in lengths.items() if (np.abs(length - 1) < 0.02).all()]
+    unit = [first for first, length in lengths.items() if (np.abs(length - 1) < UNIT_TOLERANCE).all()]
     if len(unit) == 1 or len(places) == 1:
         return (unit or places)[0], []
     varying = len(places) == 2 and len(finite) > 1 and (np.ptp(finite[:, 3:7], axis=0) > 0).all()

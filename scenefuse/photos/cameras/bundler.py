@@ -9,13 +9,11 @@ import pycolmap
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
-from scenefuse.photos.cameras.posed_photo import PosedPhoto
+from scenefuse.photos.cameras.posed_photo import FLIP, PosedPhoto
 from scenefuse.photos.photo_files import PhotosByName, bundler_list, stored_size
 
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
-# Its cameras look along -z, with y up.
-FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def read_bundler(file: Path, folder: Path) -> list[PosedPhoto]:

@@ -16,6 +16,8 @@ from scenefuse.photos.photos import SHAPE_TOLERANCE
 QUARTERS = {6: 1, 3: 2, 8: 3}
 # Camera axes after a clockwise quarter turn from those before, OpenCV axes.
 FROM_STORED = np.array([[0.0, -1.0, 0.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+# OpenCV axes from those of OpenGL and Bundler: x right, y up, looking along -z.
+FLIP = np.diag([1.0, -1.0, -1.0])
 # Parameters of a lens that a turn leaves as they are.
 EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
 

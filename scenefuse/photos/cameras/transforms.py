@@ -10,7 +10,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.photos.cameras.posed_photo import PosedPhoto
+from scenefuse.photos.cameras.posed_photo import FLIP, PosedPhoto
 from scenefuse.photos.photo_files import PhotosByName, stored_size
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}
@@ -109,5 +109,5 @@ def _pose(matrix: Any, where: str) -> NDArray[np.float64]:
     if np.abs(axes.T @ axes - np.eye(3)).max() > 1e-3 or np.linalg.det(axes) < 0:
         raise StageError(f"{where}: transform_matrix is no rotation and translation; remove scale and mirroring")
     left, _, right = np.linalg.svd(axes)
-    pose[:3, :3] = left @ right @ np.diag([1.0, -1.0, -1.0])
+    pose[:3, :3] = left @ right @ FLIP
     return pose
