@@ -33,7 +33,6 @@ DISTRIBUTIONS = {
 }
 IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
 REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
-MAX_REMEMBERED = 5000
 LIBRARY = Path(__file__).resolve().parents[1]
 # Files in the assets/ folder beside a module that imports this are part of its code.
 ASSETS_READER = "importlib.resources"
@@ -143,7 +142,7 @@ def _remembered() -> dict[str, str]:
 def _remember(known: dict[str, str], before: int) -> None:
     if len(known) > before and REMEMBERED.is_absolute():
         with contextlib.suppress(OSError), atomic_file(REMEMBERED) as temporary:
-            temporary.write_text(json.dumps(dict(list(known.items())[-MAX_REMEMBERED:])))
+            temporary.write_text(json.dumps(known))
 
 
 @functools.cache
