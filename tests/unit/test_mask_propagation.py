@@ -328,14 +328,16 @@ def test_clicks_and_box_prompt_their_own_photo_again_with_sam2(photos):
     assert outside.tolist() == [[100, 80]] and box.tolist() == [[30, 15], [90, 75]]
 
 
-def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, photos):
+def test_a_part_without_a_prompt_is_left_out_of_the_last_masks_too(tmp_path, photos, monkeypatch):
+    # Stereo takes most of the time, and a ball of one colour gets no points by it.
+    monkeypatch.setattr("scenefuse.masks.prompted.with_stereo_points", lambda photos: photos)
     write_model(tmp_path, photos.views)
     network = BallNetwork(photos)
     marked = Clicks(tmp_path, "labels", tuple(Click("inside", "f03.png", *at) for at in (MIDDLE, (70.0, 45.0))))
     up = np.array([0, 0, 1.0])
     found = masks_from_prompts(marked, tmp_path, {}, photos, up, network, MaskSettings(), 0)
     # Its quality is low, so it is segmented again in the end; the last answer has the same part in the corner.
-    assert [name for name, *_ in network.prompts].count("f06.png") == 9
+    assert [name for name, *_ in network.prompts].count("f06.png") == 5
     assert not found.masks[6][:8, :8].any() and mask_iou(found.masks[6], true_mask(photos.views[6])) > 0.95
 
 
