@@ -123,7 +123,7 @@ def upright_candidates(
         scale_steps: logarithmic steps over the prior.
         yaw_steps: steps of a full turn about the vertical.
         voxel: edge of a voxel, scene units.
-        keep: most candidates returned, best first; no two alike.
+        keep: most candidates returned, best first.
     """
     upright = rotation_between(up_in_object, np.array([0.0, 0.0, 1.0]))
     centre = obj.points.mean(0)
@@ -150,13 +150,7 @@ def upright_candidates(
             # Voxel i of the scene meets voxel i - step of the object.
             found.append((float(f_beta), float(scale), float(yaw), low + step * voxel - corner))
     found.sort(key=lambda h: -h[0])
-    chosen: list[tuple[float, float, float, Array]] = []
-    for one in found:
-        if len(chosen) == keep:
-            break
-        if not any(_alike(one, other, voxel) for other in chosen):
-            chosen.append(one)
-    return [_pose(scale, _about_z(yaw) @ upright, shift, centre) for _, scale, yaw, shift in chosen]
+    return [_pose(scale, _about_z(yaw) @ upright, shift, centre) for _, scale, yaw, shift in found[:keep]]
 
 
 def _occupancy(points: Array, voxel: float, shape: tuple[int, ...]) -> tuple[NDArray[np.float32], float]:
@@ -176,13 +170,6 @@ def _blur(grid: NDArray[np.float32]) -> NDArray[np.float32]:
 def _about_z(angle: float) -> Array:
     cosine, sine = np.cos(angle), np.sin(angle)
     return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _alike(a: tuple[float, float, float, Array], b: tuple[float, float, float, Array], voxel: float) -> bool:
-    """Two grid candidates that refinement would bring together."""
-    turn = abs((a[2] - b[2] + np.pi) % (2 * np.pi) - np.pi)
-    near = np.linalg.norm(a[3] - b[3]) < 3 * voxel
-    return bool(turn < np.radians(12) and abs(np.log(a[1] / b[1])) < 0.08 and near)
 
 
 def _pose(scale: float, rotation: Array, shift: Array, centre: Array) -> Sim3:

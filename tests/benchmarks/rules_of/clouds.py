@@ -214,7 +214,6 @@ RULES = [
     Rule("coarse: features", f"{R}.coarse._from_features", nothing),
     Rule("RANSAC: edges agree on one scale", f"{R}.candidates.MIN_EDGE_RATIO", constant(0.0)),
     Rule("sweep: blurred target", f"{R}.candidates._blur", same),
-    Rule("sweep: candidates alike are one", f"{R}.candidates._alike", lambda _: lambda *args: False),
     Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
