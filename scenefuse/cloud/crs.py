@@ -12,9 +12,9 @@ from scenefuse.core.transforms import Array
 # OpenDroneMap's way to name a UTM zone.
 UTM = re.compile(r"WGS84 UTM (0?[1-9]|[1-5]\d|60)([NS])", re.IGNORECASE)
 # A CRS is used so far beyond its area at most, in degrees: one UTM zone.
-BEYOND_DEG = 6.0
+MAX_BEYOND_DEG = 6.0
 # Coordinates this small are a site's own, unless the zero of their CRS lies where that is used.
-NEAR_ZERO = 10_000.0
+MAX_SITE_COORDINATE = 10_000.0
 
 
 def read_crs(text: str, where: str) -> pyproj.CRS:
@@ -131,11 +131,11 @@ def check_place(crs: str, points: Array, source: Path) -> None:
     known = registered(plane(registered(pyproj.CRS.from_user_input(crs))))
     if known.is_projected:
         middle = np.median(points, axis=0)
-        beyond = 0.0 if (abs(middle[:2]) < NEAR_ZERO).all() else BEYOND_DEG
+        beyond = 0.0 if (abs(middle[:2]) < MAX_SITE_COORDINATE).all() else MAX_BEYOND_DEG
         check_in_area(known, middle[None], f"{source}, the middle of its points", beyond)
 
 
-def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = BEYOND_DEG) -> Array:
+def check_in_area(crs: pyproj.CRS, points: Array, where: str, beyond_deg: float = MAX_BEYOND_DEG) -> Array:
     """(N, 2) longitude, latitude of points (N, 3) in a CRS, so far beyond its area at most; StageError as of
     `to_wgs84`."""
     found = _in_degrees(crs, points[:, :2])

@@ -15,7 +15,7 @@ from scenefuse.sfm.adjustment import Freedom, adjustment_options
 TOLERANCE = 1e-9
 # How far from its point, in metres, a camera stands that measures a coordinate: its aperture takes no depth in. Also
 # the standard deviation of an unknown height.
-FAR_M = 1000.0
+CAMERA_DISTANCE_M = 1000.0
 # cam_from_world of cameras that look down (x east, y south) and north (x east, y down).
 DOWN = np.diag([1.0, -1.0, -1.0])
 NORTH = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -108,7 +108,7 @@ def adjust_to_survey(
 
 def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int) -> list[int]:
     """Add a surveyed point with its clicks; ids of the cameras that measure its coordinates."""
-    place, (horizontal, vertical) = points.x_in_local[row], FAR_M / points.sd_m[row]
+    place, (horizontal, vertical) = points.x_in_local[row], CAMERA_DISTANCE_M / points.sd_m[row]
     track = pycolmap.Track()
     by_name = {model.images[i].name: i for i in model.reg_image_ids()}
     for click in points.clicks[row]:
@@ -129,14 +129,14 @@ def _add_point(model: pycolmap.Reconstruction, points: SurveyedPoints, row: int)
 def _add_camera(
     model: pycolmap.Reconstruction, cam_from_world: Array, place: Array, focal_px: tuple[float, float]
 ) -> int:
-    """Add a camera that sees a place (3,) in its one pixel from `FAR_M` away, with one observation; its image's id."""
+    """Add a camera that sees a place (3,) in its one pixel from far away, with one observation; its image's id."""
     camera = pycolmap.Camera(model="PINHOLE", width=2, height=2, params=[*focal_px, 1.0, 1.0])
     camera.camera_id = max(model.cameras) + 1
     model.add_camera_with_trivial_rig(camera)
     number = max(model.images) + 1
     observed = [pycolmap.Point2D(np.ones(2))]
     image = pycolmap.Image(name=f"{number}", points2D=observed, camera_id=camera.camera_id, image_id=number)
-    centre = place - FAR_M * cam_from_world[2]
+    centre = place - CAMERA_DISTANCE_M * cam_from_world[2]
     model.add_image_with_trivial_frame(
         image, pycolmap.Rigid3d(pycolmap.Rotation3d(cam_from_world), -cam_from_world @ centre)
     )
@@ -149,7 +149,9 @@ def _held(model: pycolmap.Reconstruction, count: int) -> list[int]:
     COLMAP first aligns a model with its priors by RANSAC, which would move the cameras of surveyed points away from
     them. These priors fit exactly, and no others do, so that nothing is moved.
     """
-    corners = FAR_M * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64)
+    corners = CAMERA_DISTANCE_M * np.array(
+        [[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=np.float64
+    )
     return [_add_camera(model, DOWN, corners[k % 8] * (1 + k // 8), (1.0, 1.0)) for k in range(max(8, count))]
 
 
@@ -157,7 +159,7 @@ def _position_prior(model: pycolmap.Reconstruction, photos: SurveyedPhotos, row:
     image = model.find_image_with_name(photos.names[row])
     place, (horizontal, vertical) = photos.x_in_local[row], photos.sd_m[row]
     known = np.where(np.isfinite(place), place, image.projection_center())
-    up = vertical if np.isfinite(place[2]) else FAR_M
+    up = vertical if np.isfinite(place[2]) else CAMERA_DISTANCE_M
     return _prior(image, known, np.array([horizontal, horizontal, up]))
 
 

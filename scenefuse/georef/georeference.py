@@ -15,7 +15,7 @@ from scenefuse.georef.adjust import SurveyedPhotos, SurveyedPoints, adjust_to_su
 from scenefuse.georef.control import Control, read_control_points
 from scenefuse.georef.on_cloud import lay_on_cloud
 from scenefuse.georef.placement import (
-    ELSEWHERE_M,
+    MAX_GPS_OFF_M,
     MIN_GPS_PHOTOS,
     UP,
     GeoreferenceSettings,
@@ -184,7 +184,7 @@ def placed_as_given(place: Place, model: pycolmap.Reconstruction, gps: GpsCamera
     fitted, reason = fit_sim3(corners, frame.apply(there)), f"where its cameras were given, in {place.crs.name}"
     if len(gps.names):
         off = middle_of(frame.apply(gps.positions) - fitted.apply(gps.centres))
-        if np.linalg.norm(off[:2]) > ELSEWHERE_M:
+        if np.linalg.norm(off[:2]) > MAX_GPS_OFF_M:
             raise StageError(
                 f"the given cameras lie {np.linalg.norm(off[:2]) / 1000:.3g} km from where the photos' GPS saw them;"
                 " give the project of these photos, or one whose CRS is theirs"

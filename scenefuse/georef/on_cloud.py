@@ -35,9 +35,9 @@ MAX_COMPARED, MAX_PROJECTED = 200_000, 10_000
 MIN_SEEN, MIN_MET = 0.1, 0.2
 # Of a right cloud as dense as the photos allow more is met. Where so much more is met once it is moved, it is off, and
 # where that moves it by more of the cameras' distance, turns it by more degrees, or scales it by more per cent.
-USUALLY_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
+USUAL_MET, MIN_BETTER_MET, MAX_OFF = 0.6, 0.15, (0.01, 1.0, 1.0)
 # What is met by the cloud: within this share of the distance to the nearest camera, or within a spacing of the cloud.
-NEAR = 0.002
+MAX_MET_SHARE = 0.002
 # Fewer points of a model in the cloud's box say that the cloud is elsewhere; fewer over it do not lay the model on it.
 MIN_INSIDE, MIN_OVER = 10, 50
 # What GPS is off at most, in metres: the cloud is looked at so far beyond the model.
@@ -78,7 +78,7 @@ def fit_to_cameras(points: Array, model: pycolmap.Reconstruction) -> dict[str, A
     own = _in_box_of(points, own)
     met = _met(points, own, centres)
     content = {"seen_share": quantity(seen, "1"), "met_share": quantity(met, "1")}
-    if seen < MIN_SEEN or len(own) < MIN_INSIDE or met > USUALLY_MET:
+    if seen < MIN_SEEN or len(own) < MIN_INSIDE or met > USUAL_MET:
         return content
     moved = refine_on_cloud(own, points)
     middle = own.mean(0)
@@ -267,5 +267,5 @@ def _met(points: Array, own: Array, centres: Array) -> float:
     """Share of a model's points (M, 3) that lie on a cloud (N, 3); centres (V, 3): of cameras."""
     if len(own) < MIN_INSIDE:
         return 0.0
-    reach = np.maximum(NEAR * cKDTree(centres).query(own)[0], spacing(points))
+    reach = np.maximum(MAX_MET_SHARE * cKDTree(centres).query(own)[0], spacing(points))
     return float((cKDTree(points).query(own, workers=threads())[0] <= reach).mean())

@@ -19,13 +19,13 @@ UP = np.array([0.0, 0.0, 1.0])
 MIN_GPS_PHOTOS = 5
 # In standard errors of a position: what is farther from its camera is an outlier; a flight that spreads less says
 # nothing about scale; one that is narrower lies along one line and says nothing about roll.
-OUTLIER, MIN_SPREAD, MIN_WIDTH = 4.0, 5.0, 3.0
+OUTLIER_SD, MIN_SPREAD, MIN_WIDTH = 4.0, 5.0, 3.0
 # Heights of GPS have twice the error of the plane, and so many photos beside each other have one error.
 HEIGHT_ERROR, PHOTOS_OF_ONE_ERROR = 2.0, 5.0
 # How far a model that was not yet adjusted to exact positions may be bent away from them, as a share of their extent.
 MAX_BENT = 0.1
 # Control points that lie farther from where GPS saw the cameras, in metres, are in another CRS or have swapped axes.
-ELSEWHERE_M = 1000.0
+MAX_GPS_OFF_M = 1000.0
 # In standard deviations: error of a control point or a position at which it loses half its weight (Cauchy).
 ROBUST_SD = 3.0
 # Each round halves what filling in half of the heights leaves to be found.
@@ -112,7 +112,7 @@ def place_by_control(
     whole = np.isfinite(there).all(1)
     check_spread(there[whole], [n for n, w in zip(names, whole) if w], where)
     sd_m = max(max(located[k].point.sd_m) for k in rows)
-    limit = max(OUTLIER * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
+    limit = max(OUTLIER_SD * sd_m, MAX_BENT * float(np.linalg.norm(np.ptp(there[whole], axis=0))))
     try:
         fitted, inliers = fit_measured(start, there, limit, seed)
     except ValueError:
@@ -169,7 +169,7 @@ def beside_gps(
     fitted, points = placement.local_from_model, placement.used
     difference = target - fitted.apply(gps.centres)
     shift = middle_of(difference)
-    if np.linalg.norm(shift[:2]) > ELSEWHERE_M:
+    if np.linalg.norm(shift[:2]) > MAX_GPS_OFF_M:
         raise StageError(
             f"{where}: the control points lie {np.linalg.norm(shift[:2]) / 1000:.3g} km from where GPS saw the cameras;"
             " correct their CRS or swapped axes, or switch use_gps off if GPS is wrong"
@@ -201,7 +201,7 @@ def beside_gps(
 
 def _limit(sd_m: float, extent: float, settings: GeoreferenceSettings) -> float:
     """How far a position may be from its camera after a similarity: its noise, or for exact ones the model's bend."""
-    return max(OUTLIER * sd_m, min(OUTLIER * settings.gps_accuracy_m, MAX_BENT * extent))
+    return max(OUTLIER_SD * sd_m, min(OUTLIER_SD * settings.gps_accuracy_m, MAX_BENT * extent))
 
 
 def middle_of(difference: Array) -> Array:
