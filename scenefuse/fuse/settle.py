@@ -13,8 +13,8 @@ from scenefuse.register.uncertainty import half_sampling
 REACHES = (0.04, 0.02, 0.01)
 # The scale stays within five per cent of what the registration found.
 SCALE_WIDTH = 0.05
-# An object that would move by more than this share of its diagonal (RMS) is not where the registration put it.
-MAX_MOVED = 0.04
+# An object that would move by more than pairs reach (RMS, over its diagonal) is not where the registration put it.
+MAX_MOVED = REACHES[0]
 # Measured points that each side needs; of each side at most so many, drawn evenly, and of these those that look for a
 # partner. They are not averaged, which would round corners off.
 MIN_POINTS, MAX_POINTS, MAX_QUERIES = 200, 20000, 5000
