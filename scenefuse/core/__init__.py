@@ -1,1 +1,1 @@
-"""What every part shares: stages, settings, transforms, fingerprints, checkpoints. Standard library and NumPy."""
+"""What every part shares: stages, settings, projects, transforms, fingerprints, checkpoints."""

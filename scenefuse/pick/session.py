@@ -8,9 +8,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from scenefuse.core.project import read_project
 from scenefuse.core.settings import read_settings
 from scenefuse.core.stage import StageError
-from scenefuse.marks.project import read_project
 from scenefuse.pick.photo_tiles import Picture, Thumbnails, Tiles
 from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.tables import tables_of

@@ -5,9 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
+from scenefuse.core.project import Project
 from scenefuse.core.stage import StageError, read_json
 from scenefuse.marks.clicks import Kind
-from scenefuse.marks.project import Project
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies
 from scenefuse.pick.document import Document

@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from scenefuse.core.stage import StageError
-from scenefuse.marks.check_marks import check_marks
-from scenefuse.marks.clicks import Click, Clicks, ScenePoints, read_length_clicks, read_points
+from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_marks, read_length_clicks, read_points
 from scenefuse.marks.triangulation import locate, triangulate, triangulate_consistent
 
 LABELS = "label\tphoto\tx_px\ty_px\n"

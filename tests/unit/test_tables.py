@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from scenefuse.core.project import read_project
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_table, read_text
-from scenefuse.marks.project import read_project
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -186,7 +186,7 @@ def names_in(folder, where):
 @cache
 def check_clicks(name, column):
     """Stop before hours of work where prompts or fiducials cannot be read, or are in photos that will not be used."""
-    from scenefuse.marks.check_marks import check_marks
+    from scenefuse.marks.clicks import check_marks
 
     row, used = object_row(name), None
     if column == "prompts":

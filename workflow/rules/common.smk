@@ -11,7 +11,7 @@ from snakemake.exceptions import WorkflowError
 from snakemake.output_index import OutputIndex
 
 from scenefuse.core.fingerprint import files_fingerprint, fingerprint
-from scenefuse.marks.project import read_project
+from scenefuse.core.project import read_project
 from scenefuse.core.settings import PACKAGE, ROOT as SHIPPED
 from scenefuse.core.machine import has_gpu, megapixels, memory_mb
 from scenefuse.photos.photo_files import GEO_FILE, camera_files, photo_files
