@@ -13,7 +13,7 @@ demo: .venv/ready
 check: .venv/tests
 	pytest -n $(CORES) --dist loadfile -m "not process" $(if $(PART),--part $(PART)) tests/unit
 
-# All tests, in twelve minutes: those of whole workflows first.
+# All tests: those of whole workflows first.
 test: .venv/tests
 	envs/browser.sh
 	pytest -n $(CORES) --dist loadfile --no-loadscope-reorder --durations 20
