@@ -20,7 +20,6 @@ from scenefuse.demo.capture import FlightSettings, OrbitSettings
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.masks.segmentation import MaskSettings
-from scenefuse.metrics.completion import MetricSettings
 from scenefuse.mvs.dense_cloud import DenseCloudSettings
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.field import FieldSettings
@@ -31,11 +30,7 @@ from scenefuse.nerf.training import Schedule
 from scenefuse.paper.compare_with_paper import ComparisonSettings
 from scenefuse.paper.monocular import MonocularSettings
 from scenefuse.photos.frames import FrameSettings
-from scenefuse.register.agreement import AgreementSettings
-from scenefuse.register.align_models import AlignmentSettings
-from scenefuse.register.coarse import CoarseSettings
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.scale import ScaleSettings
 from scenefuse.sfm.features import FeatureSettings
 from scenefuse.sfm.mapping import MappingSettings
 from scenefuse.sfm.matches import MatchSettings
@@ -140,13 +135,9 @@ SECTIONS: dict[str, list[Any]] = {
     "object.nerf": [NerfSettings(), FieldSettings(), Schedule()],
     "object.cloud": [CloudSettings()],
     "registration": [VariantSettings()],
-    "registration.alignment": [AlignmentSettings()],
     "registration.crop": [CropSettings()],
-    "registration.scale": [ScaleSettings()],
-    "registration.coarse": [CoarseSettings()],
     "registration.fine": [FineSettings()],
     "fusion": [FusionSettings()],
-    "metrics": [AgreementSettings(), MetricSettings()],
     "evaluation.paper": [ComparisonSettings()],
 }
 # Keys of a dataclass that its section does not hold: the other section of the same stage sets them.

@@ -39,7 +39,7 @@ class CropSettings:
     """Whether the ground is fitted around the box and removed inside."""
     max_residual_px: float = setting(5, unit="px", least=0)
     """Clicks of one fiducial may miss each other by this much, RMS, in pixels of the photos."""
-    min_votes: float = setting(0.8, above=0, most=1)
+    min_votes: float = 0.8
     """Share of the object's photos showing a scene point that must have it inside their mask."""
     whole_scene: bool = False
     """Keep the whole scene, whatever the mode: the ablation without cropping, and what is left without any mark."""

@@ -35,14 +35,14 @@ class MaskSettings:
     """What the masks keep: `object`, or an expression with folders of other masks in quotes, `and`, `or`, `not` and
     brackets. `{object}` in a folder stands for the object's name. Masks are named like the photos; a photo without one
     shows nothing of that."""
-    sam2_encoder: str = setting(ENCODER)
-    """For sam2: weights of the encoder (.ort or .onnx). Those at the shipped path are fetched by a rule."""
-    sam2_decoder: str = setting(DECODER)
+    sam2_encoder: str = ENCODER
+    """For sam2: weights of the encoder (.ort or .onnx), which a rule fetches."""
+    sam2_decoder: str = DECODER
     """For sam2: weights of the decoder (.onnx), likewise."""
     sam2_checkpoint: str | None = setting(None)
     """For sam2: folder of a SAM 2 checkpoint that transformers runs instead of the weights above, on a GPU where there
     is one (`pip install transformers==5.23.0`); nothing is downloaded."""
-    min_agreement: float = setting(0.6, least=0, most=1)
+    min_agreement: float = 0.6
     """Smallest IoU of a mask with the hull's outline; below it the photo is left out."""
     max_click_residual_px: float = setting(4, unit="px", least=0)
     """Largest reprojection error of a prompt clicked in several photos, if 3 % of what is clicked in one is not more;
@@ -135,9 +135,7 @@ def score_masks(masks: list[Mask], target: Target, views: list[View], settings: 
         if not mask.any():
             dropped[view.name] = "empty mask"
         elif scores[view.name] < settings.min_agreement:
-            dropped[view.name] = (
-                f"IoU with the visual hull is {scores[view.name]:.2f}, below {settings.min_agreement} (min_agreement)"
-            )
+            dropped[view.name] = f"IoU with the visual hull is {scores[view.name]:.2f}, below {settings.min_agreement}"
     return ScoredMasks({view.name: mask for view, mask in zip(views, masks)}, scores, dropped, hull)
 
 

@@ -41,11 +41,11 @@ class DenseCloudSettings:
 
     min_photos: int = setting(3, least=0)
     """Photos that must agree on a point."""
-    max_reprojection_px: float = setting(2, unit="px", least=0)
+    max_reprojection_px: float = 2
     """Largest distance between a pixel and the point of another photo projected into it."""
-    max_depth_error: float = setting(0.01, least=0)
+    max_depth_error: float = 0.01
     """Largest relative difference of two photos' depths of a point."""
-    max_normal_error_deg: float = setting(30, unit="deg", least=0)
+    max_normal_error_deg: float = 30
     """Largest angle between two photos' normals of a point."""
 
 
@@ -114,7 +114,7 @@ def _report(cloud: Cloud, dropped: int, measured: int, stages: list[dict[str, An
     if share < MIN_FUSED_SHARE:
         notes.append(
             f"only {share:.2%} of the pixels with a depth are in the cloud: the photos' depths disagree; look at"
-            " the cameras, or raise max_depth_error, max_reprojection_px or max_normal_error_deg"
+            " the cameras, or lower scene.dense_cloud.min_photos"
         )
         print(f"note: {notes[0]}", flush=True)
     return {
@@ -210,7 +210,8 @@ def _voted(
 def _no_points(settings: DenseCloudSettings) -> StageError:
     """The error for maps that do not agree anywhere."""
     return StageError(
-        f"no point is seen alike by {settings.min_photos} photos; lower min_photos or min_score, or check the cameras"
+        f"no point is seen alike by {settings.min_photos} photos; lower scene.dense_cloud.min_photos, or check the"
+        " cameras"
     )
 
 

@@ -51,7 +51,7 @@ class DepthMapSettings:
     """Longer side of the photo that stereo works on; the depth map has this size."""
     sources: int = setting(8, least=1)
     """Source photos per reference photo."""
-    min_score: float = setting(0.5, least=0, most=1)
+    min_score: float = 0.5
     """Smallest mean NCC of the best sources that a pixel needs to keep its depth (torch only)."""
     min_angle_deg: float = setting(2, unit="deg", least=0)
     """Smallest median angle between the rays of a reference and a source photo."""

@@ -10,7 +10,7 @@ import numpy as np
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import read_json, value
 from scenefuse.core.transforms import Sim3
-from scenefuse.register.agreement import registration_metrics
+from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.report.run_summary import ObjectSummary
 from scenefuse.report.values import Fields, find
 
@@ -64,7 +64,7 @@ class Measure:
 
 
 _FITNESS = (
-    "share of the crop's points with a point of the object within tau, which is metrics.agreement.tau_fraction of the"
+    f"share of the crop's points with a point of the object within tau, {AgreementSettings().tau_fraction:.1%} of the"
     " crop's diagonal; higher is better (R10, R11)"
 )
 _RMSE = (

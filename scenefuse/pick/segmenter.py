@@ -82,14 +82,13 @@ class Segmenter:
                 return
             if settings["method"] in ("auto", "sam2"):
                 from scenefuse.masks.sam2 import load_network, query_sam2
-                from scenefuse.masks.sam2_weights import UnavailableError
+                from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, UnavailableError
 
                 checkpoint = settings["sam2_checkpoint"]
-                encoder, decoder = Path(settings["sam2_encoder"]), Path(settings["sam2_decoder"])
                 try:
                     if checkpoint is None:
-                        self._fetch_once({encoder, decoder})
-                    network, _ = load_network(encoder, decoder, checkpoint and Path(checkpoint), threads())
+                        self._fetch_once(Path(WEIGHTS))
+                    network, _ = load_network(Path(ENCODER), Path(DECODER), checkpoint and Path(checkpoint), threads())
                     self._network = _Remembering(network)
                     self._ask, self.method = partial(query_sam2, self._network), "SAM 2"
                     return
@@ -101,16 +100,15 @@ class Segmenter:
             width = PROPAGATION_WIDTHS * MaskSettings().grabcut_width_px
             self._ask, self.method = partial(query_grabcut, width), "GrabCut"
 
-    def _fetch_once(self, paths: set[Path]) -> None:
-        """Put the shipped weights to their place, if these are they and nothing has tried it yet, neither meanwhile.
+    def _fetch_once(self, place: Path) -> None:
+        """Fetch the weights to their place, unless something has tried it already, or does so meanwhile.
 
         Raises:
             UnavailableError, OSError: they cannot be fetched or written; nothing is left behind then.
         """
-        from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS, download_weights
+        from scenefuse.masks.sam2_weights import download_weights
 
-        place = Path(WEIGHTS)
-        if paths == {Path(ENCODER), Path(DECODER)} and not place.exists():
+        if not place.exists():
             self.loading = "Fetching SAM 2's weights (184 MB, once) ..."
             with scratch_directory(place) as folder:
                 download_weights(folder)

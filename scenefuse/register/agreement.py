@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, plane_normals, sampled, spacing
-from scenefuse.core.stage import quantity, setting, threads
+from scenefuse.core.stage import quantity, threads
 from scenefuse.core.transforms import Array, Sim3
 
 # Neighbours that a plane is fitted to for a normal.
@@ -20,7 +20,7 @@ MAX_COMPARED_POINTS = 20000
 class AgreementSettings:
     """When points correspond."""
 
-    tau_fraction: float = setting(0.016, least=0)
+    tau_fraction: float = 0.016
     """Distance within which points correspond, as a share of the crop's diagonal."""
 
 

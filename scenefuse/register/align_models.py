@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.core.stage import quantity, setting, write_json
+from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.ransac import triples_of_one_scale
 from scenefuse.register.gps import MAX_GPS_DEVIATIONS, GpsPose, gps_quantities, pose_by_gps
@@ -46,9 +46,9 @@ PER_UNIT = "scene units per object unit"
 class AlignmentSettings:
     """Settings of the alignment from shared features."""
 
-    min_points: int = setting(15, least=4)
+    min_points: int = 15
     """Gate: fewest points shared by both models."""
-    min_photos: int = setting(3, least=2)
+    min_photos: int = 3
     """Gate: fewest photos on either side that observe shared points."""
     max_ratio: float = 0.85
     """Lowe's ratio test: descriptor distance to the best over that to the second-best point."""

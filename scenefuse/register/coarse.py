@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from scenefuse.core.stage import quantity, setting, write_json
+from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.geometry.icp import refine_points
 from scenefuse.geometry.surface import prepare, with_grid, with_queries
@@ -36,7 +36,7 @@ BRIEF_ROUNDS = 12
 class CoarseSettings:
     """Settings of the coarse registration."""
 
-    max_tilt_deg: float = setting(10, unit="deg", least=0)
+    max_tilt_deg: float = 10
     """Largest angle between the up directions of object and scene that the search allows, where both are known."""
     voxel_fractions: tuple[float, ...] = (0.04, 0.03)
     """Voxels of the feature pyramid, as shares of the scene crop's diagonal."""

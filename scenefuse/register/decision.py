@@ -44,9 +44,9 @@ MAX_BENDING = 0.1
 class FineSettings:
     """Settings of the fine registration: its gate, and how thoroughly it searches."""
 
-    min_f_score: float = setting(0.35, least=0)
+    min_f_score: float = 0.35
     """Gate: smallest two-way F-score."""
-    min_margin: float = setting(0.04, least=0)
+    min_margin: float = 0.04
     """Gate: smallest relative lead of the score over the best pose that differs."""
     max_scale_sd_log: float = setting(0.01, least=0)
     """Gate: largest standard deviation of the scale, natural logarithm."""

@@ -52,10 +52,7 @@ class RegistrationSettings:
         parts = content["registration"]
         return cls(
             build(CropSettings, parts["crop"]),
-            build(ScaleSettings, parts["scale"]),
-            build(CoarseSettings, parts["coarse"]),
-            build(FineSettings, parts["fine"]),
-            build(AgreementSettings, content["metrics"]),
+            fine=build(FineSettings, parts["fine"]),
         ), content["seed"]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from scenefuse.cloud.clouds import Cloud, voxel_downsample
-from scenefuse.core.stage import quantity, setting
+from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array, rotation_between
 from scenefuse.geometry.icp import ScaleRange
 
@@ -21,7 +21,7 @@ MIN_EXTENT = 0.01
 class ScaleSettings:
     """Settings of the scale."""
 
-    width_log: float = setting(0.5, least=0)
+    width_log: float = 0.5
     """Half width of the scale prior, natural logarithm: 0.5 searches from 0.6 to 1.6 times the estimate."""
     method: Literal["prior", "none"] = "prior"
     """`none` holds the scale at 1: the ablation without scale rectification."""

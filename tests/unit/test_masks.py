@@ -231,7 +231,7 @@ def test_the_one_mask_that_disagrees_with_the_visual_hull_is_left_out_and_no_oth
     agreement = {photo: numbers["agreement"] for photo, numbers in report["per_photo"].items()}
     wrong = agreement.pop("f4.png")
     assert wrong == pytest.approx(iou, abs=0.05) and min(agreement.values()) > 0.98
-    assert report["dropped"]["f4.png"] == f"IoU with the visual hull is {wrong:.2f}, below 0.6 (min_agreement)"
+    assert report["dropped"]["f4.png"] == f"IoU with the visual hull is {wrong:.2f}, below 0.6"
 
 
 def test_bad_supplied_masks_alone_are_an_error_in_one_sentence(capture, tmp_path):

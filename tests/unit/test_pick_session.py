@@ -10,7 +10,6 @@ from support.user_project import HEADER, Project
 from scenefuse.core.stage import StageError, write_json
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.clicks import Click, label_name
-from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.session import Session
@@ -202,17 +201,18 @@ def test_a_box_gives_a_mask_and_a_click_that_contradicts_it_is_counted(ball):
     assert any("click beside the object too" in note for note in Segmenter(GRABCUT, 1600).mask(picture, alone)[1])
 
 
-def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path):
-    paths = {"sam2_encoder": str(tmp_path / "no.ort"), "sam2_decoder": "no.onnx", "sam2_checkpoint": None}
-    segmenter = Segmenter(GRABCUT | paths | {"method": "sam2"}, 1600)
+def test_without_weights_grabcut_takes_their_place_and_the_page_says_so(ball, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "results/weights/sam2").mkdir(parents=True)
+    segmenter = Segmenter(GRABCUT | {"method": "sam2", "sam2_checkpoint": None}, 1600)
     segmenter.load()
-    assert segmenter.method == "GrabCut" and "no.ort do not exist" in segmenter.trouble
+    assert segmenter.method == "GrabCut" and "encoder.ort do not exist" in segmenter.trouble
 
 
 def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("NPM_CONFIG_REGISTRY", (tmp_path / "none").as_uri())
-    settings = {"method": "auto", "sam2_encoder": ENCODER, "sam2_decoder": DECODER, "sam2_checkpoint": None}
+    settings = {"method": "auto", "sam2_checkpoint": None}
     segmenter = Segmenter(GRABCUT | settings, 1600)
     segmenter.load()
     assert segmenter.method == "GrabCut" and "No such file" in segmenter.trouble

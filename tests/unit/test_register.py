@@ -163,7 +163,10 @@ def test_a_column_with_a_space_in_its_name_is_written(tmp_path, house, monkeypat
         ({"fiducials": Path("three.txt")}, "at least 4"),
         ({"fiducials": Path("far.txt")}, "nearest scene point"),
         ({"fiducials": Path("clicks.tsv")}, "clicks in photos"),
-        ({"config": Path("typo.yaml")}, "registration.fine: unknown key 'min_fscore'; did you mean 'min_f_score'"),
+        (
+            {"config": Path("typo.yaml")},
+            "registration.fine: unknown key 'max_scale_sd'; did you mean 'max_scale_sd_",
+        ),
         ({"config": Path("none.yaml")}, "cannot be read"),
         ({"object": Path("few.ply")}, "the object has only 3 different positions; 200 or more"),
         ({"object": Path("repeated.ply")}, "the object has only 3 different positions among its 5000 points; 200"),
@@ -185,7 +188,7 @@ def test_bad_input_is_one_sentence(tmp_path, monkeypatch, house, options, words)
     Path("three.txt").write_text("0 0 0\n1 0 0\n0 1 0\n")
     np.savetxt("far.txt", np.eye(4, 3) + 1000)
     Path("clicks.tsv").write_text("point\tphoto\tx_px\ty_px\na\tb.jpg\t1\t1\n")
-    Path("typo.yaml").write_text("registration: {fine: {min_fscore: 0.1}}")
+    Path("typo.yaml").write_text("registration: {fine: {max_scale_sd: 0.1}}")
     files = {"object": Path("scene.ply"), "scene": Path("scene.ply")}
     others = {name: option for name, option in options.items() if name in ("object", "scene", "config", "out")}
     known = Known(**{name: option for name, option in options.items() if name not in others})

@@ -112,7 +112,7 @@ def test_variants_are_the_settings_of_registration_with_what_differs(project):
     assert set(found) == {"full", "no_crop"}
     assert found["full"]["crop"]["mode"] == found["no_crop"]["crop"]["mode"] == "masks"
     assert found["no_crop"]["crop"] != found["full"]["crop"]
-    assert found["no_crop"]["coarse"] == found["full"]["coarse"]
+    assert found["no_crop"]["fine"] == found["full"]["fine"] | {"use_alignment": False}
 
 
 def test_with_recipe_paper_all_variants_have_the_papers_crop(project):

@@ -1,6 +1,6 @@
 # What masks are made from, and how.
 from scenefuse.masks.algebra import mask_folders
-from scenefuse.masks.sam2_weights import DECODER, ENCODER, WEIGHTS
+from scenefuse.masks.sam2_weights import WEIGHTS
 
 
 def kept_masks(wildcards):
@@ -33,11 +33,7 @@ def mask_inputs(wildcards):
     if by_network and settings["sam2_checkpoint"]:
         files += sorted(glob.glob(f"{settings['sam2_checkpoint']}/*"))
     elif by_network:
-        weights = {
-            str(Path(settings[f"sam2_{part}"])) for part in ("encoder", "decoder")
-        }
-        fetched = weights & {ENCODER, DECODER}
-        files += sorted(weights - fetched) + [WEIGHTS] * bool(fetched)
+        files.append(WEIGHTS)
     return files + own_file("object", wildcards.object, "prompts")
 
 

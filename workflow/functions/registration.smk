@@ -12,7 +12,7 @@ def variant_options(*parts):
     def words(wildcards):
         found = registration_of(wildcards)
         return flags(
-            {key: value for part in parts for key, value in found[part].items()}
+            {key: value for part in parts for key, value in found.get(part, {}).items()}
         )
 
     return words

@@ -1,6 +1,6 @@
 # Registration and completion metrics, and errors against truth where it is known.
 #
-# INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth; config: metrics
+# INPUTS    everything before; config/scenes.tsv, config/objects.tsv: truth
 # OUTPUTS   results/objects/{object}/metrics.json, registration/{variant}/metrics.json
 #           results/scenes/{scene}/metrics.json
 #           results/scenes/{scene}/truth.json, results/objects/{object}/truth.json      only with truth
@@ -31,7 +31,6 @@ rule compute_metrics:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         fused=lambda wildcards, input: input.get("fused", "None"),
-        options=flags(config["metrics"]),
         seed=config["seed"],
         script=script("metrics/compute_metrics.py"),
         code=code("metrics/compute_metrics.py"),
@@ -39,7 +38,7 @@ rule compute_metrics:
         "{wildcards.object}: metrics"
     shell:
         "exec python {params.script} --object {input.cloud} --crop {input.crop} --crop-json {input.crop_json} --fine-json {input.fine}"
-        " --fused {params.fused} --report {output} --seed {params.seed} {params.options} &> {log}"
+        " --fused {params.fused} --report {output} --seed {params.seed} &> {log}"
 
 
 use rule compute_metrics as compute_variant_metrics with:
@@ -80,7 +79,6 @@ rule compute_scene_metrics:
         runtime=lambda wildcards, attempt: 60 * attempt,
     params:
         objects=object_folders,
-        options=flags(config["metrics"]),
         seed=config["seed"],
         script=script("metrics/compute_scene_metrics.py"),
         code=code("metrics/compute_scene_metrics.py"),
@@ -88,7 +86,7 @@ rule compute_scene_metrics:
         "Scene {wildcards.scene}: metrics"
     shell:
         "exec python {params.script} --completed {input.cloud} --completed-json {input.cloud_json} --objects {params.objects}"
-        " --report {output} --seed {params.seed} {params.options} &> {log}"
+        " --report {output} --seed {params.seed} &> {log}"
 
 
 rule evaluate_scene:

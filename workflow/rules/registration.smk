@@ -36,7 +36,6 @@ rule align_models:
         mem_mb=lambda wildcards, attempt: 4000 * attempt,
         runtime=lambda wildcards, attempt: 30 * attempt,
     params:
-        options=settings("registration.alignment"),
         seed=config["seed"],
         script=script("register/align_models.py"),
         code=code("register/align_models.py"),
@@ -46,7 +45,7 @@ rule align_models:
         "exec python {params.script} --object-sparse {input.object_sparse} --object-features {input.object_features}"
         " --object-photos {input.object_photos} --scene-sparse {input.scene_sparse} --scene-features {input.scene_features}"
         " --scene-photos {input.scene_photos} --scene-json {input.scene_json} --report {output}"
-        " --seed {params.seed} {params.options} &> {log}"
+        " --seed {params.seed} &> {log}"
 
 
 rule crop_scene:
