@@ -8,7 +8,7 @@ from scipy.ndimage import minimum_filter
 
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.depth_test import IN_FRONT, depth_test
-from scenefuse.photos.maps import read_depth
+from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 
 # Below this share of points with a measurement on their rays, depth maps tell nothing of an object.

@@ -9,7 +9,7 @@ import pycolmap
 from scenefuse.core.transforms import Array
 from scenefuse.georef.placement import ROBUST_SD
 from scenefuse.marks.clicks import Click
-from scenefuse.sfm.adjustment import Freedom, adjustment_options
+from scenefuse.sfm.colmap import Freedom, adjustment_options
 
 # Relative gain that ends an adjustment.
 TOLERANCE = 1e-9

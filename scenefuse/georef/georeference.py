@@ -34,7 +34,7 @@ from scenefuse.photos.cameras.place import Place, read_place
 from scenefuse.photos.geodesy import LocalFrame, local_frame
 from scenefuse.photos.photos import Photo, gps_accuracies, gps_positions, read_photos
 from scenefuse.photos.workspace import posed_images, read_model
-from scenefuse.sfm.adjustment import Freedom, drop_outliers
+from scenefuse.sfm.colmap import Freedom, drop_outliers
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
 from scenefuse.sfm.lens import LENSES
 

@@ -26,7 +26,7 @@ from scenefuse.metrics.truth import (
     sample_surface,
     true_depth,
 )
-from scenefuse.photos.maps import read_depth
+from scenefuse.photos.pictures import read_depth
 
 # Photos whose depth maps are compared, spread evenly.
 COMPARED_PHOTOS = 8

@@ -18,9 +18,9 @@ from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import neighbours, vote
 from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.photos.geodesy import length_unit
-from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.pictures import read_depth, write_depth
 from scenefuse.photos.workspace import View, read_views
-from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.colmap import cancellable
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01

@@ -15,9 +15,9 @@ from scenefuse.core.stage import StageError, atomic_directory, manifest, quantit
 from scenefuse.mvs.plane_sweep import DepthMapSettings, estimate_depth
 from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.mvs.view_selection import Reference, select_views
-from scenefuse.photos.maps import read_depth, write_depth, write_normals
+from scenefuse.photos.pictures import read_depth, write_depth, write_normals
 from scenefuse.photos.workspace import View, Workspace, read_workspace
-from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.colmap import cancellable
 
 MAPS = ("depth_maps", "normal_maps")
 

@@ -20,7 +20,7 @@ from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import sparse_depths
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
-from scenefuse.photos.maps import read_depth, read_normals
+from scenefuse.photos.pictures import read_depth, read_normals
 from scenefuse.photos.views import Views, load_views
 
 Maps = NDArray[np.float32]

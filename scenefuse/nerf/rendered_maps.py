@@ -17,8 +17,7 @@ from scenefuse.nerf.prior.confirmed import MAP_AGREEMENT
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
-from scenefuse.photos.maps import write_depth, write_normals
-from scenefuse.photos.pictures import write_picture
+from scenefuse.photos.pictures import write_depth, write_normals, write_picture
 from scenefuse.photos.views import Views
 
 Maps = NDArray[np.float32]

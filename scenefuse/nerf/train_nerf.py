@@ -18,8 +18,7 @@ from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, 
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe
-from scenefuse.photos.maps import read_depth, read_normals
-from scenefuse.photos.pictures import read_gray, read_rgb
+from scenefuse.photos.pictures import read_depth, read_gray, read_normals, read_rgb
 from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet, save_png
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings

@@ -9,8 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array, Sim3, rotation_between
-from scenefuse.photos.maps import read_depth
-from scenefuse.photos.pictures import read_mask, read_rgb
+from scenefuse.photos.pictures import read_depth, read_mask, read_rgb
 from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.render import orbit_camera, point_radii, render

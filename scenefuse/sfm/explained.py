@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from scenefuse.sfm.adjustment import MAX_REPROJECTION_ERROR_PX
+from scenefuse.sfm.colmap import MAX_REPROJECTION_ERROR_PX
 
 # Matches that chance hardly gives a pair: as many as COLMAP needs to place a photo. Between leaves, guided matching
 # along a wrong epipolar line finds 15 to 20.

@@ -11,7 +11,7 @@ import pycolmap
 from scenefuse.core.stage import StageError, atomic_file, setting, threads
 from scenefuse.photos.cameras.posed_photo import at_size
 from scenefuse.photos.photos import Photo, check_unchanged, read_photos
-from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.colmap import cancellable
 
 # Fewer features in a photo than this deserve a note: blur, fog, or a wall without texture.
 FEW_FEATURES = 100

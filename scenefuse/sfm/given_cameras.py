@@ -12,7 +12,7 @@ from scenefuse.core.stage import StageError, scratch_directory
 from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.photo_files import frame_name
-from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.colmap import cancellable
 
 # Cameras that fit their photos give each photo so many points at least, in the median.
 MIN_POINTS = 20

@@ -13,7 +13,7 @@ import pycolmap
 
 from scenefuse.core.stage import quantity
 from scenefuse.core.transforms import Array
-from scenefuse.sfm.adjustment import ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
+from scenefuse.sfm.colmap import ROBUST_PX, ROUGH_TOLERANCE, Freedom, adjust
 
 # A richer lens has to predict held-out observations better by so many standard errors.
 MIN_GAIN = 3.0

@@ -26,18 +26,18 @@ from scenefuse.marks.lengths import read_lengths
 from scenefuse.photos.cameras.read_cameras import place_of
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.photos import orientations_in, read_photos
-from scenefuse.sfm.adjustment import (
+from scenefuse.sfm.colmap import (
     ITERATIONS,
     MAX_REPROJECTION_ERROR_PX,
     MIN_PHOTOS,
     ROUGH_TOLERANCE,
     TOLERANCE,
     adjust,
+    cancellable,
     drop_outliers,
 )
 from scenefuse.sfm.explained import STRONG_PAIR, doubtful_photos, explained_matches
 from scenefuse.sfm.given_cameras import triangulated
-from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, describe_lens
 
 # A second mapping that explains this share of the matches that the first explains is the better one: less is chance.

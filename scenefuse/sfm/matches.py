@@ -23,7 +23,7 @@ from scipy.spatial.distance import cdist
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, setting, threads, value, write_json
 from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
-from scenefuse.sfm.interrupt import cancellable
+from scenefuse.sfm.colmap import cancellable
 
 Pair = tuple[str, str]
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.photos.workspace import read_model
-from scenefuse.sfm.adjustment import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import MIN_PHOTOS, ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.lens import LENSES, Lens
 
 # Groups of photos, each left out once.

@@ -15,8 +15,8 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.photos import check_unchanged, read_photos
 from scenefuse.photos.pictures import JPEG_QUALITY
 from scenefuse.photos.workspace import View, read_workspace
+from scenefuse.sfm.colmap import cancellable
 from scenefuse.sfm.gravity import estimate_up, roll_spread_deg
-from scenefuse.sfm.interrupt import cancellable
 
 # A picture with more than this many times the pixels (along one side) is averaged before it is sampled. Undistorting
 # alone scales by a few percent, which bilinear sampling does better without.

@@ -37,7 +37,7 @@ from scenefuse.metrics.truth import (
     sample_surface,
     true_depth,
 )
-from scenefuse.photos.maps import read_depth
+from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, Workspace, read_workspace
 
 ROOT = Path(__file__).resolve().parents[2]

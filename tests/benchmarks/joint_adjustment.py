@@ -23,7 +23,7 @@ from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.register.align_models import MAX_ERROR_PX, AlignmentSettings, align_landmarks
 from scenefuse.register.landmarks import match_landmarks
 from scenefuse.register.reprojection import match_errors, observations
-from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, Freedom, adjustment_options, drop_outliers
+from scenefuse.sfm.colmap import ROUGH_TOLERANCE, Freedom, adjustment_options, drop_outliers
 
 # Ids of the object's camera, photos and points in the joint model lie so far above those of the scene's.
 ABOVE = 1_000_000

@@ -23,7 +23,7 @@ from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
 from scenefuse.nerf.object_cloud import CloudSettings, SurfaceMaps, clean, fuse_depths
-from scenefuse.photos.maps import read_depth, read_normals, write_depth
+from scenefuse.photos.pictures import read_depth, read_normals, write_depth
 from scenefuse.photos.views import Views, load_views
 
 # Depth maps: the scene's settings, and a smaller window. Of seven variants on the house at half the width (score,

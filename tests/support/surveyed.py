@@ -14,7 +14,7 @@ from scenefuse.photos.cameras.place import Place
 from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, write_photos
 from scenefuse.photos.workspace import View
-from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.lens import HELD
 
 FRAME = LocalFrame(47.37, 8.55, 430.0)

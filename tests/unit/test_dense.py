@@ -17,7 +17,7 @@ from scenefuse.mvs import dense_cloud
 from scenefuse.mvs.dense_cloud import DenseCloudSettings, fuse_depth_maps
 from scenefuse.mvs.depth_maps import estimate_depth_maps
 from scenefuse.mvs.plane_sweep import DepthMapSettings
-from scenefuse.photos.maps import read_depth, read_normals, write_depth, write_normals
+from scenefuse.photos.pictures import read_depth, read_normals, write_depth, write_normals
 from scenefuse.photos.workspace import View
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 150.0

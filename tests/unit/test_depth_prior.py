@@ -10,7 +10,7 @@ from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.mvs.photo_refinement import RefinementSettings
 from scenefuse.nerf.prior import refine_depth as feedback
 from scenefuse.nerf.prior.confirmed import DepthPrior, confirm, read_prior, write_prior
-from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.pictures import read_depth, write_depth
 
 MATCHING = RefinementSettings(match_reach_px=8.0)
 AS_IT_IS = RefinementSettings(match_reach_px=0.0)

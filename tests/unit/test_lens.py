@@ -10,7 +10,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Sim3
 from scenefuse.register.uncertainty import Uncertainty, with_bending
 from scenefuse.sfm import spread as bundle
-from scenefuse.sfm.adjustment import ROUGH_TOLERANCE, adjust
+from scenefuse.sfm.colmap import ROUGH_TOLERANCE, adjust
 from scenefuse.sfm.features import read_calibration
 from scenefuse.sfm.lens import BROWN, CENTRED, HELD, RADIAL, choose_lens, enrich
 from scenefuse.sfm.spread import Spread, read_spread, spread_of, write_spread

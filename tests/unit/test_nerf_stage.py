@@ -19,7 +19,7 @@ from scenefuse.nerf.object_cloud import CloudGates, CloudInputs, CloudSettings, 
 from scenefuse.nerf.rendered_maps import RenderedMapSettings
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_object_nerf
 from scenefuse.nerf.training import NerfRecipe, Schedule
-from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.pictures import read_depth, write_depth
 
 ROOT = Path(__file__).resolve().parents[2]
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)

@@ -19,7 +19,7 @@ from scenefuse.nerf.object_cloud import (
     read_maps,
     with_plane_normals,
 )
-from scenefuse.photos.maps import write_depth, write_normals
+from scenefuse.photos.pictures import write_depth, write_normals
 from scenefuse.photos.views import Views
 
 SETTINGS = CloudSettings(min_views=3, spacing=0.01, gates=CloudGates(point_agreement=0.02, min_component=0.02))

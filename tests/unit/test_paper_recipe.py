@@ -38,7 +38,7 @@ from scenefuse.paper.order_and_edges import RANK_WEIGHT
 from scenefuse.paper.refine_as_paper import EarlierStages, refine_as_paper
 from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
 from scenefuse.photos.workspace import View, read_workspace
-from scenefuse.sfm import adjustment, matches
+from scenefuse.sfm import colmap, matches
 from scenefuse.sfm.lens import KNOWN
 
 CPU = torch.device("cpu")
@@ -70,7 +70,7 @@ def test_the_constants_are_the_papers():
 def test_the_constants_of_sfm_are_the_papers():
     own = read_settings(ROOT / "config/paper.yaml")["scene"]
     assert (own["matches"]["max_ratio"], matches.MAX_DISTANCE, own["matches"]["guided_matching"]) == (0.7, 0.7, True)
-    options = adjustment.adjustment_options(KNOWN.freedom, adjustment.TOLERANCE).ceres.solver_options
+    options = colmap.adjustment_options(KNOWN.freedom, colmap.TOLERANCE).ceres.solver_options
     assert (options.max_num_iterations, options.max_linear_solver_iterations) == (100, 200)
     assert options.function_tolerance == options.gradient_tolerance == options.parameter_tolerance == 0
 

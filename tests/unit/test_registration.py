@@ -16,7 +16,7 @@ from scenefuse.geometry.free_space import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.geometry.surface import pair, prepare
 from scenefuse.paper.register_as_paper import register_as_paper
-from scenefuse.photos.maps import write_depth
+from scenefuse.photos.pictures import write_depth
 from scenefuse.register.candidates import match, ransac_similarities, upright_candidates
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses, register_coarsely
 from scenefuse.register.decision import FineSettings

@@ -14,9 +14,9 @@ from scenefuse.photos.geodesy import LocalFrame
 from scenefuse.photos.photos import Photo, list_photos, read_photos, write_photos
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm import mapping
+from scenefuse.sfm.colmap import cancellable
 from scenefuse.sfm.explained import doubtful_photos, explained_matches
 from scenefuse.sfm.features import FeatureSettings, camera_groups, extract_features
-from scenefuse.sfm.interrupt import cancellable
 from scenefuse.sfm.mapping import MappingSettings, map_photos
 from scenefuse.sfm.matches import MatchSettings, choose_pairs, match_features, sequential_pairs, spatial_pairs
 from scenefuse.sfm.undistort import UndistortSettings, undistort_photos, undistort_picture

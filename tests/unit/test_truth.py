@@ -21,8 +21,7 @@ from scenefuse.metrics.evaluate_scene import evaluate_scene
 from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
 from scenefuse.metrics.scores import f_score, scores_at
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
-from scenefuse.photos.maps import write_depth
-from scenefuse.photos.pictures import read_gray
+from scenefuse.photos.pictures import read_gray, write_depth
 
 TRUTH_FROM_OBJECT = Sim3(
     2.5, rotation_between(np.array([0, 0, 1.0]), np.array([0.3, -0.5, 0.8])), np.array([3.0, 1, 2])

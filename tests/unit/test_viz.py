@@ -11,7 +11,7 @@ from support.changed_scene import write_changes
 from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.photos.maps import write_depth
+from scenefuse.photos.pictures import write_depth
 from scenefuse.photos.sheets import save_png
 from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, draw_scene
 from scenefuse.report.page import view_section

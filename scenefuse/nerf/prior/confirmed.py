@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scenefuse.core.stage import quantity
 from scenefuse.geometry.consistency import compare, extent, surface_points
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
-from scenefuse.photos.maps import read_depth, write_depth
+from scenefuse.photos.pictures import read_depth, write_depth
 from scenefuse.photos.views import Views
 
 # Two depths of one place agree within this share of the object's diagonal.

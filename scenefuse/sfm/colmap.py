@@ -1,11 +1,13 @@
-"""Bundle adjustment with COLMAP, as the paper has it, with weights that outliers do not pull."""
+"""COLMAP's long calls, which a signal can end, and its bundle adjustment: the paper's, with robust weights."""
 
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import pycolmap
 
 from scenefuse.core.stage import threads
-from scenefuse.sfm.interrupt import cancellable
 
 # He et al. 2026: iterations of a global bundle adjustment, of the linear solver within one, and its tolerance; 0 runs
 # all iterations.
@@ -63,3 +65,31 @@ def drop_outliers(model: pycolmap.Reconstruction) -> None:
     observations.filter_all_points3D(MAX_REPROJECTION_ERROR_PX, min_tri_angle=min_angle_deg)
     observations.filter_observations_with_negative_depth()
     model.update_point_3d_errors()
+
+
+def cancellable(function: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    """Call a long pycolmap function so that a signal ends it: it runs beside the main thread and is cancelled.
+
+    A handler for SIGTERM only runs in the main thread, and only between two Python instructions.
+    """
+    token = pycolmap.CancellationToken()
+    outcome: dict[str, Any] = {}
+
+    def work() -> None:
+        try:
+            outcome["result"] = function(*args, cancellation_token=token, **kwargs)
+        except BaseException as error:
+            outcome["error"] = error
+
+    worker = threading.Thread(target=work)
+    worker.start()
+    try:
+        while worker.is_alive():
+            worker.join(0.2)
+    except BaseException:
+        token.cancel()
+        worker.join()
+        raise
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["result"]
