@@ -9,12 +9,10 @@ from nicegui import ui
 from scenefuse.core.stage import StageError
 from scenefuse.pick.document import Document, FileChanged
 from scenefuse.pick.editor import Editor
-from scenefuse.pick.mask_layers import MaskLayers
-from scenefuse.pick.photo_map import PhotoMap
-from scenefuse.pick.photo_strip import PhotoStrip
+from scenefuse.pick.panels import PhotoStrip, SidePanel
+from scenefuse.pick.photo_map import MaskLayers, PhotoMap
 from scenefuse.pick.photo_tiles import BACKGROUND, Picture
 from scenefuse.pick.session import Session
-from scenefuse.pick.side_panel import SidePanel
 from scenefuse.pick.tables import Table
 
 STYLE = """

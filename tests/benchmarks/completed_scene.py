@@ -31,7 +31,13 @@ from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
 from scenefuse.fuse.write import FROM_OBJECT, together
 from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
-from scenefuse.metrics.object_truth import ObjectTruth, around_object, read_object_truth, scene_scores, surface_to_find
+from scenefuse.metrics.evaluate_object import (
+    ObjectTruth,
+    around_object,
+    read_object_truth,
+    scene_scores,
+    surface_to_find,
+)
 from scenefuse.metrics.scores import THRESHOLDS
 from scenefuse.metrics.true_cameras import read_cameras
 from scenefuse.metrics.truth import registration_error

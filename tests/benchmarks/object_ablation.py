@@ -20,7 +20,13 @@ import torch
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, read_json, run, value
-from scenefuse.metrics.object_truth import COMPARED_PHOTOS, ObjectTruth, cloud_results, depth_results, read_object_truth
+from scenefuse.metrics.evaluate_object import (
+    COMPARED_PHOTOS,
+    ObjectTruth,
+    cloud_results,
+    depth_results,
+    read_object_truth,
+)
 from scenefuse.metrics.truth import SAMPLES, belongs_to_object, distances
 from scenefuse.nerf.object_cloud import CloudInputs, CloudSettings, make_object_cloud
 from scenefuse.nerf.prior.refine_depth import refine_depth

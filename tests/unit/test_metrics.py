@@ -14,10 +14,10 @@ from scenefuse.metrics.completion import (
     completion_metrics,
     completion_of,
     local_density,
+    primitive_fitting_score,
     surface_variation,
 )
 from scenefuse.metrics.compute_metrics import compute_metrics, compute_scene_metrics
-from scenefuse.metrics.primitives import primitive_fitting_score
 from scenefuse.register.agreement import MAX_COMPARED_POINTS, registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(

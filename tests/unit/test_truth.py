@@ -16,9 +16,14 @@ from scenefuse.core.stage import StageError, quantity, read_json, value, write_j
 from scenefuse.core.transforms import Sim3, look_at, rotation_between
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.metrics import truth as tr
-from scenefuse.metrics.evaluate_object import EvaluationInputs, evaluate_object
+from scenefuse.metrics.evaluate_object import (
+    EvaluationInputs,
+    around_object,
+    evaluate_object,
+    read_object_truth,
+    scene_scores,
+)
 from scenefuse.metrics.evaluate_scene import evaluate_scene
-from scenefuse.metrics.object_truth import around_object, read_object_truth, scene_scores
 from scenefuse.metrics.scores import f_score, scores_at
 from scenefuse.metrics.true_cameras import Cameras, cameras_json, pinhole
 from scenefuse.photos.pictures import read_gray, write_depth
