@@ -10,13 +10,13 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.fuse.compare import KEPT, REPLACED
+from scenefuse.fuse.compare import KEPT, REPLACED, SAME_PLACE_SPACINGS
 from scenefuse.fuse.measure import FIELDS, unchecked
 from scenefuse.fuse.write import Changes, Rows
 
-# Points farther than so many spacings of the scene from all of its points are new to it, or so many median distances
+# Points farther than SAME_PLACE_SPACINGS of the scene from all of its points are new to it, or so many median distances
 # between the clouds where both exist, if that is more: noise does not add a second layer.
-FILL_SPACINGS, FILL_RESIDUALS = 1.5, 1.5
+FILL_RESIDUALS = 1.5
 # Least and largest gain of an object's colours, and pairs of points that it is computed from at least.
 GAINS, MIN_PAIRS = (0.5, 2.0), 50
 # Points of the scene within so many of its spacings of the object's box are compared with it.
@@ -94,7 +94,7 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
     near = np.flatnonzero(((scene.points >= low) & (scene.points <= high)).all(1))
     near = near if len(near) else np.arange(len(scene))
     distance = cKDTree(scene.points[near]).query(moved.points, workers=threads())[0]
-    fill = FILL_SPACINGS * step
+    fill = SAME_PLACE_SPACINGS * step
     overlap = distance <= 3 * fill
     if overlap.sum() > MIN_PAIRS:
         fill = max(fill, FILL_RESIDUALS * float(np.median(distance[overlap])))

@@ -15,14 +15,13 @@ from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, concatenate, records_of
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS
-from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows, TiledCloud, open_cloud, reserved
+from scenefuse.cloud.tiled_cloud import Rows, TiledCloud, open_cloud, reserved
 from scenefuse.core.transforms import Array
 from scenefuse.fuse.compare import KEPT
 from scenefuse.fuse.measure import FIELDS, MEASURED, unchecked
 
 FROM_SCENE, FROM_OBJECT = 0, 1
 """Values of the field `source` of an object's clouds."""
-NO_TILES = np.zeros(0, ROW_OF_TILE)
 
 
 @dataclass(frozen=True)
@@ -130,7 +129,7 @@ def write_completed(
     changes: Changes,
     added: list[Cloud],
     count: int,
-    tiles: NDArray[Any] = NO_TILES,
+    tiles: NDArray[Any],
 ) -> None:
     """Write a completed scene as PLY, part by part: what the changes leave of the scene, then what comes in.
 
@@ -141,7 +140,7 @@ def write_completed(
         changes: that objects make to it.
         added: clouds with the fields of evidence and `source`.
         count: points that are left and come in.
-        tiles: (T,) ROW_OF_TILE, a row for each tile, for the file's end.
+        tiles: (T,) ROW_OF_TILE, a row for each tile, for the file's end; none for a file that is not read in tiles.
     """
     columns = changes.left_of(np.zeros(0, np.int64), like)
     columns = replace(columns, fields=dict(sorted(columns.fields.items())))

@@ -17,8 +17,6 @@ from scenefuse.photos.workspace import View
 
 # Views that a view is compared with at most: what more photos cost then grows with them, not with their square.
 MAX_VIEWS = 64
-# Points that a thread takes through the maps together.
-POINTS_A_BLOCK = 4096
 
 
 @dataclass(frozen=True)
@@ -126,10 +124,11 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
     A thread takes neighbouring points through one map after the other: what they look up stays in its cache.
     """
     height, width = depths.shape[1:]
-    for block in prange((len(points) + POINTS_A_BLOCK - 1) // POINTS_A_BLOCK):
+    together = 4096  # points
+    for block in prange((len(points) + together - 1) // together):
         for other in compared:
             pose, k = frame_from_cam[other], intrinsics[other]
-            for n in range(block * POINTS_A_BLOCK, min((block + 1) * POINTS_A_BLOCK, len(points))):
+            for n in range(block * together, min((block + 1) * together, len(points))):
                 dx, dy, dz = points[n, 0] - pose[0, 3], points[n, 1] - pose[1, 3], points[n, 2] - pose[2, 3]
                 z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
                 if not z > 0:

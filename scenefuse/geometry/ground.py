@@ -14,8 +14,6 @@ MIN_POINTS, MIN_CELLS = 50, 20
 TRIPLES, MIN_SHARE = 400, 0.3
 # Cells of a strip narrower than this share of its length, a ledge or the foot of a wall, fix no slope across it.
 MIN_BREADTH = 0.2
-# Rounds of Tukey weights for the plane and for the parabola, twice.
-ROUNDS = 10
 
 
 @dataclass(frozen=True)
@@ -118,7 +116,7 @@ def _height_field(xy: Array, z: Array, plane: Array, tolerance: float) -> Array:
     terms, coefficients = quadratic_terms(xy), np.concatenate([plane, np.zeros(3)])
     flat = coefficients
     for columns in (3, 6, 6):
-        for _ in range(ROUNDS):
+        for _ in range(10):
             residual = z - terms @ coefficients
             weight = (1 - np.minimum(np.abs(residual) / (3 * tolerance), 1) ** 2) ** 2
             root = np.sqrt(weight)[:, None]

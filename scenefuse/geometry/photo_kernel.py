@@ -26,7 +26,6 @@ REFERENCES, REFERENCE_ANGLE, ENOUGH = 3, math.radians(20), 4
 NOISE = 1.5
 
 _REFERENCE_COSINE = math.cos(REFERENCE_ANGLE)
-_BLOCK = 64
 _SIDE = 2 * RADIUS + 1
 _SAMPLES = _SIDE * _SIDE
 _STEPS = 2 * OFFSETS + 1
@@ -259,13 +258,14 @@ def match_points(  # type: ignore[no-untyped-def]
     (N,) of an offset.
     """
     count, views = len(points), len(focals)
-    for block in prange((count + _BLOCK - 1) // _BLOCK):
+    together = 64  # points
+    for block in prange((count + together - 1) // together):
         quality, cosine = np.zeros(views), np.zeros(views)
         chosen, angles, tried = np.zeros(OTHERS, np.int64), np.zeros(OTHERS), np.zeros(REFERENCES, np.int64)
         patch, weight = np.zeros(_SAMPLES, np.float32), np.zeros(_SAMPLES, np.float32)
         samples, ncc = np.zeros((_STEPS, _SAMPLES), np.float32), np.zeros((OTHERS, _STEPS))
         information, at_offset, worth = np.zeros(OTHERS), np.zeros(OTHERS), np.zeros(OTHERS)
-        for i in range(block * _BLOCK, min((block + 1) * _BLOCK, count)):
+        for i in range(block * together, min((block + 1) * together, count)):
             curve[i], spread[i], tested[i], confirming[i], texture[i], step_length[i] = -1.0, np.inf, 0, 0, 0.0, 0.0
             point, normal = points[i], normals[i]
             _photos_of(point, normal, projections, centres, focals, sizes, quality, cosine)

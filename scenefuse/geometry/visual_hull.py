@@ -18,8 +18,6 @@ from scenefuse.photos.workspace import View
 Mask = NDArray[np.bool_]
 Counts = NDArray[np.int32]
 
-# Photos after which `carve` leaves out the voxels that are decided: most are, early.
-CARVED_PHOTOS = 4
 # Photos that must frame a place: a share of those that frame this percentile of the object's own points; never fewer.
 MIN_FRAMING_SHARE, FRAMING_PERCENTILE, MIN_PHOTOS = 0.25, 10, 2
 # With fewer own points, the photos that show the object whole count, or this share of all photos.
@@ -174,8 +172,9 @@ def carve(
     centres = box.to_object(x_in_box).astype(np.float32)
     alive = np.flatnonzero(height_of(x_in_box) > 0)
     shown, missed = (np.zeros(len(centres), dtype=np.int32) for _ in range(2))
-    for start in range(0, len(silhouettes), CARVED_PHOTOS):
-        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + CARVED_PHOTOS]))
+    together = 4  # photos, after which the voxels that are decided are left out: most are, early
+    for start in range(0, len(silhouettes), together):
+        counts = count_silhouettes(centres[alive], map(Outline, silhouettes[start : start + together]))
         shown[alive] += counts.shown
         missed[alive] += counts.missed
         # A voxel outside more masks than all photos together could excuse is decided.

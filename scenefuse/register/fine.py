@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.alignment_picture import draw_alignment
-from scenefuse.geometry.free_space import FreeSpace, read_free_space
+from scenefuse.geometry.depth_test import FreeSpace, read_free_space
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import Candidate
 from scenefuse.register.decision import DecidedBy, FineSettings, tilt_deg

@@ -8,7 +8,7 @@ import numpy as np
 from scenefuse.cloud.clouds import Cloud, read_cloud
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.geometry.free_space import FreeSpace
+from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange
 from scenefuse.geometry.surface import Surface, prepare
 from scenefuse.register.uncertainty import Uncertainty

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates, maximum_filter
 
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.free_space import FreeSpace
+from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.icp import ScaleRange, refine_planes
 from scenefuse.geometry.surface import Surface
 from scenefuse.register.score import color_agreement, f_beta, worth

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
-from scenefuse.geometry.free_space import FreeSpace
+from scenefuse.geometry.depth_test import FreeSpace
 from scenefuse.geometry.surface import Pairs, Surface, pair
 
 # Beta of the F-beta score: recall weighs more, since the scene shows only a part of the object.

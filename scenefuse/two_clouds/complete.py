@@ -15,7 +15,7 @@ from scenefuse.cloud.clouds import MAX_STEP, Cloud, spacing
 from scenefuse.cloud.import_cloud import unit_and_name
 from scenefuse.cloud.readers.columns import COLOR
 from scenefuse.cloud.readers.las import las_crs
-from scenefuse.cloud.tiled_cloud import Rows
+from scenefuse.cloud.tiled_cloud import ROW_OF_TILE, Rows
 from scenefuse.cloud.write_las import LAS_DESCRIPTIONS, finer, las_writer
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import StageError, quantity, scratch_directory, write_json
@@ -38,7 +38,7 @@ FILES = ("completed.ply", "completed.laz", "completed.json")
 CHUNK = 1_000_000
 """Points of a LAS file that are copied at a time."""
 AXES = ("X", "Y", "Z")
-MOST = np.iinfo(np.int32).max
+MAX_INTEGER = np.iinfo(np.int32).max
 """Integers of a LAS file's coordinates, and the greatest of them."""
 
 
@@ -126,8 +126,10 @@ def write_files(out: Path, done: Completed, object: Path, scene: CloudFile) -> l
             notes += append_to_las(folder / "completed.laz", scene, done)
             if noise := scene.summary.rows - scene.summary.count:
                 notes.append(f"completed.ply leaves out the {noise} points that are not used; completed.laz has them")
-        count = scene.summary.count - len(done.removed) + len(done.added)
-        write_completed(folder / "completed.ply", scene.like, scene.parts(), done.changes, [done.added], count)
+        count, no_tiles = scene.summary.count - len(done.removed) + len(done.added), np.zeros(0, ROW_OF_TILE)
+        write_completed(
+            folder / "completed.ply", scene.like, scene.parts(), done.changes, [done.added], count, no_tiles
+        )
         _write_report(folder / "completed.json", done, object, scene, notes)
         written = [folder / name for name in FILES if (folder / name).exists()]
         return [path.replace(out / path.name) for path in written]
@@ -197,7 +199,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                 for name in chunk.array.dtype.names:
                     part.array[name] = chunk.array[name]
                 for axis in AXES if times > 1 else ():
-                    if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MOST:
+                    if np.abs(chunk.array[axis].astype(np.int64)).max(initial=0) * times > MAX_INTEGER:
                         raise StageError(f"points of {scene.summary.path} lie outside the box it names; write it again")
                     part.array[axis] *= times
                 if "red" in own:
@@ -224,13 +226,13 @@ def _finer_steps(header: Any, done: Completed, scene: Path) -> tuple[int, list[s
     """
     own, apart, notes = header.scales.copy(), spacing(done.added.points), list[str]()
     farthest = np.abs(done.added.points - header.offsets).max(0, initial=0) / own
-    if farthest.max() > MOST:
+    if farthest.max() > MAX_INTEGER:
         raise StageError(
             f"the coordinates of {scene} end before the object does: its steps of {own.max():g} are too small; write it"
             " again with larger ones (0.001)"
         )
     farthest = np.maximum(farthest, np.abs([header.mins, header.maxs] - header.offsets).max(0) / own)
-    step = finer(own.max(), apart, lambda step: bool(farthest.max() * (own.max() / step) <= MOST))
+    step = finer(own.max(), apart, lambda step: bool(farthest.max() * (own.max() / step) <= MAX_INTEGER))
     times = round(own.max() / step)
     if times > 1:
         header.scales = own / times

@@ -3,6 +3,7 @@
 import os
 import time
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -35,19 +36,24 @@ from scenefuse.register.register import (
 from scenefuse.two_clouds.complete import complete, fusion_settings, write_files
 from scenefuse.two_clouds.page import VIEW_REACH, write_page
 
-REGISTERED, UNREGISTERED = 0, 3
 NOTHING = Known()
-# An object may be so many times as large as the part of the scene that shows it.
-LARGEST = 10.0
-# And has to be at least so many times as large as its points are apart.
-SMALLEST = 10.0
+# An object may be so many times as large as the part of the scene that shows it, and has to be at least so many times
+# as large as the scene's points are apart.
+MAX_SIZE_RATIO, MIN_SPACINGS = 10.0, 10.0
 # Points of the part of a scene in which an object is searched: of many more, some are left out.
-SEARCHED = 1 << 22
+MAX_SEARCHED_POINTS = 1 << 22
 OUTPUTS = (
     *("transform.json", "transform.txt", "picture.png", "report.html", "completed.ply", "completed.laz"),
     *("completed.json", "object_in_scene.ply", "object_in_scene.laz", "object_in_scene.las"),
 )
 """All that a run may write; what an earlier one left of it is removed first."""
+
+
+class ExitStatus(IntEnum):
+    """Of the command."""
+
+    REGISTERED = 0
+    UNREGISTERED = 3
 
 
 @dataclass(frozen=True)
@@ -143,7 +149,7 @@ def register(
     if fuse:
         written += _fuse(out, given, found, content, known, config)
     print(f"written    {', '.join(map(str, written))}", flush=True)
-    return REGISTERED if found.registered else UNREGISTERED
+    return ExitStatus.REGISTERED if found.registered else ExitStatus.UNREGISTERED
 
 
 def _advice(known: Known) -> str:
@@ -177,7 +183,7 @@ def _read(object: Path, scene: Path, settings: RegistrationSettings, known: Know
     cloud = CloudFile.of(object)
     own, strays = without_strays(cloud.part, str(object))
     marked = search_box(settings.crop, known.fiducials, box)
-    whole = CloudFile.of(scene, marked, SEARCHED)
+    whole = CloudFile.of(scene, marked, MAX_SEARCHED_POINTS)
     crs = las_crs(scene)
     if crs is not None:
         from scenefuse.cloud.crs import check_place
@@ -251,7 +257,7 @@ def _check_size(scales: ScaleRange, given: Given) -> None:
     points."""
     most, part, step = scales.centre * float(np.exp(scales.width)), given.scene.part.diagonal, given.scene.spacing
     across = most * given.object.diagonal
-    if across > LARGEST * part or across < SMALLEST * step:
+    if across > MAX_SIZE_RATIO * part or across < MIN_SPACINGS * step:
         raise StageError(
             f"at a scale of {most:.4g} the object would be {across:.4g} across, and the searched part of the scene is"
             f" {part:.4g}, its points {step:.4g} apart; correct --scale or --scale-range: scene units per object unit"

@@ -22,7 +22,7 @@ from scenefuse.metrics.evaluate_object import read_object_truth, scene_scores, s
 from scenefuse.metrics.true_cameras import read_cameras
 from scenefuse.metrics.truth import registration_error
 from scenefuse.register.register import Known
-from scenefuse.two_clouds.register import REGISTERED, register
+from scenefuse.two_clouds.register import ExitStatus, register
 
 SAMPLES = 60000
 
@@ -49,7 +49,10 @@ def trial(results: Path, scene: str, name: str, seed: int, folder: Path) -> dict
         known=Known(up_scene=(0.0, 0.0, 1.0), fiducials=folder / "marks.txt"),
         seed=seed,
     )
-    row: dict[str, object] = {"object": name, "status": "registered" if status == REGISTERED else "unregistered"}
+    row: dict[str, object] = {
+        "object": name,
+        "status": "registered" if status == ExitStatus.REGISTERED else "unregistered",
+    }
     row["seconds"] = time.perf_counter() - start
     pose = Sim3.from_matrix(np.array(value(read_json(folder / "out/transform.json"), "scene_from_object"))) @ turned
     true = truth_from_scene.inverse() @ known.fit.truth_from_model

@@ -16,10 +16,9 @@ from scenefuse.fuse.compare import (
     SEEN_THROUGH,
     better_measured,
 )
-from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence
+from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence, settle
 from scenefuse.fuse.measure import FIELDS, MEASURED, NERF_ONLY, STEREO_ONLY, Measured, with_pose_uncertainty
 from scenefuse.fuse.modes import FusionSettings
-from scenefuse.fuse.settle import settle
 from scenefuse.geometry.photo_check import Matches, moved_photos, pack
 
 NOBODY = pack([])

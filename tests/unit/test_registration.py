@@ -12,7 +12,7 @@ from support.planted import errors, plant
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.free_space import read_free_space
+from scenefuse.geometry.depth_test import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.geometry.surface import pair, prepare
 from scenefuse.paper.register_as_paper import register_as_paper

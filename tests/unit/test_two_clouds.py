@@ -380,7 +380,7 @@ def in_parts(monkeypatch, rows, most):
     """Files are read so many rows at a time, and so many points of a part are held."""
     monkeypatch.setattr("scenefuse.cloud.formats.AT_ONCE", rows)
     monkeypatch.setattr("scenefuse.cloud.cloud_file.AT_ONCE", rows)
-    monkeypatch.setattr("scenefuse.two_clouds.register.SEARCHED", most)
+    monkeypatch.setattr("scenefuse.two_clouds.register.MAX_SEARCHED_POINTS", most)
 
 
 @pytest.mark.parametrize("ending", ["laz", "ply", "xyz"])
