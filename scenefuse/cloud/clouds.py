@@ -128,21 +128,21 @@ def _group_means(rows: NDArray[Any], group: NDArray[np.int64], counts: NDArray[n
     return np.stack([np.bincount(group, rows[:, k]) / counts for k in range(rows.shape[1])], axis=1)
 
 
-def spacing(points: NDArray[np.float64], sample: int = 5000, seed: int = 0, quantile: float = 0.5) -> float:
+def spacing(points: NDArray[np.float64], seed: int = 0, quantile: float = 0.5) -> float:
     """Median (or other quantile) distance from a point to its nearest neighbour elsewhere, by a seeded sample; 0 where
     all are in one place. Of points that coincide, as in a scan that was merged twice, one counts."""
-    distance = _to_nearest(points, sample, seed)
+    distance = _to_nearest(points, seed)
     if np.count_nonzero(distance == 0) > MIN_COINCIDING * len(distance):
-        distance = _to_nearest(np.unique(points, axis=0), sample, seed)
+        distance = _to_nearest(np.unique(points, axis=0), seed)
     distance = distance[distance > 0]
     return float(np.quantile(distance, quantile)) if len(distance) else 0.0
 
 
-def _to_nearest(points: NDArray[np.float64], sample: int = 5000, seed: int = 0) -> NDArray[np.float64]:
-    """Distances from some of (N, 3) points to their nearest neighbours; none for one point."""
+def _to_nearest(points: NDArray[np.float64], seed: int = 0) -> NDArray[np.float64]:
+    """Distances from up to 5000 of (N, 3) points to their nearest neighbours; none for one point."""
     if len(points) < 2:
         return np.zeros(0)
-    chosen = np.random.default_rng(seed).choice(len(points), min(sample, len(points)), replace=False)
+    chosen = np.random.default_rng(seed).choice(len(points), min(5000, len(points)), replace=False)
     return np.asarray(cKDTree(points).query(points[chosen], k=2)[0][:, 1])
 
 

@@ -26,8 +26,6 @@ from scenefuse.core.transforms import Array
 TILE = 1 << 16
 # A cloud of up to so many points is one tile and keeps its order: reading all of it takes no longer.
 WHOLE = AT_ONCE
-# Tiles of a larger cloud in which its spacing is measured.
-SPACING_TILES = 8
 BOX = ("low_x", "low_y", "low_z", "high_x", "high_y", "high_z")
 # A row of the element `tile`.
 ROW_OF_TILE = np.dtype([("count", "<u4"), *((name, "<f8") for name in BOX)])
@@ -115,7 +113,7 @@ class TiledCloud:
         """All points (N, 3), or of a larger cloud those of a few tiles, drawn by points."""
         if len(self) <= WHOLE:
             return [self.read(np.arange(len(self.low)))[1].points]
-        drawn = np.random.default_rng(seed).integers(0, len(self), SPACING_TILES)
+        drawn = np.random.default_rng(seed).integers(0, len(self), 8)
         tiles = np.unique(np.searchsorted(self.starts, drawn, side="right") - 1)
         return [self.read(tiles[k : k + 1])[1].points for k in range(len(tiles))]
 

@@ -26,11 +26,6 @@ from scenefuse.core.stage import StageError, atomic_file
 SAVE_EVERY_SECONDS = 30.0
 
 SECONDS_BETWEEN_LINES = 5.0
-# A line shows the mean of so many steps: one step's losses jump.
-STEPS_IN_A_LINE = 20
-# The summary is taken over the last tenth of the steps, where the learning rate hardly changes anything any more.
-SUMMARY_SHARE = 10
-
 
 State = dict[str, Any]
 Terms = dict[str, float]
@@ -80,7 +75,8 @@ class Progress:
     def summary(self) -> Terms:
         """Mean terms of the last tenth of the steps, `steps`, `seconds`, `rays_per_second`, `samples_per_second`."""
         elapsed = max(time.monotonic() - self.start, 1e-9)
-        return self._means(max(1, self.steps // SUMMARY_SHARE)) | {
+        # There the learning rate hardly changes anything any more.
+        return self._means(max(1, self.steps // 10)) | {
             "steps": float(self.steps),
             "seconds": elapsed,
             "rays_per_second": self.rays / elapsed,
@@ -89,7 +85,8 @@ class Progress:
 
     def _line(self, done: int, elapsed: float) -> str:
         left = elapsed / (done - self.first) * (self.steps - done)
-        means = " ".join(f"{name} {mean:.4g}" for name, mean in self._means(STEPS_IN_A_LINE).items())
+        # The mean of 20 steps: one step's losses jump.
+        means = " ".join(f"{name} {mean:.4g}" for name, mean in self._means(20).items())
         speed = f"{self.rays / elapsed:.0f} rays/s {self.samples / elapsed:.0f} samples/s"
         return f"step {done}/{self.steps} {means} | {speed}, {left:.0f} s left"
 

@@ -33,7 +33,7 @@ DISTRIBUTIONS = {
 }
 IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+(\S+)[ \t]+)?import[ \t]+(\([^)]*\)|(?:\\\n|[^\n#;])+)", re.MULTILINE)
 REMEMBERED = Path(os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache"), "scenefuse/modules.json")
-LIBRARY = Path(__file__).resolve().parents[1]
+LIBRARY = Path(__file__).resolve().parent.parent
 # Files in the assets/ folder beside a module that imports this are part of its code.
 ASSETS_READER = "importlib.resources"
 OWN_SOURCE = Path(__file__).read_bytes()  # an edit here forgets all that is remembered

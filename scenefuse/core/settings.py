@@ -12,7 +12,7 @@ import yaml
 
 from scenefuse.core.stage import StageError
 
-PACKAGE = Path(__file__).resolve().parents[1]
+PACKAGE = Path(__file__).resolve().parent.parent
 SHIPPED = PACKAGE / "shipped"
 # Folder with workflow/, scripts/ and config/: inside the package where it was installed, else the clone's.
 ROOT = SHIPPED if SHIPPED.is_dir() else PACKAGE.parent

@@ -31,7 +31,6 @@ def setting(
     least: float | None = None,
     above: float | None = None,
     most: float | None = None,
-    below: float | None = None,
 ) -> Any:
     """A field of a settings dataclass that a settings file may set; a field without it is a constant of the algorithm.
 
@@ -41,9 +40,9 @@ def setting(
         default: its value where nobody sets it.
         unit: of the value, "" for a pure number or a word.
         least, above: lower bound, included or not.
-        most, below: upper bound, included or not.
+        most: upper bound, included.
     """
-    bounds = {"minimum": least, "exclusiveMinimum": above, "maximum": most, "exclusiveMaximum": below}
+    bounds = {"minimum": least, "exclusiveMinimum": above, "maximum": most}
     about = {"unit": unit, "bounds": {key: bound for key, bound in bounds.items() if bound is not None}}
     return dataclasses.field(default=default, metadata={"setting": about})
 

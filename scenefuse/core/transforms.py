@@ -108,10 +108,8 @@ def fit_sim3(x_in_a: Array, x_in_b: Array, weights: Array | None = None, scale: 
     return Sim3(scale, rotation, mean_b - scale * (rotation @ mean_a))
 
 
-def fit_sim3_robust(
-    x_in_a: Array, x_in_b: Array, threshold: float, seed: int = 0, trials: int = 1000
-) -> tuple[Sim3, NDArray[np.bool_]]:
-    """RANSAC over triples, then least squares on the inliers within `threshold` (units of b).
+def fit_sim3_robust(x_in_a: Array, x_in_b: Array, threshold: float, seed: int = 0) -> tuple[Sim3, NDArray[np.bool_]]:
+    """RANSAC over 1000 triples, then least squares on the inliers within `threshold` (units of b).
 
     Returns:
         b_from_a and the (N,) inlier mask.
@@ -121,7 +119,7 @@ def fit_sim3_robust(
     """
     rng = np.random.default_rng(seed)
     best = np.zeros(len(x_in_a), dtype=bool)
-    for _ in range(trials):
+    for _ in range(1000):
         triple = rng.choice(len(x_in_a), 3, replace=False) if len(x_in_a) >= 3 else np.arange(len(x_in_a))
         try:
             candidate = fit_sim3(x_in_a[triple], x_in_b[triple])

@@ -11,8 +11,6 @@ from scenefuse.georef.placement import ROBUST_SD
 from scenefuse.marks.clicks import Click
 from scenefuse.sfm.colmap import Freedom, adjustment_options
 
-# Relative gain that ends an adjustment.
-TOLERANCE = 1e-9
 # How far from its point, in metres, a camera stands that measures a coordinate: its aperture takes no depth in. Also
 # the standard deviation of an unknown height.
 CAMERA_DISTANCE_M = 1000.0
@@ -58,7 +56,6 @@ def adjust_to_survey(
     freedom: Freedom,
     photos: SurveyedPhotos,
     points: SurveyedPoints,
-    tolerance: float = TOLERANCE,
 ) -> None:
     """Adjust a model that lies in the local frame (metres) in place, by reprojection errors and by what was surveyed.
 
@@ -72,7 +69,6 @@ def adjust_to_survey(
         model: registered photos and points, georeferenced.
         freedom: what of the cameras may change.
         photos, points: what was surveyed; either may be empty, not both.
-        tolerance: relative gain that ends the adjustment.
     """
     held = copy.deepcopy(model)
     config = pycolmap.BundleAdjustmentConfig()
@@ -92,7 +88,7 @@ def adjust_to_survey(
     options.ceres.prior_position_loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.prior_position_loss_scale = ROBUST_SD
     adjuster = pycolmap.create_pose_prior_bundle_adjuster(
-        adjustment_options(freedom, tolerance), options, config, priors, held
+        adjustment_options(freedom, 1e-9), options, config, priors, held
     )
     adjuster.solve()
     for image in model.reg_image_ids():

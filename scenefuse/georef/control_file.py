@@ -21,9 +21,10 @@ CHECK = "CHK-"
 SD_M = (0.02, 0.03)
 # Coordinates, standard deviations, photo and pixel.
 Row = tuple[Array, tuple[float, float], str, Array]
-# Columns; those up to the photo's name are needed.
-LAYOUT = "x y z pixel_x pixel_y photo [name [horizontal sd [vertical sd]]]"
-MIN_CELLS = len(LAYOUT.partition(" [")[0].split())
+# Columns; those that are needed come first.
+NEEDED = ("x", "y", "z", "pixel_x", "pixel_y", "photo")
+LAYOUT = f"{' '.join(NEEDED)} [name [horizontal sd [vertical sd]]]"
+MIN_CELLS = len(NEEDED)
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, setting
 from scenefuse.core.transforms import SD_OVER_MEDIAN, Sim3, fit_sim3, fit_sim3_robust, rotation_between
-from scenefuse.georef.control import LocatedPoint, check_spread, describe_misses
+from scenefuse.georef.control import MIN_CONTROL_POINTS, LocatedPoint, check_spread, describe_misses
 from scenefuse.photos.geodesy import MAX_MEDIAN_DISTANCES
 from scenefuse.sfm.gravity import MAX_VERTICAL_SD_DEG
 
@@ -117,7 +117,7 @@ def place_by_control(
         fitted, inliers = fit_measured(start, there, limit, seed)
     except ValueError:
         inliers = np.zeros(len(rows), dtype=bool)
-    if inliers.sum() < max(3, len(rows) // 2 + 1):
+    if inliers.sum() < max(MIN_CONTROL_POINTS, len(rows) // 2 + 1):
         raise StageError(
             f"{where}: only {inliers.sum()} of {len(rows)} control points agree with the model within {limit:.2g} m;"
             " check their coordinates, whether x is easting and y northing, and where each was clicked"

@@ -21,7 +21,6 @@ COLUMNS += ["photos", "reprojection_px"]
 
 # Control points that miss their coordinates by so many standard deviations deserve a note.
 MISFIT_SD = 5.0
-MAX_NAMED = 3
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,7 @@ def _misfits(found: Georeference, control: Control, left: Residuals) -> list[str
         return []
     named = [
         "{} ({:+.2f} east, {:+.2f} north, {:+.2f} up)".format(control.located[k].point.name, *left.points[k])
-        for k in worst[:MAX_NAMED]
+        for k in worst[:3]
     ]
     return [
         f"{len(worst)} of {used.sum()} control points are more than {MISFIT_SD:g} stated standard deviations off, in"

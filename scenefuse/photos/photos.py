@@ -18,8 +18,7 @@ from scenefuse.photos.pictures import JPEG_QUALITY
 from scenefuse.photos.positions import positions_of, read_geo, rtk_accuracy
 
 # Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
-MAX_PIXELS = 250_000_000
-Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+Image.MAX_IMAGE_PIXELS = 250_000_000
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
 # What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.

@@ -45,14 +45,14 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     return channel > max(1, channel.max()) / 2
 
 
-def write_picture(path: Path, pixels: NDArray[np.uint8], jpeg_quality: int = JPEG_QUALITY) -> None:
+def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write (H, W) grey or (H, W, 3) RGB pixels in the format of the path's suffix.
 
     Raises:
         StageError: OpenCV could not write the file: a full disk, or a suffix it does not know.
     """
     stored = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR) if pixels.ndim == 3 else pixels
-    options = [cv2.IMWRITE_JPEG_QUALITY, jpeg_quality] if Path(path).suffix.lower() in (".jpg", ".jpeg") else []
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY] if Path(path).suffix.lower() in (".jpg", ".jpeg") else []
     try:
         written = cv2.imwrite(str(path), stored, options)
     except cv2.error:

@@ -16,7 +16,6 @@ from scenefuse.core.stage import atomic_file
 
 Image = NDArray[np.uint8]
 
-_DPI = 100
 _MAX_BYTES = 950_000
 
 
@@ -80,7 +79,8 @@ def draw_sheet(sheet: Sheet) -> Image:
 
 def new_figure(size_px: tuple[int, int]) -> Figure:
     """An empty white figure of that many pixels, with no display behind it."""
-    figure = Figure(figsize=(size_px[0] / _DPI, size_px[1] / _DPI), dpi=_DPI, facecolor="white")
+    dpi = 100
+    figure = Figure(figsize=(size_px[0] / dpi, size_px[1] / dpi), dpi=dpi, facecolor="white")
     FigureCanvasAgg(figure)
     return figure
 

@@ -37,8 +37,6 @@ POSITION_STEP_M = 0.1
 MAX_REPEATED_SHARE = 0.1
 # Largest descriptor distance of a match (the paper's).
 MAX_DISTANCE = 0.7
-# COLMAP looks at a cancellation only between two blocks of pairs.
-BLOCK = 100
 
 
 @dataclass(frozen=True)
@@ -92,7 +90,8 @@ def match_features(
                 pycolmap.match_image_pairs,
                 temporary,
                 matching_options=_matching(settings),
-                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=BLOCK),
+                # COLMAP looks at a cancellation only between two blocks of pairs.
+                pairing_options=pycolmap.ImportedPairingOptions(match_list_path=listed, block_size=100),
                 verification_options=_verification(seed),
                 device=pycolmap.Device.cpu,
             )

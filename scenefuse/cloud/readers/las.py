@@ -13,7 +13,8 @@ ENDINGS = (".las", ".laz")
 # What LAS says of a point that a scene's cloud keeps, and as what; of points that were measured otherwise both are 0.
 LAS_DIMENSIONS = {"classification": np.uint8, "intensity": np.uint16}
 # Classes of LAS that are no surface: low and high noise; the flag of points that whoever edited the cloud took out.
-NOISE, WITHHELD = (7, 18), "withheld"
+NOISE = (7, 18)
+WITHHELD = "withheld"
 
 
 def las_crs(path: Path) -> str | None:

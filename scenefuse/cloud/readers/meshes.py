@@ -18,12 +18,6 @@ Array = NDArray[np.float64]
 
 # Points drawn from a mesh; one with more vertices gives as many as it has.
 MESH_POINTS = 500_000
-# Steps of the plane-filling sequence that places points in faces (Roberts 2018, R2): any stretch of it is even.
-STEPS = (0.7548776662466927, 0.5698402909980532)
-# glTF 2.0, 3.6.2.2: component types, and components of an accessor's type.
-COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-WHITE = (255.0, 255.0, 255.0)
 
 
 @dataclass(frozen=True)
@@ -31,7 +25,7 @@ class Material:
     """The colour of faces: a picture (H, W, 3) RGB where there is one, else one colour, 0..255."""
 
     picture: NDArray[np.uint8] | None = None
-    color: tuple[float, ...] = WHITE
+    color: tuple[float, ...] = (255.0, 255.0, 255.0)
 
 
 @dataclass(frozen=True)
@@ -55,14 +49,13 @@ class Mesh:
     materials: tuple[Material, ...] = ()
 
 
-def sampled_columns(mesh: Mesh, least: int = MESH_POINTS) -> Columns:
+def sampled_columns(mesh: Mesh) -> Columns:
     """Points on the faces of a mesh, as many on each as its area asks for, with the faces' normals.
 
     Every n-th part of the area gets one point; no chance is involved.
 
     Args:
         mesh: at least one face with an area; faces without one, or with a vertex that is not finite, are left out.
-        least: points, or as many as there are vertices, if these are more.
 
     Raises:
         ValueError: a face names a vertex that is not there, or no face has an area.
@@ -75,9 +68,10 @@ def sampled_columns(mesh: Mesh, least: int = MESH_POINTS) -> Columns:
     ends = np.cumsum(double)
     if not len(ends) or ends[-1] == 0:
         raise ValueError("none of its faces has an area")
-    count = max(least, len(mesh.vertices))
+    count = max(MESH_POINTS, len(mesh.vertices))
     face = np.searchsorted(ends, (np.arange(count) + 0.5) / count * ends[-1], side="right")
-    u, v = ((np.arange(1, count + 1) * step) % 1 for step in STEPS)
+    # A plane-filling sequence (Roberts 2018, R2): any stretch of it is even.
+    u, v = ((np.arange(1, count + 1) * step) % 1 for step in (0.7548776662466927, 0.5698402909980532))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     weights = np.stack([1 - u - v, u, v], axis=1)
     points = a[face] + u[:, None] * (b - a)[face] + v[:, None] * (c - a)[face]
@@ -94,11 +88,11 @@ def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None
     """(N, 3) colours at points of faces (N,) with barycentric weights (N, 3): of the vertices, else the materials."""
     if mesh.colors is not None:
         return np.asarray(np.einsum("nk,nkc->nc", weights, mesh.colors[mesh.faces[face]]))
-    if all(material.picture is None and material.color == WHITE for material in mesh.materials):
+    if all(material.picture is None and material.color == Material.color for material in mesh.materials):
         if mesh.materials:
             print("note: the mesh's materials have neither pictures nor colours: it has none", flush=True)
         return None
-    colors, of = np.tile(np.array(WHITE), (len(face), 1)), mesh.material[face]
+    colors, of = np.full((len(face), 3), 255.0), mesh.material[face]
     for number, material in enumerate(mesh.materials):
         rows = np.flatnonzero(of == number)
         colors[rows] = material.color
@@ -298,7 +292,10 @@ def _values(document: dict[str, Any], blob: bytes, accessor: int) -> Array:
     if "bufferView" not in about or "sparse" in about:
         raise ValueError("its meshes are stored in a form that is not read (sparse); export it again")
     view = document["bufferViews"][about["bufferView"]]
-    kind, width = np.dtype(COMPONENTS[about["componentType"]]), WIDTHS[about["type"]]
+    # glTF 2.0, 3.6.2.2: component types, and components of an accessor's type.
+    kinds = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+    kind, width = np.dtype(kinds[about["componentType"]]), widths[about["type"]]
     start, step = view.get("byteOffset", 0) + about.get("byteOffset", 0), view.get("byteStride", kind.itemsize * width)
     table = np.ndarray((about["count"], width), kind, blob, start, (step, kind.itemsize)).astype(np.float64)
     return table / np.iinfo(kind).max if about.get("normalized") else table

@@ -132,10 +132,10 @@ def header_of(elements: list[Element]) -> bytes:
     return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
-def _lines(file: BinaryIO, most: int = 1000) -> list[str]:
+def _lines(file: BinaryIO) -> list[str]:
     """The header's lines; fewer where the file is something else."""
     lines: list[str] = []
-    while len(lines) < most and (not lines or lines[-1] != "end_header"):
+    while len(lines) < 1000 and (not lines or lines[-1] != "end_header"):
         line = file.readline(1000)
         lines.append(line.decode("ascii", "replace").strip())
         if not line or lines[0] != "ply":

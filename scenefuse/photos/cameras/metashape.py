@@ -21,10 +21,8 @@ PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "
 MAX_OFF_PX = 0.5
 # How the CRS of a chunk that does not lie on the earth begins.
 LOCAL = "LOCAL_CS"
-# The earth's radius, and how far a place near its surface may be from that: it is flattened by 21 km.
-EARTH_M, MAX_ALTITUDE_M = 6.371e6, 40e3
-# Rays that it is fitted to, in each direction over the photo.
-GRID = 33
+# How far a place near the earth's surface may be from its mean radius: it is flattened by 21 km.
+MAX_ALTITUDE_M = 40e3
 
 
 def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
@@ -101,7 +99,7 @@ def _active(chunk: ET.Element) -> str | None:
 
 def _on_earth(outside_from_chunk: Sim3) -> bool:
     """Whether a chunk's origin lies near the earth's surface, in geocentric coordinates."""
-    return abs(float(np.linalg.norm(outside_from_chunk.translation)) - EARTH_M) < MAX_ALTITUDE_M
+    return abs(float(np.linalg.norm(outside_from_chunk.translation)) - 6.371e6) < MAX_ALTITUDE_M
 
 
 def _local_from_chunk(chunk: ET.Element, where: str) -> Sim3 | None:
@@ -172,7 +170,7 @@ def project(rays: Array, lens: dict[str, float], width: int, height: int) -> Arr
 def _fit(camera: pycolmap.Camera, lens: dict[str, float], where: str) -> None:
     """The parameters of COLMAP's lens that come nearest to Metashape's, over the whole photo."""
     half = np.array([camera.width, camera.height]) / 2 / lens["f"]
-    axes = [np.linspace(-side, side, GRID) for side in half]
+    axes = [np.linspace(-side, side, 33) for side in half]
     rays = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2)
     pixels = project(rays, lens, camera.width, camera.height)
     points = np.column_stack([rays, np.ones(len(rays))])
