@@ -140,9 +140,9 @@ def _way_to_cameras(source: Path, sample: Array, sparse: Path, content: dict[str
     fit = fit_to_cameras(exact(sample), model)
     check_fit(source, fit, f" nor, taken as {crs.name}, where these lie on the earth")
     print(f"{source.name} lies in {crs.name}, its cameras where their project placed them there", flush=True)
-    in_degrees, name = plane(crs).is_geographic, crs.to_string()
+    in_degrees = plane(crs).is_geographic
     nearest = _turn_there(exact, np.median(sample, axis=0)) if in_degrees else fit_sim3(sample, exact(sample))
-    return Way(exact, nearest, crs.name if len(name) > len(crs.name) + 20 else name, in_degrees), fit
+    return Way(exact, nearest, _short_name(crs), in_degrees), fit
 
 
 def _way_into_scene(source: Path, sample: Array, georeference: dict[str, Any], crs: str | None) -> Way:
@@ -160,8 +160,13 @@ def _way_into_scene(source: Path, sample: Array, georeference: dict[str, Any], c
     def exact(points: Array) -> Array:
         return in_local(points, known, frame, source)
 
-    name = known.to_string()
-    return Way(exact, fit_sim3(sample, exact(sample)), known.name if len(name) > len(known.name) + 20 else name)
+    return Way(exact, fit_sim3(sample, exact(sample)), _short_name(known))
+
+
+def _short_name(crs: pyproj.CRS) -> str:
+    """An EPSG code or the like; of a CRS that only WKT describes, its name."""
+    text = crs.to_string()
+    return crs.name if len(text) > len(crs.name) + 20 else text
 
 
 def _turn_there(exact: Callable[[Array], Array], place: Array) -> Sim3:
