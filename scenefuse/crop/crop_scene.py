@@ -12,9 +12,8 @@ from scenefuse.cloud.crs import to_wgs84
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud, whole
+from scenefuse.crop.crop_cloud import MIN_PART_SHARE, Crop, CropSettings, crop_cloud, parts, whole
 from scenefuse.crop.one_photo import MAX_GROWTH, STRAY_SHARE, SceneClicks, crop_grown, locate_clicks
-from scenefuse.crop.parts import MIN_PART_SHARE, parts
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
@@ -26,8 +25,6 @@ MIN_POINTS = 200
 MIN_FIDUCIALS = 4
 # Points of a scene in which an object is searched without any mark.
 MAX_WHOLE_POINTS = 10_000_000
-# How far from clicks a crop may reach, in their extents: it grows, and looks for ground around what it has become.
-REACH_EXTENTS = 2 * MAX_GROWTH
 # Points of an object's own cloud that mark it.
 MAX_OWN_POINTS = 20_000
 
@@ -150,7 +147,8 @@ def crop_by_file(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) 
     if clicks is None:
         near = scene.near(*around_marks(points, settings))[1]
         return near, crop_marked(near, names, points, UP, settings, inputs.fiducials), Marks("fiducials", points)
-    near = scene.near(*around_marks(points, settings, REACH_EXTENTS))[1]
+    # The crop grows, and looks for ground around what it has become.
+    near = scene.near(*around_marks(points, settings, 2 * MAX_GROWTH))[1]
     cut = crop_grown(near, points, UP, replace(settings, minimal=False), clicks.other(near.points))
     cut = replace(cut, notes=[*clicks.left_out, *cut.notes])
     _announce(cut, str(inputs.fiducials))

@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
-from scenefuse.crop.crop_cloud import Crop, CropSettings, crop_cloud
+from scenefuse.crop.crop_cloud import LINK_FRACTION, MIN_PART_SHARE, Crop, CropSettings, crop_cloud
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
@@ -20,19 +20,16 @@ from scenefuse.photos.workspace import View, read_views
 # more; of points up to so many spacings behind the nearest that is no stray: so many lie within these.
 RAY_SPACINGS, RAY_PX, DEPTH_SPACINGS, MIN_NEIGHBOURS = 2, 3, 8, 3
 # What a click outside lies on is flat where this many points around it have at most this surface variation; then it is
-# what lies nearer to their plane than this share of the clicks' extent.
-PLANE_POINTS, MAX_VARIATION, PLANE_FRACTION = 8, 0.02, 0.03
+# what lies as near to their plane as points of one part lie to each other.
+PLANE_POINTS, MAX_VARIATION = 8, 0.02
 # Inside clicks with a depth that span an object.
 MIN_INSIDE = 3
-# Rounds in which the crop grows along the object; each reaches farther by its margin.
+# Rounds in which the crop grows along the object; each reaches farther by its margin. One that adds no more than the
+# points of a part that would be left out is the last.
 MAX_ROUNDS = 25
-# A round that adds less than this share of the points is the last.
-MIN_GROWTH = 0.01
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
 MAX_GROWTH = 3.0
-# Which end of a box each of its corners has along x, y, z.
-CORNERS = np.array([[corner >> axis & 1 for axis in range(3)] for corner in range(8)], dtype=bool)
 # The outermost share of the kept points on each side marks nothing.
 STRAY_SHARE = 0.005
 
@@ -75,7 +72,7 @@ class SceneClicks:
             around = points[np.argsort(np.linalg.norm(points - click, axis=1), kind="stable")[:PLANE_POINTS]]
             spread, axes = np.linalg.eigh(np.cov(around.T))
             if spread[0] < MAX_VARIATION * spread.sum():
-                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < PLANE_FRACTION * extent
+                own &= np.abs((points - around.mean(0)) @ axes[:, 0]) < LINK_FRACTION * extent
             found |= own
         return found
 
@@ -123,8 +120,8 @@ def locate_clicks(labels: Clicks, sparse: Path, scene: TiledCloud) -> SceneClick
 
 def _behind(pixels: Array, scene: TiledCloud, step: float, view: View) -> Rows:
     """The tiles of a scene that a photo may show about one of (K, 2) pixels; those that reach behind it too."""
-    corners = np.where(CORNERS[:, None], scene.high, scene.low)
-    at, depth = view.project(corners.reshape(-1, 3))
+    corners = [np.where(end, scene.high, scene.low) for end in np.ndindex(2, 2, 2)]
+    at, depth = view.project(np.concatenate(corners))
     at, depth = at.reshape(8, -1, 2), depth.reshape(8, -1)
     reach = np.maximum(RAY_PX, RAY_SPACINGS * step * float(view.intrinsics[0, 0]) / np.maximum(depth.min(0), step))
     low, high = at.min(0) - reach[:, None], at.max(0) + reach[:, None]
@@ -180,7 +177,7 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
             break
         marks = np.concatenate([inside, own[((own >= low) & (own <= high)).all(1)]])
         grown = crop_cloud(scene, marks, up, settings, other)
-        if grown.keep.sum() <= (1 + MIN_GROWTH) * cut.keep.sum():
+        if grown.keep.sum() <= (1 + MIN_PART_SHARE) * cut.keep.sum():
             return grown
         cut = grown
     note = (
