@@ -1,0 +1,59 @@
+"""Decisions and errors of registration by clouds on planted trials: to compare two versions of the code.
+
+PYTHONPATH=tests OMP_NUM_THREADS=1 python tests/benchmarks/same_decisions.py OUT.tsv: in the folder of either version
+"""
+
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from registration import planted, scenefuse
+from support.planted import errors
+
+# Shape, kind, coverage, repeat: with all evidence, by shape alone, an object in another's scene, a mirrored object.
+TRIALS = [
+    ("house", "all", 0.3, 0), ("urn", "shape", 0.7, 1), ("wall", "absent", 0.7, 2), ("house", "mirrored", 0.7, 3),
+    ("wall", "all", 0.5, 1), ("urn", "all", 0.3, 2), ("house", "absent", 0.7, 3), ("house", "shape", 0.7, 2),
+    ("wall", "mirrored", 0.7, 0), ("urn", "absent", 0.7, 1), ("wall", "shape", 0.7, 3), ("house", "all", 0.5, 3),
+    ("urn", "all", 0.5, 0), ("wall", "all", 0.3, 2),
+]  # fmt: skip
+# Whose scene an absent object is looked for in.
+OTHER = {"house": "sculpture", "urn": "house", "wall": "urn"}
+
+
+def one(name: str, kind: str, coverage: float, repeat: int) -> dict[str, object]:
+    """The decision on a trial, its errors, and processor seconds."""
+    trial, scene, _ = planted(name, coverage, repeat)
+    if kind == "absent":
+        other, scene, _ = planted(OTHER[name], coverage, repeat)
+        trial = replace(trial, free_space=other.free_space)
+    if kind == "mirrored":
+        flip, cloud = np.array([-1.0, 1, 1]), trial.object
+        assert cloud.normals is not None
+        cloud = replace(cloud, points=cloud.points * flip, normals=cloud.normals * flip.astype(np.float32))
+        trial = replace(trial, object=cloud, up_in_object=trial.up_in_object * flip)
+    start = time.process_time()
+    found = scenefuse(trial, scene, blind=kind == "shape")
+    seconds = time.process_time() - start
+    off = (np.nan,) * 3
+    if found.pose is not None:
+        off = errors(found.pose, trial.scene_from_object, trial.object.points.mean(0), trial.diagonal, trial.axis)
+    errs = ("scale_pct", "rotation_deg", "shift"), (float(x) for x in off)
+    decision = "registered" if found.accepted else "refused"
+    return {
+        "trial": f"{name}, {kind}, {coverage}, {repeat}",
+        "decision": decision, **dict(zip(*errs)), "cpu_s": seconds, "reason": found.reason,
+    }  # fmt: skip
+
+
+def main(out: Path) -> None:
+    """Run all trials; rows are written as they come."""
+    for k, trial in enumerate(TRIALS):
+        pd.DataFrame([one(*trial)]).to_csv(out, sep="\t", index=False, mode="a" if k else "w", header=not k)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))
