@@ -32,9 +32,8 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities
-from scenefuse.register.problem import Constraints, Inputs, Problem
+from scenefuse.register.problem import Constraints, Estimate, Inputs, Problem, estimates, rms, scale_quantities
 from scenefuse.register.refinement import FINE_POINTS
-from scenefuse.register.scale import Estimate, estimates, rms, scale_quantities
 from scenefuse.register.score import SCORE_FRACTION, Hypothesis, score
 from scenefuse.register.uncertainty import uncertainty_quantities
 

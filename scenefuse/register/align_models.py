@@ -39,7 +39,6 @@ MAX_RIVAL_SHARE, MAX_SCALE_SD_LOG, MAX_ROTATION_SD_DEG = 0.5, 0.05, 3.0
 MAX_PLACES = 10
 # Draws of photos and points for the standard deviations.
 BOOTSTRAP_DRAWS = 200
-PER_UNIT = "scene units per object unit"
 
 
 @dataclass(frozen=True)
@@ -76,23 +75,6 @@ class Consensus:
     rival: int
     other: Sim3 | None = None
     settled_by_gps: bool = False
-
-
-@dataclass(frozen=True)
-class Found:
-    """A refined pose and what supports it.
-
-    Attributes:
-        consensus: with the refined pose.
-        inliers: observations of the shared points.
-        uncertainty: of the pose.
-        problem: why the pose is rejected, or None.
-    """
-
-    consensus: Consensus
-    inliers: Observations
-    uncertainty: Uncertainty
-    problem: str | None
 
 
 def align_models(
@@ -148,7 +130,8 @@ def align_landmarks(
     consensus = find_consensus(seen, seed)
     centre = np.median(obj.points, axis=0)
     if consensus is None or not consensus.inliers.any():
-        return _report(None, len(pairs)) | gps_quantities(gps, None, obj.looked_at())
+        nothing = f"{len(pairs)} points of the models look alike, and no three of them fit one similarity"
+        return _report(len(pairs), nothing) | gps_quantities(gps, None, obj.looked_at())
     if gps is not None:
         consensus = _by_gps(seen, consensus, gps, obj.looked_at(), seed)
     inliers = seen.subset(consensus.inliers)
@@ -159,7 +142,7 @@ def align_landmarks(
     uncertainty = drawn.with_difference(pose, consensus.pose, centre)
     consensus = replace(consensus, pose=pose)
     problem = rejection_reason(consensus, inliers, len(pairs), uncertainty, settings)
-    found = _report(Found(consensus, inliers, uncertainty, problem), len(pairs))
+    found = _report(len(pairs), problem, consensus, inliers, uncertainty)
     return found | gps_quantities(gps, None if problem else pose, obj.looked_at())
 
 
@@ -212,17 +195,16 @@ def _most_supported(seen: Observations, seed: int) -> Sim3 | None:
         return None
     few = seen.subset(np.isin(np.arange(len(seen.x)), rng.permutation(len(seen.x))[:RANKING_MATCHES]))
     finalists = sorted(proposed, key=lambda p: _cost(few, p, 2 * MAX_ERROR_PX))[:FINALISTS]
-    polished = [_polished(seen, p, MAX_ERROR_PX) for p in finalists]
-    return min(polished, key=lambda p: _cost(seen, p, MAX_ERROR_PX))
+    return min((_polished(seen, p) for p in finalists), key=lambda p: _cost(seen, p, MAX_ERROR_PX))
 
 
-def _polished(seen: Observations, pose: Sim3, limit_px: float) -> Sim3:
-    """Refined on the matches within a limit that narrows to `limit_px`."""
-    for factor in (4.0, 2.0, 1.0, 1.0):
-        near = match_errors(seen, pose) <= factor * limit_px
+def _polished(seen: Observations, pose: Sim3) -> Sim3:
+    """Refined on the matches within a limit that narrows to that of an inlier."""
+    for limit_px in np.array([4.0, 2.0, 1.0, 1.0]) * MAX_ERROR_PX:
+        near = match_errors(seen, pose) <= limit_px
         if near.sum() < 4:
             return pose
-        pose = minimise_reprojection(seen.subset(near), pose, factor * limit_px / 2, ROUNDS)
+        pose = minimise_reprojection(seen.subset(near), pose, limit_px / 2, ROUNDS)
     return pose
 
 
@@ -259,17 +241,19 @@ def rejection_reason(
     return None
 
 
-def _report(found: Found | None, matches: int) -> dict[str, Any]:
+def _report(
+    matches: int,
+    problem: str | None,
+    consensus: Consensus | None = None,
+    inliers: Observations | None = None,
+    uncertainty: Uncertainty | None = None,
+) -> dict[str, Any]:
     """The stage JSON; what was not found or not looked for is null."""
-    if found is None:
-        problem: str | None = f"{matches} points of the models look alike, and no three of them fit one similarity"
-        count, photos, rival, error, uncertainty, pose, settled = 0, (0, 0), 0, None, None, None, False
-    else:
-        problem, consensus, inliers = found.problem, found.consensus, found.inliers
-        count, photos, rival, uncertainty = len(inliers.x), inliers.photos, consensus.rival, found.uncertainty
-        settled = consensus.settled_by_gps
-        error = float(np.sqrt((match_errors(inliers, consensus.pose) ** 2).mean())) if count else None
-        pose = None if problem else consensus.pose
+    count, photos = (0, (0, 0)) if inliers is None else (len(inliers.x), inliers.photos)
+    pose, error = None if consensus is None or problem else consensus.pose, None
+    if consensus is not None and inliers is not None and count:
+        error = float(np.sqrt((match_errors(inliers, consensus.pose) ** 2).mean()))
+    settled = consensus is not None and consensus.settled_by_gps
     words = (
         f"{count} of {matches} matched points agree, in {photos[0]} photos of the object and {photos[1]} of the scene"
         + ("; GPS distinguishes it from its like" if settled else "")
@@ -278,11 +262,11 @@ def _report(found: Found | None, matches: int) -> dict[str, Any]:
         "found": quantity(problem is None, ""),
         "reason": quantity(problem or words, ""),
         "scene_from_object": quantity(None if pose is None else pose.matrix, ""),
-        "scale": quantity(None if pose is None else pose.scale, PER_UNIT),
+        "scale": quantity(None if pose is None else pose.scale, "scene units per object unit"),
         "shared_points": quantity(count, "1"),
         "matches": quantity(matches, "1"),
         "inlier_share": quantity(count / matches if matches else 0.0, "1"),
-        "rival_points": quantity(rival, "1"),
+        "rival_points": quantity(0 if consensus is None else consensus.rival, "1"),
         "settled_by_gps": quantity(settled, ""),
         "object_photos": quantity(photos[0], "1"),
         "scene_photos": quantity(photos[1], "1"),

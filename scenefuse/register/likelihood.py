@@ -15,19 +15,20 @@ from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.geometry.icp import MAX_SCALE_STEP, ScaleRange, moved_about, similarity_rows
 from scenefuse.geometry.surface import Surface
+from scenefuse.register.score import SCORE_FRACTION
 from scenefuse.register.uncertainty import MIN_PIECES, PIECES_ACROSS, Uncertainty
 
 # Object points from which a scene point may come: those within two deviations, at the usual spacing and noise.
 NEIGHBOURS = 24
 # A scene point this many standard deviations from the object, in place and colour, is as likely something else.
 MAX_DEVIATIONS = 4.0
-# The noise begins at this share of the scene's diagonal; it never gets below this share of the object's spacing, nor
-# the noise of colours (0..1) below MIN_COLOR_NOISE: samples a spacing apart tell no more.
-START_NOISE, MIN_NOISE, MIN_COLOR_NOISE = 0.02, 0.75, 0.03
+# The noise begins at the distance within which points agree, a share of the scene's diagonal.
+START_NOISE = SCORE_FRACTION
+# It never gets below this share of the object's spacing, nor that of colours (0..1) below MIN_COLOR_NOISE: samples a
+# spacing apart tell no more.
+MIN_NOISE, MIN_COLOR_NOISE = 0.75, 0.03
 # The noise settles in MIN_ROUNDS; then a step that moves the points by less than this share of it is the last.
 MAX_ROUNDS, MIN_ROUNDS, MIN_STEP = 25, 5, 0.01
-# Directions of which less is known than this share of the best known are not followed further in one step.
-MIN_INFORMATION = 1e-3
 MAX_STEP_CUTS = 5
 # Copies of the scene that are drawn from the object, at a pose that is known.
 PLANTED_COPIES = 4
@@ -203,7 +204,8 @@ def _newton_step(at: MostLikely, reach: float, hold_scale: bool) -> Array:
     if hold_scale:
         gradient[6], information[6], information[:, 6] = 0, 0, 0
     values, vectors = np.linalg.eigh(information)
-    values = np.maximum(values, MIN_INFORMATION * values[-1])
+    # Directions of which next to nothing is known are not followed far in one step.
+    values = np.maximum(values, 1e-3 * values[-1])
     change = (vectors @ ((vectors.T @ gradient) / values)) / unit
     change[6] = np.clip(change[6], -MAX_SCALE_STEP, MAX_SCALE_STEP)
     return change

@@ -36,8 +36,8 @@ from scenefuse.register.uncertainty import Uncertainty, common_error, half_sampl
 # Points kept of either cloud; query points of the first refinement and ranking, and of the polish.
 FINE_POINTS = 12000
 POLISH_QUERY_POINTS = 3000
-# Pairing distances of the first refinement, from first to last, as shares of the diagonal; the polish uses the last.
-START_FRACTION = 0.05
+# First pairing distance, as a share of the diagonal: of poses that differ by less, one finds the other.
+START_FRACTION = DISTINCT_SHIFT
 REFINE_ROUNDS, POLISH_ROUNDS = 25, 60
 # Leading poses whose turned copies are tried, copies that are refined, and hypotheses, or copies, that are polished.
 TURNED_POSES, REFINED_COPIES, POLISHED_POSES = 2, 6, 4
@@ -47,8 +47,6 @@ COPY_SEPARATION_DEG = 25
 COPY_START = 0.7
 # A valley that is flat in scale has several ends: the polish is repeated from both sides.
 POLISH_SCALE_FACTOR = 1.06
-# Poses of an object that repeats itself differ when they lie more than this share of the shortest period apart.
-MIN_PERIOD_SHARE = 0.5
 # Its repetition is looked for at this spacing at most, as a share of the object's own diagonal.
 REPETITION_SPACING = 0.005
 # The coarse search stays inside the scale prior; what it found at a bound may go on by this much (natural logarithm).
@@ -84,7 +82,7 @@ class Outcome:
         """The uncertainty with what the clouds have wrong alike."""
         if self.uncertainty is None or self.common_error is None:
             return self.uncertainty
-        return self.uncertainty.plus(self.common_error)
+        return Uncertainty.of(self.uncertainty.covariance + self.common_error)
 
     def unless_torn(self, bending: Array | None, diagonal: float) -> "Outcome":
         """Refused where the object's model may be bent too far, by its covariance (7, 7); see `unless_torn`."""
@@ -198,9 +196,9 @@ class _Work:
         return best_distinct(hypotheses, self.centre, diagonal, len(hypotheses), angle_deg, same)
 
     def same_shift(self, scale: float) -> float:
-        """Poses whose shift differs by less are one, as a share of the diagonal."""
+        """Poses whose shift differs by less are one, as a share of the diagonal; at most half the shortest period."""
         periods = [scale * float(np.linalg.norm(shift)) / self.problem.scene.diagonal for shift in self.shifts]
-        return min([DISTINCT_SHIFT, *(MIN_PERIOD_SHARE * period for period in periods)])
+        return min([DISTINCT_SHIFT, *(period / 2 for period in periods)])
 
     def refine(self, pose: Sim3, source: str, first: float) -> Hypothesis:
         """The bottom of the valley that a pose lies in, by point pairs within `first`, scene units, and ever less."""

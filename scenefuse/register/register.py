@@ -21,9 +21,8 @@ from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import pose_quantities
-from scenefuse.register.problem import Constraints, Problem, check_extent
+from scenefuse.register.problem import Constraints, Problem, ScaleSettings, check_extent, estimates, prior
 from scenefuse.register.refinement import Outcome, refine_hypotheses
-from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import SCORE_FRACTION
 from scenefuse.register.uncertainty import uncertainty_quantities
 
@@ -330,14 +329,14 @@ def _unit(flag: str, direction: Direction | None) -> Array | None:
 
 def _fiducials(path: Path) -> tuple[list[str], Array]:
     """Names and positions (F, 3) of marked points in the scene's coordinates."""
-    if path.suffix.lower() not in (".tsv", *TEXTS):
-        points = read_cloud(path).points
-        return [str(number) for number in range(1, len(points) + 1)], points
-    try:
-        marked = read_points(path)
-    except StageError:
-        if path.suffix.lower() not in TEXTS:
-            raise
+    marked = None
+    if path.suffix.lower() in (".tsv", *TEXTS):
+        try:
+            marked = read_points(path)
+        except StageError:
+            if path.suffix.lower() not in TEXTS:
+                raise
+    if marked is None:
         points = read_cloud(path).points
         return [str(number) for number in range(1, len(points) + 1)], points
     if not isinstance(marked, ScenePoints):

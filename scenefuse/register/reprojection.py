@@ -10,8 +10,6 @@ from scenefuse.geometry.icp import ScaleRange, moved_about
 from scenefuse.register.landmarks import Landmarks
 from scenefuse.register.uncertainty import Uncertainty
 
-BEHIND_PX = 1e4
-
 
 @dataclass(frozen=True)
 class Observations:
@@ -93,7 +91,8 @@ def residuals(seen: Observations, scene_from_object: Sim3) -> tuple[Array, Array
     depth = in_cam[:, 2:]
     with np.errstate(divide="ignore", invalid="ignore"):
         error = (in_cam[:, :2] / depth - seen.rays) * _gain(seen, scene_from_object.scale)[:, None]
-    error[depth[:, 0] <= 0] = BEHIND_PX
+    # Behind the camera: farther off than any photo is wide.
+    error[depth[:, 0] <= 0] = 1e4
     return error, in_cam
 
 

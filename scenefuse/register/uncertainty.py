@@ -68,10 +68,6 @@ class Uncertainty:
         """(3,) standard deviations of log scale, of the rotation (degrees) and of the shift (scene units)."""
         return np.array([self.scale_sd_log, self.rotation_sd_deg, self.translation_sd])
 
-    def plus(self, covariance: Array) -> "Uncertainty":
-        """With another error about the same centre, by its covariance (7, 7)."""
-        return Uncertainty.of(self.covariance + covariance)
-
     def with_difference(self, pose: Sim3, other: Sim3, at: Array) -> "Uncertainty":
         """With the difference of two estimates of the pose, taken at (3,) in the object's frame, added in squares."""
         return Uncertainty.even(*np.hypot(self.deviations, _apart(pose, other, at)))

@@ -22,8 +22,7 @@ from scenefuse.register.agreement import AgreementSettings, registration_metrics
 from scenefuse.register.coarse import CoarseSettings, register_coarsely
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.fine import ConstraintFiles, register_finely
-from scenefuse.register.problem import Inputs
-from scenefuse.register.scale import ScaleSettings
+from scenefuse.register.problem import Inputs, ScaleSettings
 
 OBJECTS = ("house", "balloon", "sculpture")
 

@@ -10,7 +10,7 @@ from support.planted import plant
 
 from scenefuse.core.stage import run
 from scenefuse.paper import register_as_paper as paper
-from scenefuse.register.scale import rms
+from scenefuse.register.problem import rms
 
 EDGES = (0.9, 0.7, 0.5)
 SHOWN = ((1.0, False), (0.6, False), (0.4, False), (0.6, True))

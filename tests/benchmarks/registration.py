@@ -24,9 +24,8 @@ from scenefuse.geometry.icp import ScaleRange
 from scenefuse.paper.register_as_paper import paper_coarse, paper_fine
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Constraints, Problem
+from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.uncertainty import Uncertainty
 
 UP = np.array([0.0, 0.0, 1.0])

@@ -19,9 +19,8 @@ from scenefuse.geometry.surface import Surface
 from scenefuse.register import decision as gate
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import Decision, FineSettings, Repetition, decide, unless_torn
-from scenefuse.register.problem import Alignment, Constraints, Problem
+from scenefuse.register.problem import Alignment, Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import DISTINCT_ANGLE_DEG, DISTINCT_SCALE_LOG, DISTINCT_SHIFT, Hypothesis, Score
 from scenefuse.register.uncertainty import Uncertainty
 

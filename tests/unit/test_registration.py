@@ -17,14 +17,19 @@ from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.geometry.surface import pair, prepare
 from scenefuse.paper.register_as_paper import register_as_paper
 from scenefuse.photos.pictures import write_depth
-from scenefuse.register.candidates import match, ransac_similarities, upright_candidates
-from scenefuse.register.coarse import CoarseSettings, find_hypotheses, register_coarsely
+from scenefuse.register.coarse import (
+    CoarseSettings,
+    find_hypotheses,
+    match,
+    ransac_similarities,
+    register_coarsely,
+    upright_candidates,
+)
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.fine import register_finely, scale_ledger
 from scenefuse.register.frame_ledger import frame_ledger, round_trip
-from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem
+from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.scale import ScaleSettings, estimates, prior
 from scenefuse.register.score import color_agreement, score
 from scenefuse.register.uncertainty import COMMON_ERROR, Uncertainty, common_error, half_sampling
 

@@ -13,9 +13,8 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.demo.meshes import box, join, sheet
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Constraints, Problem
+from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
-from scenefuse.register.scale import ScaleSettings, estimates, prior
 
 UP, DIAGONAL = np.array([0.0, 0.0, 1.0]), 14.0
 TRUTH = Sim3(0.3, Rotation.random(random_state=1).as_matrix(), np.array([3.0, -8.0, 5.0])).inverse()

@@ -19,8 +19,7 @@ from scenefuse.geometry.surface import Pairs
 from scenefuse.register import decision, refinement
 from scenefuse.register.coarse import CoarseSettings, find_hypotheses
 from scenefuse.register.decision import FineSettings
-from scenefuse.register.problem import Constraints, Problem
-from scenefuse.register.scale import ScaleSettings, estimates, prior
+from scenefuse.register.problem import Constraints, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.score import Hypothesis
 from scenefuse.register.uncertainty import Uncertainty
 
@@ -212,8 +211,8 @@ RULES = [
     # Candidates.
     Rule("coarse: sweep of headings", f"{R}.coarse._upright", nothing),
     Rule("coarse: features", f"{R}.coarse._from_features", nothing),
-    Rule("RANSAC: edges agree on one scale", f"{R}.candidates.MIN_EDGE_RATIO", constant(0.0)),
-    Rule("sweep: blurred target", f"{R}.candidates._blur", same),
+    Rule("RANSAC: edges agree on one scale", f"{R}.coarse.MIN_EDGE_RATIO", constant(0.0)),
+    Rule("sweep: blurred target", f"{R}.coarse._blur", same),
     Rule("coarse: brief refinement", f"{R}.coarse.BRIEF_ROUNDS", constant(1)),
     # Refinement.
     Rule("refine: turned copies", f"{R}.refinement._Work.turned", nothing),
