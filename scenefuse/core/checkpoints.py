@@ -48,6 +48,11 @@ def learning_rate_factor(step: int, steps: int, warmup: float, lowest: float = 0
     return rise * (lowest + (1 - lowest) * 0.5 * (1 + math.cos(math.pi * done)))
 
 
+def step_generator(seed: int, step: int) -> torch.Generator:
+    """Random numbers of a step, the same ones in a resumed training."""
+    return torch.Generator().manual_seed(seed * 1_000_003 + step)
+
+
 class Progress:
     """Collects the loss terms of every step; prints a line now and then.
 

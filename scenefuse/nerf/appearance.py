@@ -28,17 +28,11 @@ MIN_OPACITY = 0.9
 MIN_COLOR, MAX_COLOR = 0.04, 0.98
 # Logarithms of colours that differ by more than this are a highlight, a shadow or another surface.
 LOG_DELTA = 0.05
-# Pull of gains towards 1, as a share of the pairs that determine them; of the vignetting, of all pairs.
-GAIN_PULL, FALLOFF_PULL = 1e-3, 1e-5
 ROUNDS = 10
-# The pull on a gain that is fitted to a finished render, in squared colour per pixel.
-RIDGE = 1e-4
 # A photo that was not trained on is taken to have the gains of so many that were taken nearest to it.
 GAIN_NEIGHBOURS = 2
 # Sharpness compares details finer than the first Gaussian's sigma with those between the two, in pixels.
 FINE_PX, COARSE_PX = 1.0, 3.0
-# It is read so far inside the mask: the object's outline is sharp in a blurred photo's mask too.
-MASK_INSET_PX = 3
 # A photo is compared with so many from nearby, and is blurred with less than this share of their median sharpness.
 SHARPNESS_NEIGHBOURS, MIN_SHARPNESS_SHARE = 8, 0.7
 
@@ -138,7 +132,8 @@ def _shared(photos: PhotoTensors, depths: Tensor, a: int, b: int) -> tuple[Tenso
 def solved(shared: SharedColors, photos: int) -> Appearance:
     """Gains and vignetting that shared colours agree under: least squares of log colours, with Huber's weights.
 
-    A photo that shares no colours gets a gain of 1.
+    A weak pull, a share of the pairs, holds gains at 1 and the vignetting at none where the pairs leave them open. A
+    photo that shares no colours gets a gain of 1.
     """
     a, b, count = shared.a, shared.b, max(len(shared.a), 1)
     radial = (shared.radius2[:, 0] - shared.radius2[:, 1]).double()
@@ -148,9 +143,9 @@ def solved(shared: SharedColors, photos: int) -> Appearance:
     for _ in range(ROUNDS):
         left = difference - (log_gain[a] - log_gain[b]) - (falloff * radial)[:, None]
         weight = (LOG_DELTA / left.abs().amax(1).clamp(min=1e-9)).clamp(max=1.0)
-        log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], GAIN_PULL * pairs.clamp(min=1))
+        log_gain = _gains(a, b, weight, difference - (falloff * radial)[:, None], 1e-3 * pairs.clamp(min=1))
         left = (difference - (log_gain[a] - log_gain[b])).mean(1)
-        falloff = (weight * radial * left).sum() / ((weight * radial**2).sum() + FALLOFF_PULL * count)
+        falloff = (weight * radial * left).sum() / ((weight * radial**2).sum() + 1e-5 * count)
         falloff = falloff.clamp(max=0.0)
     known = (pairs > 0)[:, None]
     mean = (log_gain * known).sum(0) / known.sum().clamp(min=1)
@@ -194,7 +189,7 @@ def fitted_log_gain(rendered: Tensor, photo: Tensor) -> Tensor:
     """
     gain = torch.ones(3, dtype=torch.float64)
     c, p = rendered.double(), photo.double()
-    ridge = RIDGE * max(len(c), 1)
+    ridge = 1e-4 * max(len(c), 1)
     for _ in range(ROUNDS):
         weight = (COLOR_DELTA / (gain * c - p).abs().clamp(min=1e-9)).clamp(max=1.0)
         gain = ((weight * c * p).sum(0) + ridge) / ((weight * c * c).sum(0) + ridge)
@@ -242,10 +237,11 @@ def measured_sharpness(images: Tensor, masks: Tensor) -> Tensor:
     """Sharpness (V,) of (V, H, W, 3) uint8 photos in their masks (V, H, W): fine detail as a share of coarser detail.
 
     The ratio of two neighbouring bands depends little on contrast and on what is shown; blur takes the finer band away.
-    Photos with too little in their mask get the median of the others.
+    It is read a coarse sigma inside the mask, whose outline is sharp in a blurred photo too. Photos with too little in
+    their mask get the median of the others.
     """
     found = torch.full((len(images),), torch.nan)
-    for index, (image, mask) in enumerate(zip(images, dilate(masks, -MASK_INSET_PX))):
+    for index, (image, mask) in enumerate(zip(images, dilate(masks, -round(COARSE_PX)))):
         if mask.sum() < 2:
             continue
         gray = image.float().mean(2)

@@ -75,7 +75,7 @@ def encode_reference(x: Tensor, table: Tensor, grid: HashGrid, level_weight: Ten
     corners = torch.tensor([[k & 1, k >> 1 & 1, k >> 2] for k in range(8)], device=device)
     vertex = low.long()[:, :, None, :] + corners
     vx, vy, vz = vertex.unbind(-1)
-    hashed = (vx ^ (vy * kernels.PRIMES[1]) ^ (vz * kernels.PRIMES[2])) & mask
+    hashed = (vx ^ (vy * kernels.PRIMES[0]) ^ (vz * kernels.PRIMES[1])) & mask
     row = torch.where(stride > 0, vx + stride * (vy + stride * vz), hashed) + offset
     weight = torch.where(corners.bool(), part, 1 - part).prod(-1)
     features = (table[row] * weight[..., None]).sum(2)

@@ -8,11 +8,8 @@ from torch import Tensor, nn
 from scenefuse.core.stage import setting
 from scenefuse.nerf.encoding import encode, hash_grid, spherical_harmonics
 
-# Of the density network's 16 outputs the first is the density's logarithm (Mueller et al. 2022, section 5.4).
-GEOMETRY_FEATURES = 15
 # exp(11) in a unit cube is opaque within a ten-thousandth of its side; beyond it gradients overflow.
 MAX_LOG_DENSITY = 11.0
-INITIAL_FEATURE = 1e-4  # initial features are uniform in +-1e-4, as in instant-ngp
 # Training from coarse to fine begins with half of the levels, and with so many at least.
 MIN_OPEN_LEVELS = 4
 
@@ -43,11 +40,13 @@ class Field(nn.Module):
         super().__init__()
         self.settings = settings
         self.grid = hash_grid(settings.levels, settings.log2_table, settings.coarsest, settings.finest)
-        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * INITIAL_FEATURE)
-        width, inputs = settings.width, 2 * settings.levels
+        # Features begin uniform in +-1e-4, as in instant-ngp.
+        self.table = nn.Parameter((torch.rand(self.grid.rows, 2, generator=generator) * 2 - 1) * 1e-4)
+        # Of the density network's outputs the first is the density's logarithm (Mueller et al. 2022, section 5.4).
+        width, inputs, outputs = settings.width, 2 * settings.levels, 16
         self.density_in = _linear(inputs, width, generator)
-        self.density_out = _linear(width, 1 + GEOMETRY_FEATURES, generator)
-        self.color_geometry = _linear(1 + GEOMETRY_FEATURES, width, generator)
+        self.density_out = _linear(width, outputs, generator)
+        self.color_geometry = _linear(outputs, width, generator)
         self.color_direction = _linear(16, width, generator)
         self.color_hidden = _linear(width, width, generator)
         self.color_out = _linear(width, 3, generator)

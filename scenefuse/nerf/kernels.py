@@ -20,14 +20,12 @@ except ImportError:  # the PyTorch twins do the work
     pass
 
 AVAILABLE = nb is not None
-PRIMES = (1, 2654435761, 805459861)
-ZERO, ONE = np.float32(0.0), np.float32(1.0)
-PY, PZ, ONE_ROW = np.uint32(PRIMES[1]), np.uint32(PRIMES[2]), np.uint32(1)
+# Those of the hash along y and z; along x it takes the vertex itself.
+PRIMES = (2654435761, 805459861)
+PY, PZ = map(np.uint32, PRIMES)
+f32 = np.float32
 # Sum of compositing weights below which the grid knows no surface on a ray.
-MIN_KNOWN_WEIGHT = np.float32(1e-4)
-RAYS_A_BLOCK = 64  # rays that share a thread's buffers
-PREFETCHED_SAMPLES = 16  # samples
-CACHED_ROWS = 1 << 17  # a level of so many rows, one MiB, stays in a core's cache
+MIN_KNOWN_WEIGHT = f32(1e-4)
 
 
 def _jit(function):  # type: ignore[no-untyped-def]
@@ -63,13 +61,13 @@ def _cell(position, size):
     """Lower vertex of the cell and place in it, along one axis."""
     scaled = position * size
     low = np.int32(scaled)
-    return np.uint32(low), scaled - np.float32(low)
+    return np.uint32(low), scaled - f32(low)
 
 
 @_inline
 def _rows(ix, iy, iz, stride, start, mask):
     """Table rows of a cell's eight vertices, x fastest: dense with a stride, hashed without (equation 4)."""
-    jx = ix + ONE_ROW
+    jx = ix + np.uint32(1)
     if stride > 0:
         y0, z0 = iy * stride, start + iz * stride * stride
         y1, z1 = y0 + stride, z0 + stride * stride
@@ -104,12 +102,14 @@ def _prefetch(typing, array, row):  # type: ignore[no-untyped-def]
 
 @_inline
 def _is_far(stride, mask):
-    return (stride * stride * stride if stride > 0 else mask) >= CACHED_ROWS
+    """Whether a level has too many rows for a core's cache, a MiB and more."""
+    return (stride * stride * stride if stride > 0 else mask) >= 1 << 17
 
 
 @_inline
-def _fetch(table, position, size, stride, start, mask):
-    """Ask for the rows that a sample at a position (3,) will need."""
+def _fetch(table, x, n, last, size, stride, start, mask):
+    """Ask for the rows that a sample a few after the n-th will need, the last one at most."""
+    position = x[min(n + 16, last - 1)]
     ix, _ = _cell(position[0], size)
     iy, _ = _cell(position[1], size)
     iz, _ = _cell(position[2], size)
@@ -133,21 +133,21 @@ def _encode(threads, x, table, levels, out):
         first, last = count * thread // threads, count * (thread + 1) // threads
         for level in range(resolution.shape[0]):
             weight = level_weight[level]
-            if weight == ZERO:
+            if weight == f32(0):
                 for n in range(first, last):
-                    out[n, 2 * level] = ZERO
-                    out[n, 2 * level + 1] = ZERO
+                    out[n, 2 * level] = f32(0)
+                    out[n, 2 * level + 1] = f32(0)
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
             far = _is_far(step, bits)
             for n in range(first, last):
                 if far:
-                    _fetch(table, x[min(n + PREFETCHED_SAMPLES, last - 1)], size, step, start, bits)
+                    _fetch(table, x, n, last, size, step, start, bits)
                 ix, fx = _cell(x[n, 0], size)
                 iy, fy = _cell(x[n, 1], size)
                 iz, fz = _cell(x[n, 2], size)
                 r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
-                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
+                gx, gy, gz = f32(1) - fx, f32(1) - fy, f32(1) - fz
                 a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
                 out[n, 2 * level] = weight * (
                     a * (gx * table[r0, 0] + fx * table[r1, 0]) + b * (gx * table[r2, 0] + fx * table[r3, 0])
@@ -174,22 +174,22 @@ def _encode_backward(threads, x, gradient, levels, out):
         # Fine levels cost more than coarse ones: every thread gets some of both.
         for level in range(thread, last_level + 1, threads):
             weight = level_weight[level]
-            out[offset[level] : offset[level + 1] if level < last_level else out.shape[0]] = ZERO
-            if weight == ZERO:
+            out[offset[level] : offset[level + 1] if level < last_level else out.shape[0]] = f32(0)
+            if weight == f32(0):
                 continue
             size, step, start, bits = resolution[level], stride[level], offset[level], mask[level]
             far = _is_far(step, bits)
             for n in range(x.shape[0]):
                 if far:
-                    _fetch(out, x[min(n + PREFETCHED_SAMPLES, x.shape[0] - 1)], size, step, start, bits)
+                    _fetch(out, x, n, x.shape[0], size, step, start, bits)
                 ga, gb = weight * gradient[n, 2 * level], weight * gradient[n, 2 * level + 1]
-                if ga == ZERO and gb == ZERO:
+                if ga == f32(0) and gb == f32(0):
                     continue
                 ix, fx = _cell(x[n, 0], size)
                 iy, fy = _cell(x[n, 1], size)
                 iz, fz = _cell(x[n, 2], size)
                 r0, r1, r2, r3, r4, r5, r6, r7 = _rows(ix, iy, iz, step, start, bits)
-                gx, gy, gz = ONE - fx, ONE - fy, ONE - fz
+                gx, gy, gz = f32(1) - fx, f32(1) - fy, f32(1) - fz
                 a, b, c, d = gy * gz, fy * gz, gy * fz, fy * fz
                 _add(out, r0, gx * a, ga, gb)
                 _add(out, r1, fx * a, ga, gb)
@@ -204,14 +204,14 @@ def _encode_backward(threads, x, gradient, levels, out):
 @_inline
 def _span(origin, direction, r):
     """Where ray r enters the unit cube and leaves it; it misses the cube where it leaves first."""
-    low, high = ZERO, np.float32(1e9)
+    low, high = f32(0), f32(1e9)
     for k in range(3):
         o, d = origin[r, k], direction[r, k]
-        if abs(d) < np.float32(1e-9):
-            if o < ZERO or o > ONE:
-                high = -ONE
+        if abs(d) < f32(1e-9):
+            if o < f32(0) or o > f32(1):
+                high = -f32(1)
         else:
-            a, b = (ZERO - o) / d, (ONE - o) / d
+            a, b = (f32(0) - o) / d, (f32(1) - o) / d
             low, high = max(low, min(a, b)), min(high, max(a, b))
     return low, high
 
@@ -231,12 +231,12 @@ def _peak(raw, k, used):
 @_inline
 def _shares(uniform, prior, near_count, total):
     """Shares of the samples: spread evenly, by the grid's weights, near the prior. They add up to one."""
-    share_prior = prior if near_count > 0 else ZERO
-    share_uniform = uniform * (ONE - share_prior)
-    share_weight = (ONE - share_prior) - share_uniform
+    share_prior = prior if near_count > 0 else f32(0)
+    share_uniform = uniform * (f32(1) - share_prior)
+    share_weight = (f32(1) - share_prior) - share_uniform
     if total < MIN_KNOWN_WEIGHT:
         share_uniform += share_weight
-        share_weight = ZERO
+        share_weight = f32(0)
     return share_uniform, share_weight, share_prior
 
 
@@ -251,22 +251,22 @@ def _walk(ray, span, occupancy, expected, width, buffers):
     alpha, blocks_used, step = occupancy
     start, raw, near = buffers
     grid = alpha.shape[0]
-    scale = np.float32(grid)
+    scale = f32(grid)
     ox, oy, oz, dx, dy, dz = ray
     used, near_count = 0, 0
-    transmittance, total = ONE, ZERO
+    transmittance, total = f32(1), f32(0)
     for i in range(min(int(np.ceil((high - low) / step)), len(start) - 1)):
-        t = low + (np.float32(i) + np.float32(0.5)) * step
+        t = low + (f32(i) + f32(0.5)) * step
         ix, iy, iz = _index(ox, dx, t, scale, grid), _index(oy, dy, t, scale, grid), _index(oz, dz, t, scale, grid)
         if blocks_used[ix >> 2, iy >> 2, iz >> 2] == 0:
             continue
         opacity = alpha[ix, iy, iz]
-        if opacity < ZERO:
+        if opacity < f32(0):
             continue
-        start[used] = t - np.float32(0.5) * step
+        start[used] = t - f32(0.5) * step
         raw[used] = transmittance * opacity
         total += raw[used]
-        transmittance *= ONE - opacity
+        transmittance *= f32(1) - opacity
         close = abs(t - expected) <= width
         near[used] = 1 if close else 0
         near_count += 1 if close else 0
@@ -281,29 +281,29 @@ def _place(r, jitter, shares, near_count, used, step, buffers, out):
     out_t, out_delta, _ = out
     share_uniform, share_weight, share_prior = shares
     samples = jitter.shape[1]
-    blurred = ZERO
+    blurred = f32(0)
     for i in range(used):
         blurred += _peak(raw, i, used)
-    blurred = max(blurred, np.float32(1e-12))
+    blurred = max(blurred, f32(1e-12))
     k = -1
-    before, after, edge = ZERO, ZERO, ZERO
+    before, after, edge = f32(0), f32(0), f32(0)
     for s in range(samples):
-        goal = np.float32(s + 1) / np.float32(samples)
+        goal = f32(s + 1) / f32(samples)
         while k < used - 1 and (k < 0 or after < goal):
             k += 1
             before = after
-            mass = share_uniform / np.float32(used) + share_weight * _peak(raw, k, used) / blurred
+            mass = share_uniform / f32(used) + share_weight * _peak(raw, k, used) / blurred
             if near[k] == 1:
-                mass += share_prior / np.float32(near_count)
+                mass += share_prior / f32(near_count)
             after = before + mass
-        inside = (goal - before) / max(after - before, np.float32(1e-12))
-        end = np.float32(k) + min(max(inside, ZERO), ONE)
+        inside = (goal - before) / max(after - before, f32(1e-12))
+        end = f32(k) + min(max(inside, f32(0)), f32(1))
         if s == samples - 1:
-            end = np.float32(used)
+            end = f32(used)
         end = max(end, edge)
         middle = edge + (end - edge) * jitter[r, s]
         cell = min(int(middle), used - 1)
-        out_t[r, s] = start[cell] + (middle - np.float32(cell)) * step
+        out_t[r, s] = start[cell] + (middle - f32(cell)) * step
         out_delta[r, s] = (end - edge) * step
         edge = end
 
@@ -324,10 +324,11 @@ def march(rays, occupancy, jitter, uniform, prior, out):
     origin, direction = rays
     distance, width, share = prior
     step, out_hit = occupancy[2], out[2]
-    longest = int(np.float32(1.7320508) / step) + 3
-    for block in prange((origin.shape[0] + RAYS_A_BLOCK - 1) // RAYS_A_BLOCK):
+    longest = int(f32(1.7320508) / step) + 3
+    rays_a_block = 64  # they share a thread's buffers
+    for block in prange((origin.shape[0] + rays_a_block - 1) // rays_a_block):
         buffers = np.empty(longest, np.float32), np.empty(longest, np.float32), np.empty(longest, np.uint8)
-        for r in range(block * RAYS_A_BLOCK, min((block + 1) * RAYS_A_BLOCK, origin.shape[0])):
+        for r in range(block * rays_a_block, min((block + 1) * rays_a_block, origin.shape[0])):
             low, high = _span(origin, direction, r)
             out_hit[r] = 0
             if high <= low:

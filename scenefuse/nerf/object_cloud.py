@@ -16,8 +16,9 @@ from scenefuse.cloud.clouds import Cloud, concatenate, plane_normals, spacing, v
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
+from scenefuse.mvs.dense_cloud import OUTLIER_NEIGHBOURS
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
-from scenefuse.mvs.sparse_depths import sparse_depths
+from scenefuse.mvs.sparse_depths import MASK_REACH_PX, sparse_depths
 from scenefuse.nerf.appearance import without_appearance
 from scenefuse.nerf.rendered_maps import read_nerf
 from scenefuse.photos.pictures import read_depth, read_normals
@@ -27,10 +28,6 @@ Maps = NDArray[np.float32]
 
 # Fewer points than these are no surface.
 MIN_POINTS = 100
-# A point may lie this far beyond another photo's mask: masks are cut off a little.
-MASK_REACH_PX = 2
-# A point is as far from the others as the mean of its distances to so many.
-OUTLIER_NEIGHBOURS = 8
 # Voxels are no larger than so many pixels: windows of five pixels, which the depths were matched by, tell no more.
 VOXEL_PIXELS = 2
 # Points belong to one group where steps of this many spacings lead from one to the other.

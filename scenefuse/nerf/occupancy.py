@@ -14,8 +14,6 @@ STEP_IN_CELLS = 0.75
 # decays before the larger of it and the new one is kept, and cells below an opacity are left out.
 DECAY = 0.9
 MIN_OPACITY = 0.005
-# Half of the hull's cells at a time, but never many more than a training step has samples.
-MIN_CELLS, MAX_MORE_CELLS = 4096, 65536
 
 
 @dataclasses.dataclass
@@ -84,7 +82,8 @@ def _drawn_cells(occupancy: Occupancy, seed: int, step: int) -> tuple[Tensor, Te
     """Flat indices (N,) of random hull cells, and a random position (N, 3) in each."""
     rng = np.random.default_rng((seed, step, 1))
     inside = torch.nonzero(occupancy.hull.flatten())[:, 0]
-    count = min(len(inside) // 2, MAX_MORE_CELLS) + MIN_CELLS
+    # Half of the hull's cells and some more, but never many more than a training step has samples.
+    count = min(len(inside) // 2, 1 << 16) + (1 << 12)
     chosen = inside[torch.from_numpy(rng.integers(0, len(inside), min(count, 2 * len(inside))))].unique()
     size = occupancy.size
     index = torch.stack([chosen // (size * size), chosen // size % size, chosen % size], dim=1)

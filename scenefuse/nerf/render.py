@@ -14,8 +14,6 @@ from scenefuse.nerf.rays import camera_rays
 
 # Share of a ray's samples that is spread evenly over its occupied part: what the grid does not know yet is seen too.
 UNIFORM_SHARE = 0.25
-# Rays that a view is rendered in at a time: the samples of more would leave the processor's caches.
-RAYS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
@@ -229,7 +227,8 @@ def render_view(
     """
     device = field.table.device
     maps = [torch.zeros(*where.shape, 3), *(torch.zeros(where.shape) for _ in range(3))]
-    for pixels in torch.nonzero(where).split(RAYS_AT_ONCE):
+    # At a time so many rays that their samples stay in the processor's caches.
+    for pixels in torch.nonzero(where).split(1 << 12):
         uv = pixels.flip(1).float() + 0.5
         intrinsics, rotation, center = (part.expand(len(uv), *part.shape) for part in camera)
         origin, direction, length = camera_rays(intrinsics, rotation, center, uv)

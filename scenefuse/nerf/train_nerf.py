@@ -23,9 +23,6 @@ from scenefuse.photos.sheets import Image, Sheet, depth_colors, draw_sheet, save
 from scenefuse.sfm.import_photos import import_photos
 from scenefuse.sfm.undistort import UndistortSettings
 
-NO_CLOUD = 3
-SHEET_ROWS, TILE_PX = 6, 320
-
 
 @dataclass(frozen=True)
 class TrainingOptions:
@@ -105,7 +102,7 @@ def train_nerf(
     report = _report(out, {"nerf": asdict(chosen), "cloud": asdict(fused)}, refused, seed)
     write_json(out / "report.json", report | {"seconds": quantity(round(time.perf_counter() - start, 1), "s")})
     _print_summary(report, out, refused)
-    return 0 if refused is None else NO_CLOUD
+    return 0 if refused is None else 3
 
 
 def _clear(out: Path) -> None:
@@ -156,16 +153,16 @@ def _print_summary(report: dict[str, Any], out: Path, refused: str | None) -> No
 
 
 def render_sheet(workspace: Path, masks: Path, stage: Path) -> Image:
-    """A row for each of some rendered photos: the photo inside its mask, the render, its depth, its normals."""
+    """A row for each of at most six rendered photos: the photo inside its mask, the render, its depth, its normals."""
     photos = {path.stem: path for path in sorted((workspace / "images").iterdir())}
     stems = sorted(path.stem for path in (stage / "renders").glob("*.png"))
-    shown = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, SHEET_ROWS).round().astype(int))]
+    shown = [stems[i] for i in np.unique(np.linspace(0, len(stems) - 1, 6).round().astype(int))]
     rows = [_sheet_row(photos[stem], masks, stage) for stem in shown]
     note = f"{len(shown)} of {len(stems)} rendered photos; depth near bright, far dark; normals in the camera's axes"
     labels = ["photo in its mask", "render", "depth", "normals"]
     height, width = rows[0][0].shape[:2]
     cells: list[list[Image | None]] = [[*row] for row in rows]
-    tile = (TILE_PX, round(TILE_PX * height / width))
+    tile = (320, round(320 * height / width))
     return draw_sheet(Sheet("Renders beside the photos", note, cells, shown, labels, {}, tile))
 
 

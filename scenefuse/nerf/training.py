@@ -14,7 +14,14 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from scenefuse.core.checkpoints import Progress, State, checkpointed, learning_rate_factor, load_checkpoint
+from scenefuse.core.checkpoints import (
+    Progress,
+    State,
+    checkpointed,
+    learning_rate_factor,
+    load_checkpoint,
+    step_generator,
+)
 from scenefuse.core.stage import setting
 from scenefuse.nerf import losses
 from scenefuse.nerf.appearance import Appearance, find_appearance, squared_radius
@@ -24,8 +31,7 @@ from scenefuse.nerf.occupancy import Occupancy, updated
 from scenefuse.nerf.rays import PhotoTensors, PixelPool, RayBatch, camera_rays, draw_batch, pixel_pool
 from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySamples, composite, march
 
-# Mueller et al. 2022, section 4 and appendix E.2: Adam's moments and epsilon, and steps between updates of the grid.
-ADAM_BETAS, ADAM_EPSILON = (0.9, 0.99), 1e-15
+# Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
 OCCUPANCY_EVERY = 16
 # The grid drops no cell in the first tenth of a training: the densities there mean nothing yet.
 PRUNE_FROM = 0.1
@@ -36,10 +42,8 @@ FINAL_RATE_SHARE = 0.02
 # Gains and vignetting are found at these shares of a training: when depths are good enough to compare photos by, and
 # again when they are better. A warm training finds them at its start too.
 APPEARANCE_AT = (0.15, 0.4)
-# Where a prior expects the surface, this share of a ray's samples lies within this distance of it, as shipped.
-PRIOR_SHARE, PRIOR_HALF_WIDTH = 0.6, 0.04
-# A step's random numbers come from a seed of their own, so that a resumed training draws the same ones.
-SEED_STRIDE = 1_000_003
+# Samples near a prior's surface lie within this distance of it.
+PRIOR_HALF_WIDTH = 0.04
 
 
 @dataclass(frozen=True)
@@ -76,7 +80,7 @@ class NerfRecipe:
     """Samples per ray from the middle of the training on."""
     coarse_until: float = 0.3
     """Share of the steps after which all levels are open (method N9)."""
-    prior_share: float = PRIOR_SHARE
+    prior_share: float = 0.6
     """Where a prior expects the surface, at most this share of a ray's samples lies near it."""
     turned_share: float = 0.25
     """This share of the rays has its colours asked for from a random direction: they depend on the direction where the
@@ -269,11 +273,10 @@ def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer) -> int:
 
 
 def _optimizer(field: Field) -> torch.optim.Optimizer:
-    """Adam, with a group each for the hash grid and the networks: each has its own rate."""
+    """Adam with the moments of Mueller et al. 2022, section 4; hash grid and networks each have a rate of their own."""
     networks = [parameter for name, parameter in field.named_parameters() if name != "table"]
-    return torch.optim.Adam(
-        [{"params": [field.table]}, {"params": networks}], betas=ADAM_BETAS, eps=ADAM_EPSILON, fused=True
-    )
+    groups = [{"params": [field.table]}, {"params": networks}]
+    return torch.optim.Adam(groups, betas=(0.9, 0.99), eps=1e-15, fused=True)
 
 
 def _prepare(nerf: Nerf, training: Training, step: int) -> None:
@@ -318,7 +321,7 @@ def _loss_terms(nerf: Nerf, training: Training, batch: RayBatch, step: int) -> t
     rays = _rays(training.photos, batch, training.recipe.prior_share)
     device = rays.origin.device
     count = _samples_per_ray(training.recipe, step / training.steps)
-    rng = torch.Generator().manual_seed(training.seed * SEED_STRIDE + step)
+    rng = step_generator(training.seed, step)
     jitter = torch.rand(len(rays.origin), count, generator=rng).to(device)
     background = torch.rand(len(rays.origin), 3, generator=rng).to(device)
     seen_from = _partly_turned(rays.direction, training.recipe.turned_share, rng)

@@ -9,7 +9,7 @@ import triton.language as tl
 
 from scenefuse.nerf import kernels
 
-PY, PZ = tl.constexpr(kernels.PRIMES[1]), tl.constexpr(kernels.PRIMES[2])
+PY, PZ = map(tl.constexpr, kernels.PRIMES)
 # As many as there are threads: then both features are read, and their gradients added, by one instruction each.
 BLOCK = 128
 

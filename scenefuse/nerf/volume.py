@@ -25,15 +25,11 @@ from scenefuse.photos.workspace import View
 FIRST_CELLS = 64
 # Share of the cube's side left free on each side of the hull, for what the masks cut off.
 MARGIN = 0.02
-# The first, rough cube is half as wide again as the masks' extents ask for.
-ROUGH_FACTOR = 1.5
 # A mask of fewer pixels does not show where the object is.
 MIN_MASK_PIXELS = 16
-# Half the diagonal of a cell, sqrt(3) / 2, rounded up: what a mask has to grow by to hold the cells it touches.
-HALF_DIAGONAL = 0.87
 # Share of the photos that must frame a cell, more than masks need: what few photos bound is large, and costs rays.
 MIN_FRAMING_SHARE = 0.3
-# The rough cube around the object's own points is wider than these by this share of their diagonal on each side.
+# The first, rough cube is wider by this share on each side than the masks' extents ask for, or the object's own points.
 ROUGH_MARGIN = 0.25
 # Photos that show a cell, from which on one may miss it, however small the tolerance: a single mask may lack a part.
 TOLERANT_PHOTOS = 12
@@ -107,7 +103,7 @@ def hidden_pixels(volume: Volume, outlines: list[Outline]) -> NDArray[np.bool_]:
     """
     object_from_unit = volume.nerf_from_object.inverse()
     centres = object_from_unit.apply((np.argwhere(volume.hull) + 0.5) / len(volume.hull))
-    reach = object_from_unit.scale * HALF_DIAGONAL / len(volume.hull)
+    reach = _reach(object_from_unit, len(volume.hull))
     height, width = (max(getattr(outline.view, side) for outline in outlines) for side in ("height", "width"))
     hidden = np.ones((len(outlines), height, width), dtype=bool)
     for place, outline in zip(hidden, outlines):
@@ -164,7 +160,7 @@ def cube_from_cameras(views: list[View]) -> Sim3:
         raise ValueError("fewer than two photos have a mask of the object")
     center = np.linalg.solve(normal, right)
     radius = max(np.percentile(np.linalg.norm(np.array(centres) - center, axis=1) * np.array(angles), 90), 1e-9)
-    scale = 0.5 / (ROUGH_FACTOR * radius)
+    scale = 0.5 / ((1 + 2 * ROUGH_MARGIN) * radius)
     return Sim3(scale, np.eye(3), 0.5 - scale * center)
 
 
@@ -204,7 +200,7 @@ def visual_hull(
     cells, children = _corners(count), _corners(2)
     while True:
         points = object_from_unit.apply((cells + 0.5) / count)
-        reach = object_from_unit.scale * HALF_DIAGONAL / count
+        reach = _reach(object_from_unit, count)
         grown = (_grown(outline, points, reach) for outline in outlines)
         found = count_silhouettes(points, grown, object_from_unit.scale * MAX_DEPTH_BEHIND)
         # Of a coarse cell that is hidden one part may be in sight.
@@ -218,6 +214,11 @@ def visual_hull(
             hull[tuple(cells.T)] = True
             return hull
         cells, count = (2 * cells[:, None] + children).reshape(-1, 3), 2 * count
+
+
+def _reach(object_from_unit: Sim3, count: int) -> float:
+    """Half the diagonal of one of `count` cells per side, sqrt(3) / 2 rounded up: what a mask grows by to hold them."""
+    return object_from_unit.scale * 0.87 / count
 
 
 def _corners(count: int) -> NDArray[np.int64]:

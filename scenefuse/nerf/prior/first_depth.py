@@ -15,15 +15,11 @@ from scenefuse.nerf.prior.networks import depth_from_disparity, disparity_from_d
 from scenefuse.nerf.prior.self_supervision import points_in_cam, warp
 from scenefuse.photos.workspace import View
 
-# Side of the matching windows at full and at half size: small, because the cut photos are small. A median of the larger
-# one leaves out single pixels that matched elsewhere, and masks are widened by its radius.
+# Side of the matching windows at full size: small, because the cut photos are small. A median of it leaves out single
+# pixels that matched elsewhere, and masks are widened by its radius.
 WINDOW_PX = 5
-COARSE_WINDOW_PX = 3
 # Photos that a photo is matched with, and of these the ones that count: others may not see the place.
 SWEEP_SOURCES, BEST_SOURCES = 4, 2
-# Windows this small hold little contrast: what the matcher allows for flat ones must not outweigh theirs, and the slow
-# changes of brightness are kept.
-SMALL_WINDOW_FLAT = NOISE_VARIANCE / 16
 WHOLE = (slice(None), slice(None))
 # Finer hypotheses tried at full size on each side of the one found at half size.
 FINE_STEPS = 3
@@ -125,8 +121,9 @@ def _best_hypothesis(
     reference = _gray(photos, index, cut, shrink)
     sources = [_gray(photos, int(source), WHOLE, shrink) for source in chosen]
     depths = depth_from_disparity(hypotheses.clamp(0.0, 1.0), photos.near, photos.far)
-    window = WINDOW_PX if shrink == 1 else COARSE_WINDOW_PX
-    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, flat=SMALL_WINDOW_FLAT)
+    window = WINDOW_PX // shrink | 1
+    # Windows this small hold little contrast, which what the matcher allows for flat ones must not outweigh.
+    matcher = Matcher(reference, sources, BEST_SOURCES, window, hypotheses.device, flat=NOISE_VARIANCE / 16)
     scores = matcher.score((1.0 / depths).contiguous())
     moves = photos.source_from_target(torch.full_like(chosen, index), chosen)
     silhouettes = torch.maximum(photos.masks, photos.beyond)[chosen]

@@ -17,14 +17,14 @@ from scenefuse.photos.views import Views
 CHECK_EVERY = 10
 # A point belongs to the object when this share of the photos that observe it have it in their mask.
 MIN_IN_MASKS_SHARE = 0.7
-# The depth range spans these percentiles of the points' depths, widened at both ends by shares of the range and of the
-# farthest depth; the box around the object spans the percentiles of BOX_PERCENTILES.
+# The depth range spans these percentiles of the points' depths, widened at both ends by a share of the range; the box
+# around the object spans the percentiles of BOX_PERCENTILES.
 DEPTH_PERCENTILES, BOX_PERCENTILES = (1, 99), (2, 98)
-RANGE_MARGIN, FAR_MARGIN = 0.15, 1e-3
+RANGE_MARGIN = 0.15
 # Kept around a mask's box, share of the box: windows and warps at the outline need pixels beyond it.
 MARGIN = 0.06
-# The canvas fits the boxes of this percentage of the photos; larger ones are shrunk.
-FITTING_PERCENT, SPARE_PX = 90, 8
+# The canvas fits the boxes of this percentage of the photos with some pixels to spare; larger ones are shrunk.
+FITTING_PERCENT = 90
 MIN_CANVAS_PX = 32
 # Sides of the canvas relative to each other: no more elongated than this.
 MAX_ASPECT = 2.0
@@ -68,7 +68,7 @@ def crop_to_object(views: Views, crop_px: int) -> Crops:
     extent = (boxes[:, 2:] - boxes[:, :2]) * (1 + 2 * MARGIN)
     aspect = float(np.clip(np.median(extent[:, 0] / extent[:, 1]), 1 / MAX_ASPECT, MAX_ASPECT))
     ideal = np.array([crop_px * aspect**0.5, crop_px / aspect**0.5])
-    largest = np.minimum(np.minimum(ideal, np.percentile(extent, FITTING_PERCENT, axis=0) + SPARE_PX), [width, height])
+    largest = np.minimum(np.minimum(ideal, np.percentile(extent, FITTING_PERCENT, axis=0) + 8), [width, height])
     canvas = np.maximum(np.round(largest / 4) * 4, MIN_CANVAS_PX).astype(int)
     wholes = {"images": views.images, "mattes": views.mattes, "known": (~views.beyond).astype(np.uint8)}
     parts: dict[str, list[NDArray[np.uint8]]] = {name: [] for name in wholes}
@@ -184,7 +184,7 @@ def depth_photos(views: Views, sources: int, device: torch.device) -> DepthPhoto
     low, high = np.percentile(views.sparse[on_object], BOX_PERCENTILES, axis=0)
     depths = np.concatenate([pixels[:, 2] for _, pixels in seen])
     closest, farthest = np.percentile(depths, DEPTH_PERCENTILES)
-    margin = RANGE_MARGIN * (farthest - closest) + FAR_MARGIN * farthest
+    margin = RANGE_MARGIN * (farthest - closest) + 1e-3 * farthest  # a range of its own where all depths are equal
 
     def as_tensor(array: NDArray[np.generic]) -> Tensor:
         return torch.as_tensor(array, dtype=torch.float32, device=device)

@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from scenefuse.core.checkpoints import checkpointed, learning_rate_factor, load_checkpoint, require_finite
+from scenefuse.core.checkpoints import (
+    checkpointed,
+    learning_rate_factor,
+    load_checkpoint,
+    require_finite,
+    step_generator,
+)
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, threads
 from scenefuse.nerf.prior.first_depth import NetworkInputs
@@ -38,9 +44,6 @@ SQUARED_ERROR, MAX_ERROR = 0.005, 0.1
 COARSE_SHARE = 0.3
 # Share of a half-size pixel that is object, for it to count.
 MIN_OBJECT_SHARE = 0.75
-PRINT_EVERY = 10
-# Photos that go through the network at once when nothing is trained.
-PHOTOS_AT_ONCE = 8
 
 # The losses of (B,) chosen photos at a step, by name; the generator draws what is random.
 Objective = Callable[[Tensor, int, torch.Generator], dict[str, Tensor]]
@@ -136,8 +139,7 @@ def optimise(
         for step in range(len(losses), steps):
             for group in optimizer.param_groups:
                 group["lr"] = LEARNING_RATE * learning_rate_factor(step, steps, warmup)
-            generator = torch.Generator().manual_seed(seed * 1_000_003 + step)
-            parts = losses_of(torch.as_tensor(batches[step]), step, generator)
+            parts = losses_of(torch.as_tensor(batches[step]), step, step_generator(seed, step))
             losses.append({name: float(value.detach()) for name, value in parts.items()})
             require_finite(losses[-1])  # the gradient of sampling at a NaN would end the process without a word
             optimizer.zero_grad(set_to_none=True)
@@ -146,7 +148,7 @@ def optimise(
             for network in networks.values():
                 torch.nn.utils.clip_grad_norm_(network.parameters(), MAX_GRADIENT)
             optimizer.step()
-            if (step + 1) % PRINT_EVERY == 0:
+            if (step + 1) % 10 == 0:
                 print(f"step {step + 1}: {' '.join(f'{k} {v:.4f}' for k, v in losses[-1].items())}", flush=True)
             step_done(step + 1)
     return _by_epoch(losses, recipe.epochs)
@@ -155,7 +157,7 @@ def optimise(
 @torch.no_grad()
 def predict(network: DepthNetwork, photos: DepthPhotos, channels: Tensor, first: Tensor) -> Tensor:
     """(V, 1, H, W) depth of all photos, held-out ones too, from input channels and first disparities."""
-    parts = zip(channels.split(PHOTOS_AT_ONCE), first.split(PHOTOS_AT_ONCE))
+    parts = zip(*(maps.split(8) for maps in (channels, first)))
     return depth_from_disparity(torch.cat([network(x, d) for x, d in parts]), photos.near, photos.far)
 
 
