@@ -26,8 +26,8 @@ Maps = NDArray[np.float32]
 BEYOND_MASK_PX = 4
 # A rendered depth counts where the ray is opaque and its weights lie within a few hundredths of the cube (method N13).
 MAX_DEVIATION = 0.05
-# Normals come from depths two pixels apart, unless these jump by more than 3 %.
-NORMAL_STEP_PX, NORMAL_JUMP = 2, 0.03
+# Normals come from depths so many pixels apart, unless these jump: by more than this share, no slanted surface does.
+NORMAL_STEP_PX, DEPTH_JUMP = 2, 0.03
 # Structural similarity looks at windows of 11 pixels: these reach 5 beyond the mask.
 SSIM_REACH_PX = 5
 
@@ -117,7 +117,7 @@ def write_maps(maps: RenderedMaps, folder: Path) -> None:
         photo = np.s_[:height, :width]
         write_depth(folder / "depth_maps" / f"{name}.bin", maps.depths[index][photo])
         write_depth(folder / "confidence_maps" / f"{name}.bin", maps.confidence[index][photo])
-        normals = normals_from_depth(maps.depths[index], maps.views.intrinsics[index], NORMAL_STEP_PX, NORMAL_JUMP)
+        normals = normals_from_depth(maps.depths[index], maps.views.intrinsics[index], NORMAL_STEP_PX, DEPTH_JUMP)
         write_normals(folder / "normal_maps" / f"{name}.bin", normals[photo])
     (folder / "renders").mkdir()
     for row in np.flatnonzero(maps.measured):

@@ -47,7 +47,7 @@ from scenefuse.nerf.volume import Volume, find_volume, hidden_pixels, silhouette
 from scenefuse.photos.views import Views, load_views
 
 # A rendered depth is confident from here on; what later stages and the export call confident.
-CONFIDENT = 0.5
+MIN_CONFIDENCE = 0.5
 # What a training returns beside its losses.
 NO_LOSSES = ("steps", "seconds", "rays_per_second", "samples_per_second", "psnr")
 
@@ -257,7 +257,7 @@ def _report(
         "diagonal": quantity(maps.diagonal, "object units"),
         **{f"loss_{name}": quantity(value, "1") for name, value in result.items() if name not in NO_LOSSES},
         "psnr_training": quantity(result.get("psnr"), "dB"),
-        "confident_share": quantity(float((maps.confidence > CONFIDENT).sum() / given.views.masks.sum()), "1"),
+        "confident_share": quantity(float((maps.confidence > MIN_CONFIDENCE).sum() / given.views.masks.sum()), "1"),
     }
 
 

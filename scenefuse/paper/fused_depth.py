@@ -53,7 +53,7 @@ def consistency_between_views(depth: Tensor, photos: DepthPhotos) -> ViewConsist
     for view in range(len(depth)):
         sources = photos.sources[view]
         moves = photos.source_from_target(torch.full_like(sources, view), sources)
-        difference, _, seen = reprojection_differences(
+        difference, seen = reprojection_differences(
             depth[view : view + 1],
             depth[sources],
             moves,
@@ -140,7 +140,7 @@ def fuse_by_inverse_variance(
 
 def reprojection_differences(
     depth: Tensor, others: Tensor, other_from_view: Tensor, of_view: Tensor, of_others: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor]:
     """Forward-backward check of one view's depth map against those of other views.
 
     Each pixel goes into another view with its depth, takes the depth found there, and comes back.
@@ -153,8 +153,7 @@ def reprojection_differences(
         of_others: (S, 3, 3) intrinsics.
 
     Returns:
-        (S, H, W) depth that came back minus depth; (S, H, W) distance in pixels between start and return; (S, H, W)
-        bool, True where both views have a depth.
+        (S, H, W) depth that came back minus depth; (S, H, W) bool, True where both views have a depth.
     """
     count, (height, width) = len(others), depth.shape[2:]
     points = points_in_cam(depth, of_view).expand(count, -1, -1)
@@ -163,16 +162,8 @@ def reprojection_differences(
     found = sample(torch.cat([others, have], 1), pixels)
     seen = inside(pixels, z, height, width) & (found[:, 1] > 0.999) & (depth > 0).view(1, -1)
     rays = torch.linalg.inv(of_others) @ torch.cat([pixels, torch.ones_like(pixels[..., :1])], 2).transpose(1, 2)
-    back, returned = project(rays * found[:, :1], torch.linalg.inv(other_from_view), of_view.expand(count, -1, -1))
-    start, _ = project(
-        points, torch.eye(4, dtype=depth.dtype, device=depth.device)[None].expand(count, -1, -1), of_view
-    )
-    shape = (count, height, width)
-    return (
-        (returned - depth.view(1, -1)).view(shape),
-        (back - start).norm(dim=2).view(shape),
-        seen.view(shape),
-    )
+    _, returned = project(rays * found[:, :1], torch.linalg.inv(other_from_view), of_view.expand(count, -1, -1))
+    return (returned - depth.view(1, -1)).view(count, height, width), seen.view(count, height, width)
 
 
 def map_quantities(depth: Tensor, consistency: ViewConsistency, photos: DepthPhotos) -> Content:

@@ -13,10 +13,11 @@ from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.nerf.prior.confirmed import read_stage_maps
 from scenefuse.nerf.prior.training import loss_quantities, optimise, predict, prepare_torch
-from scenefuse.paper.chain import chained
+from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper.estimate_as_paper import (
     PoseSource,
     StageOutputs,
+    chained,
     in_unit,
     photos_at,
     place,
@@ -26,16 +27,14 @@ from scenefuse.paper.fused_depth import blend_depths, print_quality
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
+    load_networks,
     monocular_losses,
     new_monocular_networks,
+    pose_quantities,
     recipe_of,
     supervision_of,
 )
-from scenefuse.paper.networks import load_networks, pose_quantities
 from scenefuse.photos.views import Views, load_views
-
-# Rendered depths below this confidence (0..1) are not used.
-MIN_RENDERED_CONFIDENCE = 0.5
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,7 @@ def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple
     rendered = read_stage_maps(earlier.rendered / "depth_maps", views)
     if not rendered.any():
         raise StageError(f"{earlier.rendered}/depth_maps holds no depth for any photo of the object; run stage 2 again")
-    confident = read_stage_maps(earlier.rendered / "confidence_maps", views) >= MIN_RENDERED_CONFIDENCE
+    confident = read_stage_maps(earlier.rendered / "confidence_maps", views) >= MIN_CONFIDENCE
     found = read_stage_maps(earlier.previous / "depth_maps", views), rendered * confident * views.masks
     predicted, kept = (torch.from_numpy(maps.astype(np.float32))[:, None].to(device) for maps in found)
     return predicted, kept

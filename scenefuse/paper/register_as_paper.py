@@ -50,9 +50,9 @@ RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
 MIN_MUTUAL_SHARE = 0.1
-# Matches that determine a similarity, and how much the sizes of object and crop, which is cut to it, may differ then:
-# matches that are wrong shrink the object into a spot. Triples that are drawn at once.
-MIN_MATCHES, MAX_SCALE_FACTOR, TRIPLES_AT_ONCE = 3, 2.0, 1 << 14
+# How much the sizes of object and crop, which is cut to it, may differ: matches that are wrong shrink the object into a
+# spot. Triples that are drawn at once.
+MAX_SCALE_FACTOR, TRIPLES_AT_ONCE = 2.0, 1 << 14
 
 
 def register_as_paper(
@@ -152,7 +152,7 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
     agree = agreeing(*matched, RANSAC_DISTANCE * VOXEL_FRACTION, seed)
     said = f"{agree.sum()} of {len(pairs)} mutual matches agree"
     print(said, flush=True)
-    if agree.sum() < MIN_MATCHES:
+    if agree.sum() < RANSAC_POINTS:
         return None, [f"{said}, too few: the scale is the RMS ratio of the whole clouds"]
     ratio = rms(matched[1][agree]) / rms(matched[0][agree])
     return ratio * scene.diagonal / cloud.diagonal, [said]

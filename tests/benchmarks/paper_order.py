@@ -11,9 +11,7 @@ from pathlib import Path
 from scenefuse.core.settings import build, read_settings
 from scenefuse.core.stage import read_json, run, value
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, train_stage
-from scenefuse.paper.order_and_edges import RANK_WEIGHT, OrderAndEdges
-from scenefuse.paper.recipe import NERF
-from scenefuse.paper.train_nerf_as_paper import as_paper, rays_of_an_epoch
+from scenefuse.paper.train_nerf_as_paper import NERF, RANK_WEIGHT, OrderAndEdges, as_paper, rays_of_an_epoch
 
 # So small a weight teaches nothing, and the loss is still measured.
 NOTHING = 1e-9

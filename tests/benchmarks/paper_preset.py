@@ -28,7 +28,7 @@ from scenefuse.core.stage import read_json, run, value
 from scenefuse.core.transforms import Array, Sim3, rotation_angle_deg
 from scenefuse.metrics.evaluate_object import ObjectTruth, cloud_results, depth_results, read_object_truth
 from scenefuse.metrics.truth import SAMPLES, registration_error, true_depth
-from scenefuse.paper.chain import trajectory_error
+from scenefuse.paper.estimate_as_paper import trajectory_error
 from scenefuse.paper.paper_tables import (
     COMMON,
     NULL,

@@ -26,16 +26,16 @@ from scenefuse.demo.capture import render
 from scenefuse.demo.world import World, build_world, openness
 from scenefuse.metrics.true_cameras import Cameras, pinhole
 from scenefuse.nerf.prior.training import optimise, predict, prepare_torch
-from scenefuse.paper.chain import chained, trajectory_error
+from scenefuse.paper.estimate_as_paper import chained, trajectory_error
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
     monocular_losses,
     new_monocular_networks,
+    pose_quantities,
     recipe_of,
     supervision_of,
 )
-from scenefuse.paper.networks import pose_quantities
 from scenefuse.photos.views import Views
 
 # As the demo's photos, at the width of the paper's stage 1.

@@ -25,7 +25,7 @@ from scenefuse.nerf.prior.self_supervision import (
     warp,
 )
 from scenefuse.nerf.prior.training import Recipe, predict, train_network
-from scenefuse.paper.networks import rigid
+from scenefuse.paper.monocular import rigid
 from scenefuse.photos.pictures import read_depth
 
 INTRINSICS = torch.tensor([[[40.0, 0.0, 24.0], [0.0, 40.0, 16.0], [0.0, 0.0, 1.0]]])

@@ -18,8 +18,7 @@ from scenefuse.nerf.prior.training import Recipe, optimise, predict
 from scenefuse.nerf.render import render_view
 from scenefuse.nerf.training import NerfRecipe, Schedule, Training, new_nerf, train
 from scenefuse.paper.monocular import frames_of, monocular_losses, new_monocular_networks, supervision_of
-from scenefuse.paper.order_and_edges import OrderAndEdges
-from scenefuse.paper.recipe import NERF
+from scenefuse.paper.train_nerf_as_paper import NERF, OrderAndEdges
 
 
 @pytest.fixture

@@ -15,8 +15,7 @@ from scenefuse.nerf.field import Field, FieldSettings
 from scenefuse.nerf.losses import LossWeights
 from scenefuse.nerf.rays import draw_batch
 from scenefuse.nerf.training import Nerf, NerfRecipe, Schedule, Training, new_nerf, train
-from scenefuse.paper.order_and_edges import EDGE_RATE, RANK_MARGIN, RANK_WEIGHT, OrderAndEdges, rank_loss
-from scenefuse.paper.recipe import LOSSES
+from scenefuse.paper.train_nerf_as_paper import EDGE_RATE, LOSSES, RANK_MARGIN, RANK_WEIGHT, OrderAndEdges, rank_loss
 
 FIELD = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
 RECIPE = NerfRecipe(

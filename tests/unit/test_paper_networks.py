@@ -10,7 +10,7 @@ from support.textured_plane import plane_views
 from scenefuse.core.stage import StageError, value
 from scenefuse.nerf.prior.inputs import depth_photos
 from scenefuse.paper.fused_depth import consistency_between_views, fuse_by_inverse_variance
-from scenefuse.paper.networks import PoseNetwork, load_networks, pose_quantities, rigid
+from scenefuse.paper.monocular import PoseNetwork, load_networks, pose_quantities, rigid
 
 
 def test_rigid_turns_about_an_axis():

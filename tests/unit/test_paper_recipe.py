@@ -20,23 +20,29 @@ from scenefuse.nerf.prior import training
 from scenefuse.nerf.prior.training import Recipe, optimise, predict
 from scenefuse.nerf.train_object_nerf import NerfSettings
 from scenefuse.nerf.training import NerfRecipe, Schedule
-from scenefuse.paper import recipe
 from scenefuse.paper import train_nerf_as_paper as nerf_stage
-from scenefuse.paper.chain import chained, place_chain, trajectory_error
-from scenefuse.paper.estimate_as_paper import StageOutputs, estimate_as_paper, few_frames, place
+from scenefuse.paper.estimate_as_paper import (
+    StageOutputs,
+    chained,
+    estimate_as_paper,
+    few_frames,
+    place,
+    place_chain,
+    trajectory_error,
+)
 from scenefuse.paper.monocular import (
     MonocularSettings,
     frames_of,
+    load_networks,
     monocular_losses,
     neighbours,
     new_monocular_networks,
     recipe_of,
+    small_photos,
     supervision_of,
 )
-from scenefuse.paper.networks import load_networks, small_photos
-from scenefuse.paper.order_and_edges import RANK_WEIGHT
 from scenefuse.paper.refine_as_paper import EarlierStages, refine_as_paper
-from scenefuse.paper.train_nerf_as_paper import as_paper, train_nerf_as_paper
+from scenefuse.paper.train_nerf_as_paper import RANK_WEIGHT, as_paper, train_nerf_as_paper
 from scenefuse.photos.workspace import View, read_workspace
 from scenefuse.sfm import colmap, matches
 from scenefuse.sfm.lens import KNOWN
@@ -45,17 +51,17 @@ CPU = torch.device("cpu")
 
 
 def test_the_constants_are_the_papers():
-    nerf, depth = recipe.NERF, recipe_of(MonocularSettings(15))
+    nerf, depth = nerf_stage.NERF, recipe_of(MonocularSettings(15))
     assert (nerf.learning_rate, nerf.grid_learning_rate, training.LEARNING_RATE) == (1e-3, 1e-3, 1e-3)
     assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
     assert (nerf.images_per_batch, depth.batch_photos, depth.even) == (24, 24, False)
-    assert FieldSettings(levels=16, log2_table=19, finest=2048, width=64) == recipe.FIELD
+    assert FieldSettings(levels=16, log2_table=19, finest=2048, width=64) == nerf_stage.FIELD
     assert nerf == NerfRecipe(
         images_per_batch=24, rays_per_image=170, warmup_epochs=2, learning_rate=1e-3, grid_learning_rate=1e-3,
         coarse_until=0.0, prior_share=0.0, turned_share=0.0, appearance=False,
     )  # fmt: skip
-    assert replace(LossWeights(), distortion_weight=0.0) == recipe.LOSSES
-    assert RANK_WEIGHT > 0 and recipe.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
+    assert replace(LossWeights(), distortion_weight=0.0) == nerf_stage.LOSSES
+    assert RANK_WEIGHT > 0 and nerf_stage.LOSSES.depth_weight > 0 and training.SMOOTHNESS_WEIGHT == 1e-3
     preset = read_settings(ROOT / "config/paper.yaml")
     assert sum(preset["object"][f"stage{number}"]["epochs"] for number in (1, 2, 3, 4)) == 60
     assert preset["scene"]["depth_maps"] | {"max_image_size_px": 2000, "sources": 8} == preset["scene"]["depth_maps"]
@@ -78,10 +84,10 @@ def test_the_constants_of_sfm_are_the_papers():
 def test_the_papers_field_and_rays_are_taken_on_a_gpu_and_those_of_the_settings_on_a_cpu():
     settings = NerfSettings(field=FieldSettings(levels=4))
     on_gpu, on_cpu = (as_paper(settings, 900_000, device) for device in ("cuda", "cpu"))
-    assert (on_gpu.field, on_gpu.schedule.rays_per_epoch) == (recipe.FIELD, 900_000)
+    assert (on_gpu.field, on_gpu.schedule.rays_per_epoch) == (nerf_stage.FIELD, 900_000)
     assert (on_cpu.field, on_cpu.schedule.rays_per_epoch) == (settings.field, settings.schedule.rays_per_epoch)
     assert as_paper(settings, 500, "cpu").schedule.rays_per_epoch == 500
-    assert on_cpu.recipe is recipe.NERF
+    assert on_cpu.recipe is nerf_stage.NERF
 
 
 def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
@@ -285,7 +291,7 @@ def ball(tmp_path_factory):
 
 def test_all_stages_run_from_sfm_poses_and_stage_3_refines_both_networks(ball, tmp_path, monkeypatch):
     # A hash grid learns too little in a test's few steps at the paper's rate.
-    fast = replace(recipe.NERF, learning_rate=1e-2, grid_learning_rate=2e-2, rays_per_image=20, occupancy_cells=32)
+    fast = replace(nerf_stage.NERF, learning_rate=1e-2, grid_learning_rate=2e-2, rays_per_image=20, occupancy_cells=32)
     monkeypatch.setattr(nerf_stage, "NERF", fast)
     given = {"masks": ball / "masks", "hold_out_every": 4, "seed": 0}
 
