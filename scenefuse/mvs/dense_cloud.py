@@ -1,6 +1,7 @@
-"""The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion."""
+"""The dense cloud of a scene: its depth maps, fused by COLMAP's stereo fusion in a temporary workspace."""
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -13,23 +14,18 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import WHOLE, write_tiled
-from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, value, write_json
+from scenefuse.core.stage import StageError, quantity, read_json, scratch_directory, setting, threads, value, write_json
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.consistency import neighbours, vote
-from scenefuse.mvs.temporary_workspace import linked_workspace
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.pictures import read_depth, write_depth
-from scenefuse.photos.workspace import View, read_views
+from scenefuse.photos.workspace import View, posed_images, read_model, read_views
 from scenefuse.sfm.colmap import cancellable
 
 # Share of the measured pixels below which the cameras or the limits are probably wrong.
 MIN_FUSED_SHARE = 0.01
-# Steps from photo to photo in one point's search for agreement: COLMAP's own limit.
-MAX_TRAVERSAL_DEPTH = 100
 # Photos whose maps are kept in memory, for the next photo's vote and by COLMAP, which follows a point through 50.
 CACHED_MAPS = 64
-# A pixel of a photo's depth and normal map; a pixel of the photo, which COLMAP keeps at its own size.
-MAP_BYTES, PHOTO_BYTES = 16, 3
 # Neighbours whose mean distance shows a point far from all others; it is dropped when that is more than so many times
 # the cloud's median.
 OUTLIER_NEIGHBOURS, OUTLIER_RATIO = 8, 4.0
@@ -151,7 +147,8 @@ def _fuse(
     """
     largest = max(_path(folder, "depth_maps", name).stat().st_size for name, folder in maps.items()) // 4
     photo = max(view.width * view.height for view in read_views(workspace / "sparse"))
-    cached = CACHED_MAPS * (MAP_BYTES * largest + PHOTO_BYTES * photo)
+    # Bytes of a pixel: 16 of its depth and normal, 3 of the photo, which COLMAP keeps at its own size.
+    cached = CACHED_MAPS * (16 * largest + 3 * photo)
     widths = {name: _map_width(_path(folder, "depth_maps", name)) for name, folder in maps.items()}
     with linked_workspace(workspace, beside, widths) as folder:
         for name, source in maps.items():
@@ -181,7 +178,6 @@ def _options(settings: DenseCloudSettings, cached_bytes: int) -> pycolmap.Stereo
     options.max_reproj_error = settings.max_reprojection_px
     options.max_depth_error = settings.max_depth_error
     options.max_normal_error = settings.max_normal_error_deg
-    options.max_traversal_depth = MAX_TRAVERSAL_DEPTH
     options.use_cache, options.cache_size = True, cached_bytes / 1e9
     return options
 
@@ -263,3 +259,28 @@ def _mean_distance(points: Array, at: Array, reach: float) -> Array:
     """(M,) of the neighbours of some of the points, as far as they are within reach."""
     neighbours = cKDTree(points).query(at, k=OUTLIER_NEIGHBOURS + 1, distance_upper_bound=reach, workers=threads())
     return np.asarray(neighbours[0][:, 1:].mean(1))
+
+
+@contextmanager
+def linked_workspace(workspace: Path, beside: Path, map_widths: Mapping[str, int]) -> Iterator[Path]:
+    """A temporary COLMAP workspace, removed afterwards: links to the photos, and shifted cameras.
+
+    COLMAP's dense part takes the first pixel's centre as 0, its sparse part as 0.5, so principal points move by half
+    a pixel of the map. With exact depth maps this takes the fused cloud from a quarter of a pixel's error to none.
+
+    Args:
+        workspace: with images/ and sparse/, PINHOLE cameras.
+        beside: path that it lies beside, on the file system of what comes out, so that maps can be moved there.
+        map_widths: width of the depth map of each photo, in pixels; photos of one camera have maps of one width.
+    """
+    model = read_model(workspace / "sparse")
+    widths = {image.camera_id: map_widths[image.name] for image in posed_images(model) if image.name in map_widths}
+    for camera in model.cameras.values():
+        half = 0.5 * camera.width / widths.get(camera.camera_id, camera.width)
+        fx, fy, cx, cy = camera.params
+        camera.params = [fx, fy, cx - half, cy - half]
+    with scratch_directory(beside) as folder:
+        (folder / "sparse").mkdir()
+        model.write_binary(folder / "sparse")
+        (folder / "images").symlink_to((workspace / "images").resolve())
+        yield folder

@@ -27,15 +27,14 @@ from scenefuse.photos.workspace import View
 PLANE_PX, NORMAL_PX = 9, 11
 # The same where depths are already nearly right: smaller, since objects are curved.
 KNOWN_PLANE_PX = 7
-# Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere.
-MIN_GAIN = 0.02
+# Less than this, in NCC, is no better match: smooth surfaces match nearly everywhere. A match must be better than those
+# beside it by this and by so much more for noise as strong as the texture: in that ratio noise changes NCC.
+MIN_GAIN, MIN_GAIN_PER_NOISE = 0.02, 0.25
 # Windows whose grey values deviate by this much (two of 255 levels) have a texture that must match somewhere.
 MIN_TEXTURE = 2 / 255
 # A match must be worse this far beside it, in pixels of the middle one of the source photos: a high correlation alone
 # says little, as a shaded wall matches at all depths.
 PEAK_DISTANCE_PX = 1.5
-# By how much, in NCC, and how much more for noise as strong as the texture: in that ratio noise changes NCC.
-MIN_PEAK, MIN_PEAK_PER_NOISE = 0.02, 0.25
 # Largest share of blank pixels among those around that look alike, in windows of this side, twice over: the glow beside
 # an edge lies at the rim of a blank sky.
 MAX_BLANK_SHARE, SUPPORT_PX = 0.25, 11
@@ -305,7 +304,7 @@ def is_measured(matcher: Matcher, inverse: Tensor, score: Tensor, min_score: flo
     away = PEAK_DISTANCE_PX * pixel
     beside = matcher.score(torch.stack([inverse - away, inverse + away])).amax(0)
     noise = matcher.flat / matcher.variance.clamp(min=1e-12)
-    measured = (score >= min_score) & (score - beside >= MIN_PEAK + MIN_PEAK_PER_NOISE * noise)
+    measured = (score >= min_score) & (score - beside >= MIN_GAIN + MIN_GAIN_PER_NOISE * noise)
     return measured & ~_among_blank(matcher, measured)
 
 
