@@ -13,7 +13,7 @@ from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
 from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
 from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
-from scenefuse.nerf.prior.confirmed import MAP_AGREEMENT
+from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf

@@ -21,7 +21,7 @@ from scenefuse.nerf.appearance import measured_sharpness, photo_weights
 from scenefuse.nerf.encoding import kernels_on
 from scenefuse.nerf.field import FieldSettings
 from scenefuse.nerf.losses import LossWeights
-from scenefuse.nerf.prior.confirmed import DepthPrior, read_prior
+from scenefuse.nerf.prior.refine_depth import DepthPrior, read_prior
 from scenefuse.nerf.rays import PhotoTensors
 from scenefuse.nerf.rendered_maps import (
     RenderedMaps,

@@ -36,6 +36,25 @@ from scenefuse.report.values import find, load, number
 
 ON_DEMAND = ("fused_scene.json",)
 """Files of an object that no run makes unless they are asked for, at any time."""
+_HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
+_TITLES = {
+    "2": "registration",
+    "3": "completion",
+    "4": "registration without scale rectification (no_scale), without the crop (no_crop)",
+}
+_ABOUT = (
+    f"{PAPER}: what it states for its own captures of such objects; its thresholds are not known. {HERE}: this run."
+    f" {SCENEFUSE}: a run of the shipped recipe on the same photos, by the same definitions, on its own crop."
+    f" {COMMON}: its pose on this run's crop, which may hold ground, as the fiducials' box has it (Table 2)."
+    f" {NULL}: the same for a random cloud in the place of the object (Tables 2, 4) or of the added points (Table 3);"
+    " only a clear distance from it says something. Labels like R10 are those of docs/method."
+)
+_FIGURES = (
+    "Its figures have their counterparts on this page and in results/. Figure 2, the scene and its incomplete objects:"
+    " (a) scenes/SCENE/scene.png, (b) the row before of objects/OBJECT/figures/before_after.png, large in before.png."
+    " Figure 3, the objects reconstructed: figures/object.png. Figure 5, before and after completion:"
+    " figures/before_after.png, large in before.png and after.png."
+)
 
 
 @dataclass(frozen=True)
@@ -200,27 +219,6 @@ def _tau_share(item: ObjectSummary) -> float | None:
     fields = item.variants.get("full", {})
     tau, diagonal = find(fields, "metrics.registration.tau"), find(fields, "crop.diagonal")
     return None if tau is None else tau / diagonal
-
-
-_HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
-_TITLES = {
-    "2": "registration",
-    "3": "completion",
-    "4": "registration without scale rectification (no_scale), without the crop (no_crop)",
-}
-_ABOUT = (
-    f"{PAPER}: what it states for its own captures of such objects; its thresholds are not known. {HERE}: this run."
-    f" {SCENEFUSE}: a run of the shipped recipe on the same photos, by the same definitions, on its own crop."
-    f" {COMMON}: its pose on this run's crop, which may hold ground, as the fiducials' box has it (Table 2)."
-    f" {NULL}: the same for a random cloud in the place of the object (Tables 2, 4) or of the added points (Table 3);"
-    " only a clear distance from it says something. Labels like R10 are those of docs/method."
-)
-_FIGURES = (
-    "Its figures have their counterparts on this page and in results/. Figure 2, the scene and its incomplete objects:"
-    " (a) scenes/SCENE/scene.png, (b) the row before of objects/OBJECT/figures/before_after.png, large in before.png."
-    " Figure 3, the objects reconstructed: figures/object.png. Figure 5, before and after completion:"
-    " figures/before_after.png, large in before.png and after.png."
-)
 
 
 def paper_section(rows: list[dict[str, str]]) -> str:

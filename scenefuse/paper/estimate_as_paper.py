@@ -16,11 +16,10 @@ from torch import Tensor
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
-from scenefuse.nerf.prior.alignment import align_maps, residual_at_checks
-from scenefuse.nerf.prior.confirmed import DepthPrior, write_prior
 from scenefuse.nerf.prior.inputs import DepthPhotos, depth_photos
-from scenefuse.nerf.prior.networks import parameters
-from scenefuse.nerf.prior.self_supervision import sample
+from scenefuse.nerf.prior.monodepth import parameters, sample
+from scenefuse.nerf.prior.refine_depth import DepthPrior, write_prior
+from scenefuse.nerf.prior.train_depth import align_maps, residual_at_checks
 from scenefuse.nerf.prior.training import Recipe, loss_quantities, optimise, predict, prepare_torch
 from scenefuse.paper.fused_depth import Content, consistency_between_views, map_quantities, print_quality
 from scenefuse.paper.monocular import (

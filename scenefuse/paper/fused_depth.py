@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from scenefuse.core.stage import quantity
-from scenefuse.nerf.prior.alignment import residual_at_checks
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.self_supervision import inside, points_in_cam, project, sample
+from scenefuse.nerf.prior.monodepth import inside, points_in_cam, project, sample
+from scenefuse.nerf.prior.train_depth import residual_at_checks
 
 Content = dict[str, Any]
 

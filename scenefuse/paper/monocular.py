@@ -17,10 +17,23 @@ from torch.nn import functional
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.networks import DepthNetwork, convolutions, depth_from_disparity, disparity_from_depth
-from scenefuse.nerf.prior.self_supervision import masked_mean, smoothness
+from scenefuse.nerf.prior.monodepth import (
+    DepthNetwork,
+    convolutions,
+    depth_from_disparity,
+    disparity_from_depth,
+    masked_mean,
+    smoothness,
+)
 from scenefuse.nerf.prior.training import Objective, PhotoScale, Recipe, huber, reprojection_error
 from scenefuse.photos.views import Views
+
+# What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
+NEAR, FAR = 0.5, 2.0
+# Photos are compared at these fractions of their size one after the other, in equal parts of the training.
+SHRINKS = (4, 2, 1)
+# Frames that differ less on the object, on the mean, show no motion: two grey levels.
+MIN_CHANGE = 2 / 255
 
 
 class PoseNetwork(nn.Module):
@@ -135,14 +148,6 @@ def _mean(turns: Array) -> Array:
     """The rotation (3, 3) nearest to all of (N, 3, 3)."""
     u, _, vt = np.linalg.svd(turns.sum(0))
     return np.asarray(u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt)
-
-
-# What the depth network can say: an object that fits into its photos, about 1 away, is neither nearer nor farther.
-NEAR, FAR = 0.5, 2.0
-# Photos are compared at these fractions of their size one after the other, in equal parts of the training.
-SHRINKS = (4, 2, 1)
-# Frames that differ less on the object, on the mean, show no motion: two grey levels.
-MIN_CHANGE = 2 / 255
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 from scenefuse.core.checkpoints import key_of
 from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Array
-from scenefuse.nerf.prior.confirmed import read_stage_maps
+from scenefuse.nerf.prior.refine_depth import read_stage_maps
 from scenefuse.nerf.prior.training import loss_quantities, optimise, predict, prepare_torch
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
 from scenefuse.paper.estimate_as_paper import (

@@ -13,17 +13,20 @@ from support.textured_plane import plane_views
 
 from scenefuse.core.stage import StageError
 from scenefuse.nerf.prior import train_depth as stage
-from scenefuse.nerf.prior.alignment import align_to_points
 from scenefuse.nerf.prior.first_depth import network_inputs
 from scenefuse.nerf.prior.inputs import depth_photos
-from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity, disparity_from_depth, parameters
-from scenefuse.nerf.prior.self_supervision import (
+from scenefuse.nerf.prior.monodepth import (
+    DepthNetwork,
+    depth_from_disparity,
+    disparity_from_depth,
     minimum_reprojection,
+    parameters,
     photometric_error,
     smoothness,
     ssim,
     warp,
 )
+from scenefuse.nerf.prior.train_depth import align_to_points
 from scenefuse.nerf.prior.training import Recipe, predict, train_network
 from scenefuse.paper.monocular import rigid
 from scenefuse.photos.pictures import read_depth

@@ -11,8 +11,7 @@ from torch.nn import functional
 
 from scenefuse.geometry.matcher import NOISE_VARIANCE, Matcher
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.networks import depth_from_disparity, disparity_from_depth
-from scenefuse.nerf.prior.self_supervision import points_in_cam, warp
+from scenefuse.nerf.prior.monodepth import depth_from_disparity, disparity_from_depth, points_in_cam, warp
 from scenefuse.photos.workspace import View
 
 # Side of the matching windows at full size: small, because the cut photos are small. A median of it leaves out single

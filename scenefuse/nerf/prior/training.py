@@ -22,8 +22,9 @@ from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, threads
 from scenefuse.nerf.prior.first_depth import NetworkInputs
 from scenefuse.nerf.prior.inputs import DepthPhotos
-from scenefuse.nerf.prior.networks import DepthNetwork, depth_from_disparity
-from scenefuse.nerf.prior.self_supervision import (
+from scenefuse.nerf.prior.monodepth import (
+    DepthNetwork,
+    depth_from_disparity,
     masked_mean,
     minimum_reprojection,
     photometric_error,
