@@ -37,17 +37,11 @@ MIN_CHANGE = 2 / 255
 
 
 class PoseNetwork(nn.Module):
-    """Strided convolutions over two stacked photos, averaged into one motion.
+    """Strided convolutions over two stacked photos, averaged into one motion."""
 
-    Args:
-        width: channels of the first layer.
-        unit: length that an output of one stands for, in object units (the typical distance camera to object).
-    """
-
-    def __init__(self, unit: float, width: int = 16) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.unit = unit
-        sizes = [6, width, width * 2, width * 4, width * 6]
+        sizes = [6, 16, 32, 64, 96]
         self.encoder = nn.Sequential(*(convolutions(before, after, 2) for before, after in zip(sizes, sizes[1:])))
         self.last = nn.Conv2d(sizes[-1], 6, 1)
         nn.init.normal_(self.last.weight, std=1e-3)
@@ -56,7 +50,7 @@ class PoseNetwork(nn.Module):
     def forward(self, target: Tensor, source: Tensor) -> Tensor:
         """(B, 3, H, W) target and source photos in 0..1 -> (B, 4, 4) source_from_target."""
         motion = self.last(self.encoder(torch.cat([target, source], 1) - 0.5)).mean((2, 3))
-        return rigid(motion[:, :3], motion[:, 3:] * self.unit)
+        return rigid(motion[:, :3], motion[:, 3:])
 
 
 def rigid(axis_angle: Tensor, translation: Tensor) -> Tensor:
@@ -237,7 +231,7 @@ def _check_motion(frames: DepthPhotos) -> None:
 
 def new_monocular_networks(device: torch.device) -> Networks:
     """Untrained networks: depth from colours alone, motion in the networks' unit."""
-    return Networks(DepthNetwork(3).to(device), PoseNetwork(1.0).to(device))
+    return Networks(DepthNetwork(3).to(device), PoseNetwork().to(device))
 
 
 def supervision_of(frames: DepthPhotos, target: Tensor | None = None, weight: Tensor | None = None) -> Supervision:

@@ -21,7 +21,7 @@ def test_rigid_turns_about_an_axis():
 def test_one_motion_for_all_pairs_is_told_from_motions_that_were_found():
     views = plane_views(6)[0]
     photos = depth_photos(views, 3, torch.device("cpu"))
-    network = PoseNetwork(3.0)
+    network = PoseNetwork()
     with torch.no_grad():
         network.last.weight.zero_()
         network.last.bias.copy_(torch.tensor([0.3, 0.0, 0.0, 0.0, 0.0, 0.0]))

@@ -140,24 +140,19 @@ class DepthNetwork(nn.Module):
 
     Args:
         channels: input channels beside the first disparity.
-        width: channels of the finest level; deeper levels have 1, 2, 3 and 4 times as many.
     """
 
-    def __init__(self, channels: int, width: int = 16) -> None:
+    def __init__(self, channels: int) -> None:
         super().__init__()
-        sizes = [width, width * 2, width * 3, width * 4]
+        sizes = [16, 32, 48, 64]
         self.encoder = nn.ModuleList(
             convolutions(before, after, 2) for before, after in zip([channels + 1, *sizes[:-1]], sizes)
         )
         self.decoder = nn.ModuleList(
             convolutions(deep + skip, skip, 1) for deep, skip in zip(sizes[:0:-1], sizes[-2::-1])
         )
-        self.head = nn.Conv2d(width + channels + 1, 16, 3, padding=1, padding_mode="replicate")
+        self.head = nn.Conv2d(sizes[0] + channels + 1, 16, 3, padding=1, padding_mode="replicate")
         self.last = nn.Conv2d(16, 1, 3, padding=1, padding_mode="replicate")
-        self.restart()
-
-    def restart(self) -> None:
-        """Set the correction to zero; the features learned so far stay."""
         nn.init.zeros_(self.last.weight)
         nn.init.zeros_(self.last.bias)  # type: ignore[arg-type]
 
