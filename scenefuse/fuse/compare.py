@@ -34,10 +34,12 @@ THROUGH_PHOTOS, THROUGH_SHARE = 2, 0.3
 # the sparser side where that is more; never farther than this share of the diagonal.
 SAME_PLACE_DEVIATIONS, SAME_PLACE_SPACINGS, MAX_SAME_PLACE = 5.0, 1.5, 0.02
 # The object's points give way where the scene's standard deviation is smaller by more than this factor: they are the
-# denser ones, and equals would alternate.
+# denser ones, and equals would alternate. Where they are outnumbered, the scene's give way likewise.
 BETTER_FACTOR = 1.5
 # Standard deviations of the object within which a point that the scene did not measure may be right.
 CONSISTENT_DEVIATIONS = 3.5
+# Points of the scene for each of the object's, on the surface that both have, from which the scene is the denser.
+DENSER_FACTOR = 2.0
 # Side of the cells in which both sides' scatter is compared, over the diagonal, and in spacings of the sparser side
 # where that is more. Photos may confirm a point that is off, by chance; that a whole surface is rough shows beside the
 # other side's.
@@ -59,7 +61,7 @@ class Compared:
     reason: NDArray[np.uint8]
 
 
-def compare(obj: Measured, scene: Measured, views: list[View]) -> Compared:
+def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.0) -> Compared:
     """Decide which points of both sides stay.
 
     Measured points are the surface that hides and is seen. What the scene measured goes only where something is left
@@ -69,6 +71,7 @@ def compare(obj: Measured, scene: Measured, views: list[View]) -> Compared:
         obj: the object where it settled in the scene.
         scene: the scene's points around it, measured by the photos of both sides.
         views: the photos of both sides.
+        share: of the scene's points there that are given.
     """
     diagonal = obj.cloud.diagonal
     surface = obj.cloud[obj.surface]
@@ -83,7 +86,7 @@ def compare(obj: Measured, scene: Measured, views: list[View]) -> Compared:
     behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
     contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
-    worse, better = better_measured(obj, scene, diagonal)
+    worse, better = better_measured(obj, scene, diagonal, share)
     reason[worse & (reason == KEPT)] = REPLACED
     added = obj.surface & ~better
     replaced = np.flatnonzero(scene.surface & (reason == REPLACED))
@@ -93,8 +96,11 @@ def compare(obj: Measured, scene: Measured, views: list[View]) -> Compared:
     return Compared(added, contradicted, reason)
 
 
-def better_measured(obj: Measured, scene: Measured, diagonal: float) -> tuple[Mask, Mask]:
-    """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did."""
+def better_measured(obj: Measured, scene: Measured, diagonal: float, share: float) -> tuple[Mask, Mask]:
+    """Points of the scene (M,) that the object measured better, and points of the object (N,) that the scene did.
+
+    share: of the scene's points that are given.
+    """
     worse, better = np.zeros(len(scene.cloud), dtype=bool), np.zeros(len(obj.cloud), dtype=bool)
     if not obj.surface.any() or len(scene.cloud) == 0:
         return worse, better
@@ -107,6 +113,8 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float) -> tuple[Ma
     if len(second):
         rough, other_rough = _rougher(first, second, max(ROUGH_SIDE * diagonal, ROUGH_SPACINGS * coarse))
         mine, other = np.hypot(mine, rough), np.hypot(other, other_rough)
+    is_denser = _times_as_many(second.points, first.points, coarse) > DENSER_FACTOR * share
+    factor = 1 / BETTER_FACTOR if is_denser else BETTER_FACTOR
     theirs = np.full(len(points), np.inf)
     theirs[scene.surface] = other
     # What the scene did not measure lies as far off as what it measured, at least.
@@ -119,7 +127,7 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float) -> tuple[Ma
     distance, partner = cKDTree(first.points).query(points, workers=threads())
     # A measured point of the scene is on the object's surface or beside it, on the ground for instance.
     least = SAME_PLACE_SPACINGS * np.where(scene.surface, fine, coarse)
-    worse = is_same(distance, mine[partner], theirs, least) & (mine[partner] <= BETTER_FACTOR * theirs)
+    worse = is_same(distance, mine[partner], theirs, least) & (mine[partner] <= factor * theirs)
     # What it measured in a hole of the object's surface, or beyond its border, is nowhere else.
     worse &= ~scene.surface | (_beside(points, first[partner]) <= coarse)
     if len(second):
@@ -130,7 +138,11 @@ def better_measured(obj: Measured, scene: Measured, diagonal: float) -> tuple[Ma
         # A better point of a sparser side stands for what lies within a spacing of the object's.
         there = is_same(distance, mine, other[partner], SAME_PLACE_SPACINGS * coarse)
         there &= _beside(first.points, second[partner]) <= fine
-        better[obj.surface] = there & (mine > BETTER_FACTOR * other[partner])
+        if is_denser:
+            # Of equals the object's points stay in the holes of a denser scene.
+            hole = np.where(mine > BETTER_FACTOR * other[partner], np.inf, SAME_PLACE_SPACINGS * spacing(second.points))
+            there &= _beside(first.points, second[partner]) <= hole
+        better[obj.surface] = there & (mine > factor * other[partner])
     return worse, better
 
 
@@ -142,6 +154,17 @@ def _alone(points: Array, others: Cloud, reach: float) -> Mask:
     near = cKDTree(others.points).query(points, k=count, workers=threads())[1].reshape(-1)
     beside = _beside(np.repeat(points, count, axis=0), others[near])
     return np.asarray(beside.reshape(-1, count).min(1) > reach)
+
+
+def _times_as_many(points: Array, others: Array, reach: float) -> float:
+    """How many of (N, 3) points there are for each of the others (M, 3), where both are within `reach` of each other.
+
+    Counted, since regular points lie farther from their nearest ones than as many irregular ones; doubles are one.
+    """
+    if not len(points):
+        return 0.0
+    shared = [a[cKDTree(b).query(a, workers=threads())[0] < reach] for a, b in ((points, others), (others, points))]
+    return len(np.unique(shared[0], axis=0)) / max(len(shared[1]), 1)
 
 
 def _beside(points: Array, partners: Cloud) -> Array:

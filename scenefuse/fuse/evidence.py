@@ -150,7 +150,7 @@ def check(
     mine, obj_photos = mine.moved(settled), moved_photos(obj_photos, settled)
 
     theirs = measure_again(theirs, obj_photos, diagonal)
-    decided = compare(mine, theirs, obj_photos.views + scene_photos.views)
+    decided = compare(mine, theirs, obj_photos.views + scene_photos.views, len(chosen) / max(len(scene), 1))
     added, reason = decided.added, decided.reason
     if nerf_only:
         unconfirmed = ~mine.surface & ~decided.contradicted

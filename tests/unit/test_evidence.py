@@ -252,6 +252,29 @@ def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
     assert added[distance > 0.022].mean() > 0.95 and added[distance < 0.018].mean() < 0.5
 
 
+def test_of_equals_the_denser_side_stays(near, far):
+    coarse, fine = sheet(-0.8, 0.8, 0.04), sheet(-0.8, 0.8, 0.015)
+    for obj, scene, added in ((coarse, fine, False), (fine, coarse, True)):
+        found = check(obj, scene, near, near, nerf_only=False)
+        middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
+        assert (found.added[middle].mean() > 0.95) == added
+        assert ((found.reason[around] == KEPT).mean() < 0.05) == added
+
+
+def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.012)
+    scene = scene[np.linalg.norm(scene.points[:, :2], axis=1) > 0.08]
+    found = check(obj, scene, near, near, nerf_only=False)
+    inside, beside = (np.linalg.norm(obj.points[:, :2], axis=1) < r for r in (0.05, 0.5))
+    assert found.added[inside].mean() > 0.7 and found.added[beside & (np.abs(obj.points[:, 0]) > 0.2)].mean() < 0.05
+
+
+def test_doubles_do_not_make_a_scene_dense(near):
+    obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.06)
+    found = check(obj, concatenate([scene] * 10), near, near, nerf_only=False)
+    assert found.added.mean() > 0.95
+
+
 def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
     obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
     found = check(obj, floating, near, far, nerf_only=False)
@@ -263,11 +286,11 @@ def test_what_the_scene_did_not_measure_stays_where_the_object_measures_less_exa
     obj, scene = sheet(-0.8, 0.8, 0.03), sheet(-0.8, 0.8, 0.04, z=0.01)
     measured = scene.points[:, 0] < 0
     theirs = known(scene, np.where(measured, 0.005, np.inf), measured)
-    worse, better = better_measured(known(obj, inexact), theirs, obj.diagonal)
+    worse, better = better_measured(known(obj, inexact), theirs, obj.diagonal, 1.0)
     assert (not worse[~measured].any()) if stay else worse[~measured].all()
     # What lies farther off than the object's own deviation explains goes.
     away = replace(theirs, cloud=replace(scene, points=scene.points + [0, 0, 0.035]))
-    worse, _ = better_measured(known(obj, 0.012), away, obj.diagonal)
+    worse, _ = better_measured(known(obj, 0.012), away, obj.diagonal, 1.0)
     assert worse[~measured].mean() > 0.95
 
 
