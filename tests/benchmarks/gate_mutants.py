@@ -72,7 +72,7 @@ def caught() -> str | None:
     return None
 
 
-def main() -> int:
+def gate_mutants() -> int:
     """Print a line for each mutant; 1 when one survives."""
     if (wrong := caught()) is not None:
         print(f"the gate fails its own test without any change: {wrong}")
@@ -93,4 +93,4 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(gate_mutants())

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from registration import planted, scenefuse
+from benchmarks.registration import planted, scenefuse
 from support.planted import errors
 
 # Shape, kind, coverage, repeat: with all evidence, by shape alone, an object in another's scene, a mirrored object.
@@ -49,11 +49,11 @@ def one(name: str, kind: str, coverage: float, repeat: int) -> dict[str, object]
     }  # fmt: skip
 
 
-def main(out: Path) -> None:
+def same_decisions(out: Path) -> None:
     """Run all trials; rows are written as they come."""
     for k, trial in enumerate(TRIALS):
         pd.DataFrame([one(*trial)]).to_csv(out, sep="\t", index=False, mode="a" if k else "w", header=not k)
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    same_decisions(Path(sys.argv[1]))
