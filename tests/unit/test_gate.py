@@ -4,7 +4,7 @@
 """
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -103,7 +103,7 @@ def decided(case: Case, decided_by: str) -> Decision:
         sure = replace(Uncertainty.even(scale, angle, step * DIAGONAL), rotation_axis=case.axis)
     scene = Cloud(np.array([[0.0, 0, 0], [DIAGONAL, 0, 0]]))
     problem = Problem(Cloud(case.obj.points), scene, case.scales, Constraints(case.ups))
-    return decide(ranked, sure, decided_by, case.obj, problem, SETTINGS, case.repetition)
+    return decide(ranked, sure, cast(Any, decided_by), case.obj, problem, SETTINGS, case.repetition)
 
 
 def check(case: Case) -> None:
@@ -225,7 +225,8 @@ def check_reported() -> None:
     found = {by: decided(case, by) for by in EVERY}
     assert all(("turned about (" in found[by].reason) == (by in BY_CLOUDS) for by in EVERY)
     assert "fits as well" not in decided(replace(case, rivals=()), "geometry").reason
-    assert found["geometry"].rival.pose is ELSEWHERE and "margin 0.50" in found["geometry"].reason
+    rival = found["geometry"].rival
+    assert rival is not None and rival.pose is ELSEWHERE and "margin 0.50" in found["geometry"].reason
     assert "agree" in found["both"].reason and "against the clouds' best fit" in found["photos"].reason
     assert "refute" in found["near"].reason
     assert gate.tilt_deg(turn(X, 30), (Z, Z)) == pytest.approx(30) and gate.tilt_deg(QUARTER, None) is None

@@ -19,7 +19,7 @@ from rules import Rule
 
 from scenefuse.core.stage import StageError, read_json, value
 from scenefuse.geometry.visual_hull import Mask, mask_iou
-from scenefuse.marks.clicks import read_points
+from scenefuse.marks.clicks import Clicks, read_points
 from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.prompts import NO_PIXELS
 from scenefuse.masks.sam2 import Sam2Onnx
@@ -48,7 +48,7 @@ class Cached:
 
     def encode(self, image: Any) -> tuple[str, Any]:
         """The photo and its key; it is encoded when a prompt has no answer yet."""
-        return hashlib.sha1(np.ascontiguousarray(image)).hexdigest()[:16], image
+        return hashlib.sha1(np.ascontiguousarray(image).tobytes()).hexdigest()[:16], image
 
     def masks(
         self, features: tuple[str, Any], size: tuple[int, int], points: Any, box: Any, outside: Any = NO_PIXELS
@@ -94,9 +94,11 @@ class Capture:
 
 @cache
 def capture_of(number: int) -> Capture:
-    """A capture with every so manyth of its photos, those with clicks among them."""
+    """A capture with every n-th of its photos, those with clicks among them."""
     row = pd.read_csv(CAPTURES, sep="\t", keep_default_na=False).iloc[number]
     folder, marked = Path(row.folder), read_points(Path(row.prompts))
+    if not isinstance(marked, Clicks):
+        raise StageError(f"{row.prompts} has points in the object's frame, and no clicks in photos")
     whole = read_workspace(folder / "undistorted")
     stems = {Path(photo).stem for photo in marked.photos}
     clicked = [k for k, view in enumerate(whole.views) if Path(view.name).stem in stems]
