@@ -1,7 +1,7 @@
 """Compare: the points of an object and of the scene around it against each other, and what goes and why (F4).
 
-Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see through goes;
-where both sides measured a place, one stays.
+Photos have measured both sides by now (`measure`), and the object has settled (`evidence.settle`). What photos see
+through goes; where both sides measured a place, one stays.
 """
 
 from dataclasses import dataclass

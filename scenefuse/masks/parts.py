@@ -1,4 +1,4 @@
-"""Parts of the object that a photo's mask lacks: of several things that are prompted, a network takes the clearest."""
+"""Add the object's parts that a photo's mask lacks: prompted on several things, SAM 2 returns only the clearest."""
 
 from collections.abc import Iterator
 
