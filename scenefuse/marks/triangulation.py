@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pycolmap
 
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, read_points
 from scenefuse.photos.workspace import ray_through, read_model
+
+if TYPE_CHECKING:
+    import pycolmap
 
 Sizes = Mapping[str, tuple[int, int]]
 
