@@ -9,7 +9,7 @@ demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
 	@cat results/summary/summary.txt
 
-# Unit tests that start no process, in three minutes; those of one package and what imports it: make check PART=masks.
+# Unit tests that start no process; those of one package and what imports it: make check PART=masks.
 check: .venv/tests
 	pytest -n $(CORES) --dist loadfile -m "not process" $(if $(PART),--part $(PART)) tests/unit
 
