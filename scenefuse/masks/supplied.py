@@ -7,7 +7,7 @@ import pycolmap
 
 from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import Mask
-from scenefuse.photos.photo_files import mask_files
+from scenefuse.photos.photo_files import masks_by_name, pictures_below
 from scenefuse.photos.pictures import matte_of, read_raw
 from scenefuse.photos.workspace import View, read_cameras
 from scenefuse.sfm.undistort import undistort_picture
@@ -32,11 +32,11 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
         raise StageError(
             f"the folder of masks {folder} does not exist; set its path in config/objects.tsv, or in object.masks.keep"
         )
-    files, originals = mask_files(folder), read_cameras(sparse)
+    files, originals = masks_by_name([view.name for view in views], folder), read_cameras(sparse)
     masks: dict[str, Mask] = {}
     unusable: dict[str, str] = {}
     for view in views:
-        file = files.get(Path(view.name).stem)
+        file = files.get(view.name)
         if file is None or view.name not in originals:
             continue
         try:
@@ -47,9 +47,10 @@ def supplied_masks(folder: Path, sparse: Path, views: list[View]) -> tuple[dict[
     if not masks and unusable:
         raise StageError(f"none of {len(unusable)} masks in {folder} can be used; {next(iter(unusable.values()))}")
     if not masks:
-        example = next(iter(files), "none")
+        pictures = pictures_below(folder)
+        example = next(iter(pictures), "none")
         raise StageError(
-            f"masks that match no photo: {len(files)} masks in {folder} (first: {example}), photos are named like "
+            f"masks that match no photo: {len(pictures)} masks in {folder} (first: {example}), photos are named like "
             f"{views[0].name}; name a mask like its photo, with or without _mask"
         )
     print(f"{len(masks)} of {len(views)} photos have a mask in {folder}", flush=True)

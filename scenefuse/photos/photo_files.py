@@ -2,8 +2,10 @@
 workflow lists them often."""
 
 import os
-from collections import Counter
-from functools import cached_property
+import unicodedata
+from collections import Counter, defaultdict
+from collections.abc import Iterable
+from itertools import takewhile
 from pathlib import Path
 
 from scenefuse.core.stage import StageError
@@ -19,12 +21,18 @@ UNREADABLE = frozenset(
 UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
 
 # Where in a folder other programs keep cameras, and under which names.
-CAMERA_PLACES = (".", "sparse", "sparse/0", "opensfm")
-CAMERA_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images", "frames", "rigs") for kind in ("bin", "txt"))
-CAMERA_FILES += ("transforms.json", "transforms_train.json", "reconstruction.json")
+CAMERA_FILES = ["transforms.json", "transforms_train.json", "transforms_test.json"]
+CAMERA_FILES += ["reconstruction.json", "opensfm/reconstruction.json"]
+MODEL_FILES = tuple(f"{name}.{kind}" for name in ("cameras", "images") for kind in ("bin", "txt"))
 BUNDLER = ".out"
 # Where in an OpenDroneMap project its place on the earth is.
 COORDS = "odm_georeferencing/coords.txt"
+# What the name of a mask may have more than its photo's.
+MASK = "_mask"
+# What to do about names that do not tell photos apart.
+RENAME = "give the folder that holds the photos alone, or every photo a name of its own"
+
+_Key = tuple[str, str]
 
 
 def camera_files(given: Path) -> list[Path]:
@@ -32,8 +40,17 @@ def camera_files(given: Path) -> list[Path]:
     if given.is_file():
         listed, coords = bundler_list(given), given.parent.parent / COORDS
         return [given, *([listed] if listed else []), *([coords] if coords.is_file() else [])]
-    places = [given / place / name for place in CAMERA_PLACES for name in CAMERA_FILES]
-    return [file for file in [*places, given / COORDS] if file.is_file()] or [given]
+    models = [model / name for model in colmap_models(given) for name in MODEL_FILES]
+    places = [given / name for name in [*CAMERA_FILES, COORDS]]
+    return [file for file in [*models, *places] if file.is_file()] or [given]
+
+
+def colmap_models(given: Path) -> list[Path]:
+    """The COLMAP models in a folder: itself, sparse/, and the numbered ones in both, which a mapping that fell apart
+    writes."""
+    homes = [home for home in (given / "sparse", given) if home.is_dir()]
+    parts = [part for home in homes for part in sorted(home.iterdir()) if part.name.isdigit()]
+    return [m for m in [*parts, *homes] if any((m / name).is_file() for name in ("images.bin", "images.txt"))]
 
 
 def bundler_list(file: Path) -> Path | None:
@@ -73,50 +90,106 @@ def photo_files(folder: Path) -> list[Path]:
     return sorted(photos, key=lambda file: file.relative_to(folder).as_posix())
 
 
-def mask_files(folder: Path) -> dict[str, Path]:
-    """The pictures of a folder by the stem of the photo they belong to: without the photo's ending and `_mask`.
-
-    Those in folders below it have the folders' names in front, joined by `_`.
-    """
-    files = {}
-    for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff"):
-            stem = "_".join((*path.relative_to(folder).parts[:-1], path.stem))
-            for ending in (".jpg", ".JPG", ".jpeg", ".JPEG", ".png", ".PNG"):
-                stem = stem.removesuffix(ending)
-            files[stem.removesuffix("_mask")] = path
-    return files
+def pictures_below(folder: Path) -> dict[str, Path]:
+    """The pictures below a folder, symlinked folders included, by their paths relative to it."""
+    files = sorted(path for path in _files_below(folder) if path.suffix.lower() in SUFFIXES)
+    return {path.relative_to(folder).as_posix(): path for path in files}
 
 
-class PhotosByName:
-    """Photos by the names that other programs give them.
+def files_by_name(names: Iterable[str], folder: Path, where: str) -> dict[str, Path]:
+    """The photos below a folder by the names that another program gives them; see `photos_by_name`."""
+    root, names = Path(os.path.abspath(folder)), list(names)
+    paths = {name: Path(os.path.normpath(root / name.replace("\\", "/"))) for name in names}
+    found = {name: path for name, path in paths.items() if path.is_relative_to(root) and os.path.isfile(path)}
+    if len(found) < len(paths):
+        files = pictures_below(root)
+        found = {name: files[path] for name, path in photos_by_name(names, files, where).items()}
+    return found
+
+
+def masks_by_name(photos: Iterable[str], folder: Path) -> dict[str, Path]:
+    """The masks below a folder by the names of their photos; those named `_mask` alone where there are any."""
+    files = pictures_below(folder)
+    marked = {name: path for name, path in files.items() if path.stem.endswith(MASK)} or files
+    return {photo: marked[name] for photo, name in photos_by_name(photos, marked, str(folder), MASK).items()}
+
+
+def photos_by_name(wanted: Iterable[str], known: Iterable[str], where: str, mark: str = "") -> dict[str, str]:
+    """Which photo is meant by each name that another program, a list or a person gives; those not there are left out.
+
+    Names are compared from their end, folder by folder, as far as they agree: other machines' paths, and frames with
+    their folders in their name, are found. Kinds of slashes, blanks and byte order marks around a name, and how letters
+    like umlauts are composed, never count; case, and then endings that are missing, doubled or others, count only
+    where they tell photos apart.
 
     Args:
-        folder: of the photos.
-        beside: folder that names may be relative to, which is looked at first.
+        wanted: names as given.
+        known: paths of photos below their folder.
+        where: the file that gives the names, for messages.
+        mark: what names of `known` may have before their ending, as those of masks do.
+
+    Raises:
+        StageError: a name may be of several photos, or a photo of several names.
     """
+    index = defaultdict[_Key, list[str]](list)
+    for name in dict.fromkeys(known):
+        for key in dict.fromkeys(_keys(name, mark)):
+            index[key].append(name)
+    claims: list[tuple[int, str, str]] = []
+    for name in dict.fromkeys(wanted):
+        keys = _keys(name)
+        key = next((key for key in keys if key in index), ("", ""))
+        alike = index.get(key, [])
+        whole = [photo for photo in alike if key in _keys(photo, mark)[:3]]
+        if len(whole) == 1 or len(alike) == 1:
+            claims.append((len(key[1]), name, (whole if len(whole) == 1 else alike)[0]))
+        elif key in keys[:3]:
+            raise StageError(
+                f"{where}: {name} may be any of {len(alike)} photos ({', '.join(alike[:2])}, ...); {RENAME}"
+            )
+    # Of names in one folder all agree with their photos as far up as one does.
+    depths = defaultdict[str, int](int)
+    for _, name, photo in claims:
+        depths[_folder(name)] = max(depths[_folder(name)], _shared_folders(name, photo))
+    found = dict[str, tuple[int, str]]()
+    for length, name, photo in claims:
+        if _shared_folders(name, photo) == depths[_folder(name)]:
+            if photo in found and found[photo][0] == length:
+                raise StageError(f"{where}: {found[photo][1]} and {name} may both be the photo {photo}; {RENAME}")
+            found[photo] = max((length, name), found.get(photo, (0, "")))
+    return {name: photo for photo, (_, name) in found.items()}
 
-    def __init__(self, folder: Path, beside: Path | None = None) -> None:
-        self.folder, self.places = folder, [folder] if beside is None else [beside, folder]
 
-    def at(self, name: str) -> Path | None:
-        """The file of that path, or of a frame's name, with or without its ending; None where there is none."""
-        paths = [place / called for place in self.places for called in (name, frame_name(name))]
-        endings = ("", *SUFFIXES, *map(str.upper, SUFFIXES))
-        named = (Path(os.path.abspath(path.with_name(path.name + ending))) for path in paths for ending in endings)
-        return next((file for file in named if file.is_file()), None)
+def _parts(name: str) -> list[str]:
+    """The folders and the name of a photo, spelled alike whoever wrote them."""
+    plain = unicodedata.normalize("NFC", name.strip("\ufeff\"' \t\r\n")).replace("\\", "/")
+    return [part for part in plain.split("/") if part.strip(". ")]
 
-    def find(self, name: str) -> Path:
-        """The same, or else the photo in the folder that has the name's last part; without any, what it would be."""
-        name = name.replace("\\", "/")
-        found, wanted = self.at(name), Path(name).name
-        alike = [file for file in self._files if file.name == wanted] if found is None else [found]
-        alike = alike or [file for file in self._files if file.stem == wanted]
-        return (alike or [Path(os.path.abspath(self.places[0] / name))])[0]
 
-    @cached_property
-    def _files(self) -> list[Path]:
-        return photo_files(self.folder) if self.folder.is_dir() else []
+def _folder(name: str) -> str:
+    return "/".join(_parts(name)[:-1])
+
+
+def _shared_folders(one: str, other: str) -> int:
+    """How many folders two paths share, from their names upwards."""
+    pairs = zip(_parts(one.casefold())[-2::-1], _parts(other.casefold())[-2::-1])
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+def _keys(name: str, mark: str = "") -> list[_Key]:
+    """What names have in common that may be of one photo: three keys of the whole name, then of less and less of it."""
+    parts = _parts(name)
+    keys: list[_Key] = []
+    for k in range(len(parts)):
+        spelled = "_".join(parts[k:])
+        folded = spelled.casefold()
+        stem, before = folded, ""
+        while stem != before:
+            before = stem
+            ending = next((e for e in (*SUFFIXES, *UNREADABLE) if stem.endswith(e)), "")
+            stem = stem.removesuffix(ending).removesuffix(mark) or stem
+        keys += [("spelled", spelled), ("folded", folded), ("stem", stem)]
+    return keys
 
 
 def in_folders(names: list[str]) -> str:

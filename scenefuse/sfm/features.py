@@ -9,6 +9,8 @@ import numpy as np
 import pycolmap
 
 from scenefuse.core.stage import StageError, atomic_file, setting, threads
+from scenefuse.core.tables import read_lines
+from scenefuse.photos.cameras.colmap import camera_of
 from scenefuse.photos.cameras.posed_photo import at_size
 from scenefuse.photos.photos import Photo, check_unchanged, read_photos
 from scenefuse.sfm.colmap import cancellable
@@ -120,23 +122,14 @@ def read_calibration(path: Path) -> pycolmap.Camera:
     Raises:
         StageError: no camera, more than one, an unknown model, or a wrong number of parameters.
     """
-    try:
-        lines = [line.split() for line in path.read_text().splitlines() if line.strip() and line[0] != "#"]
-    except (OSError, UnicodeDecodeError) as error:
-        raise StageError(f"the calibration {path} cannot be read: {error}") from error
+    lines = [line.split() for _, line in read_lines(path)]
     form = "write one line like '1 OPENCV 4000 3000 fx fy cx cy k1 k2 p1 p2', as in COLMAP's cameras.txt"
     if len(lines) != 1:
         raise StageError(f"the calibration {path} holds {len(lines)} cameras; {form}")
     try:
-        _, model, width, height, *numbers = lines[0]
-        parameters = [float(number) for number in numbers]
-        camera = pycolmap.Camera(model=model, width=int(width), height=int(height), params=parameters)
-    except (ValueError, TypeError, RuntimeError) as error:
-        raise StageError(f"the calibration {path} is no camera of COLMAP ({error}); {form}") from error
-    if not camera.verify_params():
-        wanted = camera.params_info
-        raise StageError(f"the calibration {path} has {len(numbers)} parameters, but {model} has {wanted}; {form}")
-    return camera
+        return camera_of(lines[0])
+    except ValueError as error:
+        raise StageError(f"the calibration {path} is no camera of COLMAP ({error}); {form}") from None
 
 
 def _reader_options(

@@ -1,8 +1,8 @@
 """A sparse model from cameras that another program found: its poses and lenses, and points from the photos' matches."""
 
+import os
 import shutil
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,6 @@ import pycolmap
 from scenefuse.core.stage import StageError, scratch_directory
 from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size, possible_turns
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
-from scenefuse.photos.photo_files import frame_name
 from scenefuse.sfm.colmap import cancellable
 
 # Cameras that fit their photos give each photo so many points at least, in the median.
@@ -26,8 +25,8 @@ def triangulated(
     work: Path,
     options: pycolmap.IncrementalPipelineOptions,
 ) -> tuple[pycolmap.Reconstruction, list[str]]:
-    """The model of given cameras: poses and lenses as they are, points from the photos' own matches; and what was
-    decided about photos that EXIF rotates, a sentence each.
+    """The model of given cameras: poses and lenses as they are, points from the photos' own matches; and notes, on
+    cameras without a photo and photos that EXIF rotates for instance.
 
     Args:
         cameras: a COLMAP model, nerfstudio's transforms.json, or OpenSfM's reconstruction.json, or a folder with one;
@@ -42,14 +41,12 @@ def triangulated(
         StageError: what the readers say; cameras of no photo, or of other shape than their photos; photos that share a
             camera in the database but not here; cameras that do not fit the photos.
     """
-    given, _ = read_posed_photos(cameras, folder)
+    given, _, notes = read_posed_photos(cameras, folder)
     with pycolmap.Database.open(database) as opened:
         own = {camera.camera_id: (camera.width, camera.height) for camera in opened.read_all_cameras()}
         sizes = {image.name: own[image.camera_id] for image in opened.read_all_images()}
-    posed = _by_name(given, sizes, cameras)
-    if not posed:
-        some = ", ".join(sorted(photo.file.name for photo in given)[:3])
-        raise StageError(f"{cameras} holds cameras of none of the photos in {folder}; it names {some}, ...")
+    paths = {photo.file.relative_to(os.path.abspath(folder)).as_posix(): photo for photo in given}
+    posed = {name: photo for name, photo in paths.items() if name in sizes}
     ways = possible_turns(posed, orientations, sizes)
     models = [_model(way, cameras, folder, database, work, options) for way in ways]
     met = [model.num_points3D() for model in models]
@@ -61,13 +58,14 @@ def triangulated(
             f"{cameras}: its cameras do not fit the photos: half of them see fewer than {MIN_POINTS} points where their"
             " matches meet; give cameras of these photos, as large as they were computed for or scaled down alike"
         )
-    notes = [f"the cameras of {turned} photos were turned, as EXIF rotates these photos"] if turned else []
     if len(ways) > 1:
-        notes = [
+        notes.append(
             f"EXIF rotates photos, and {cameras.name} does not say whether its cameras are for them as they are stored:"
             f" they are taken as {('upright', 'stored')[best]}, whose matches meet in {met[best]} points, and not as"
             f" {('stored', 'upright')[best]}, with {met[1 - best]}"
-        ]
+        )
+    elif turned:
+        notes.append(f"the cameras of {turned} photos were turned, as EXIF rotates these photos")
     return found, notes
 
 
@@ -106,32 +104,6 @@ def _model(
                 model.register_frame(frame.frame_id)
         (scratch / "points").mkdir()
         return cancellable(pycolmap.triangulate_points, model, calibrated, folder, scratch / "points", options=options)
-
-
-def _by_name(given: list[PosedPhoto], names: Iterable[str], cameras: Path) -> dict[str, PosedPhoto]:
-    """The cameras of photos (paths below their folder): by the whole path, or by the file's name where camera and photo
-    are the only ones that are called so.
-
-    Raises:
-        StageError: several cameras may be a photo's.
-    """
-    whole, alike = {photo.name: photo for photo in given}, dict[str, list[PosedPhoto]]()
-    for photo in given:
-        alike.setdefault(photo.file.name, []).append(photo)
-    found = dict[str, PosedPhoto]()
-    names = list(names)
-    called = Counter(Path(name).name for name in names)
-    for name in names:
-        end = Path(name).name
-        same = [whole[frame_name(name)]] if frame_name(name) in whole else alike.get(end, [])
-        if len(same) > 1 or (same and called[end] > 1 and frame_name(name) not in whole):
-            raise StageError(
-                f"{cameras}: {max(len(same), called[end])} photos are called {end}, and it does not say which of them"
-                " its camera is of; give every photo a name of its own"
-            )
-        if same:
-            found[name] = same[0]
-    return found
 
 
 def _check_same(first: PosedPhoto, photo: PosedPhoto, cameras: Path) -> None:

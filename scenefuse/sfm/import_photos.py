@@ -1,6 +1,8 @@
 """Posed photos of any format as the workspace and the masks that the training stages read."""
 
+import os
 import shutil
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.cameras.transforms import PERSPECTIVE
-from scenefuse.photos.photo_files import SUFFIXES, mask_files, stored_size
+from scenefuse.photos.photo_files import frame_name, masks_by_name, pictures_below, stored_size
 from scenefuse.photos.photos import SHAPE_TOLERANCE
 from scenefuse.photos.pictures import matte_of, write_picture
 from scenefuse.photos.workspace import View, write_model
@@ -47,7 +49,7 @@ def import_photos(
 
     Args:
         data: folder or file with the cameras; see `read_posed_photos`.
-        images: folder of the photos; None for images/ beside the cameras, or where a JSON says.
+        images: folder of the photos; None as for `read_posed_photos`.
         masks: folder of masks named like the photos; None to look elsewhere.
         workspace: output, with images/, sparse/ (PINHOLE, no points), and held_out.txt where the data say which photos
             are held out.
@@ -60,8 +62,9 @@ def import_photos(
     """
     if masks is not None and not masks.is_dir():
         raise StageError(f"--masks {masks} is no folder; give the folder of the masks")
-    photos, kind = _photos_with_cameras(data, images)
-    files = {} if masks is None else mask_files(masks)
+    photos, kind, notes = read_posed_photos(data, images)
+    photos = _named(photos, Path(os.path.abspath(images or (data if data.is_dir() else data.parent) / "images")))
+    files = {} if masks is None else masks_by_name([photo.name for photo in photos], masks)
     exact = masks is None and not any(photo.mask for photo in photos)
     lenses = _lenses(photos, settings)
     kept: list[View] = []
@@ -70,13 +73,13 @@ def import_photos(
         (output / "images").mkdir()
         (output / "sparse").mkdir()
         for photo, lens in zip(photos, lenses):
-            mask = photo.mask if masks is None else files.get(Path(photo.name).stem)
+            mask = photo.mask if masks is None else files.get(photo.name)
             view = _write_photo(photo, lens, mask, exact, output / "images", folder)
             if view is not None:
                 kept.append(view)
                 held_out += [view.name] if photo.held_out else []
         if not kept:
-            raise StageError(_no_masks(data, photos, masks, files))
+            raise StageError(_no_masks(data, photos, masks))
         write_model(output / "sparse", kept)
         if held_out:
             (output / "held_out.txt").write_text("".join(f"{name}\n" for name in held_out))
@@ -86,30 +89,24 @@ def import_photos(
         "masks_from": quantity(source, ""),
         "masks_exact": quantity(exact, ""),
         "held_out_by_the_data": quantity(held_out, ""),
+        "notes": quantity(notes, ""),
     }
+    for note in notes:
+        print(f"note: {note}", flush=True)
     write_json(report, origin | _described(photos, lenses, kept))
     print(f"{len(kept)} of {len(photos)} photos ({kind}) have a mask, masks from {source}", flush=True)
 
 
-def _photos_with_cameras(data: Path, images: Path | None) -> tuple[list[PosedPhoto], str]:
-    """The photos, which are all there and called differently, and the name of the program."""
-    photos, kind = read_posed_photos(data, images or (data if data.is_dir() else data.parent) / "images")
-    if not photos:
-        raise StageError(f"{data} holds no photo with a camera; reconstruct the photos first")
-    missing = [photo.file for photo in photos if not photo.file.is_file()]
-    if missing:
-        raise StageError(
-            f"{len(missing)} of {len(photos)} photos of {data} are missing, {missing[0]} for one; give their folder"
-            " with --images"
-        )
-    # Metashape names photos without their ending.
-    whole = {photo.name: Path(photo.name).suffix.lower() in SUFFIXES for photo in photos}
-    photos = [p if whole[p.name] else replace(p, name=p.name + p.file.suffix) for p in photos]
-    stems = [Path(photo.name).stem for photo in photos]
-    twice = next((stem for stem in stems if stems.count(stem) > 1), None)
+def _named(photos: list[PosedPhoto], folder: Path) -> list[PosedPhoto]:
+    """The photos by the names that they get: their paths below the folder, or below what holds them all, in one."""
+    inside = all(photo.file.is_relative_to(folder) for photo in photos)
+    root = folder if inside else os.path.commonpath([photo.file.parent for photo in photos])
+    named = [replace(photo, name=frame_name(photo.file.relative_to(root).as_posix())) for photo in photos]
+    stems = Counter(Path(photo.name).stem for photo in named)
+    twice = next((stem for stem, count in stems.items() if count > 1), None)
     if twice is not None:
-        raise StageError(f"two photos of {data} are both called {twice}; rename one")
-    return photos, kind
+        raise StageError(f"two photos in {root} are both called {twice}; rename one")
+    return named
 
 
 def _write_photo(
@@ -159,10 +156,11 @@ def _described(photos: list[PosedPhoto], lenses: list[Lens], kept: list[View]) -
     }
 
 
-def _no_masks(data: Path, photos: list[PosedPhoto], masks: Path | None, files: dict[str, Path]) -> str:
+def _no_masks(data: Path, photos: list[PosedPhoto], masks: Path | None) -> str:
     """Why no photo has a mask, and what to do."""
     if masks is not None:
-        example = next(iter(files.values())).name if files else "none"
+        files = pictures_below(masks)
+        example = next(iter(files), "none")
         return (
             f"masks that match no photo: {len(files)} masks in {masks} (first: {example}), photos are named like "
             f"{photos[0].name}; name a mask like its photo, with or without _mask"

@@ -25,7 +25,7 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.segmentation import MaskSettings, score_masks
 from scenefuse.masks.supplied import supplied_masks
 from scenefuse.photos.frames import original_sizes
-from scenefuse.photos.photo_files import mask_files
+from scenefuse.photos.photo_files import masks_by_name
 from scenefuse.photos.pictures import read_mask
 from scenefuse.photos.workspace import Workspace, read_workspace
 
@@ -134,7 +134,7 @@ def _read(folder: Path, truth: Path, wrong: tuple[str, ...]) -> Object:
         np.array(value(read_json(folder / "undistorted.json"), "up_in_camera_frame")),
         original_sizes(read_json(folder / "photos.json")),
         {name: mask for name, mask in true.items() if name not in wrong},
-        mask_files(truth),
+        masks_by_name(true, truth),
     )
 
 
@@ -156,7 +156,7 @@ def _trial(
 ) -> dict[str, Any]:
     """Masks from one choice of clicks, and how like the true ones they are."""
     rng = np.random.default_rng([trial, *name.encode()])
-    true = read_mask(thing.files[Path(name).stem])
+    true = read_mask(thing.files[name])
     labels, pixels = clicks_on(true, how, rng)
     middle = _smaller_part(true) if part else None
     if middle is not None:

@@ -282,9 +282,8 @@ def shrink(file, size):
     ("damage", "words"),
     [
         (lambda root: (root / "transforms.json").unlink(), "no cameras in a known format"),
-        (lambda root: (root / "transforms.json").write_text("{"), "no readable JSON"),
+        (lambda root: (root / "transforms.json").write_text("{"), "holds no cameras of nerfstudio that can be read"),
         (lambda root: (root / "transforms.json").write_text("[]"), "no list of frames"),
-        (lambda root: (root / "images/02.png").unlink(), "1 of 5 photos .*images/02.png for one"),
         (lambda root: (root / "images/02.png").write_text("no picture"), "02.png is not a readable picture"),
         (lambda root: (root / "masks/02.png").unlink(), r"frame 2 .*its mask masks/02.png does not exist"),
         (lambda root: (root / "masks/02.png").write_text("no picture"), "the mask .*02.png is not a readable picture"),
@@ -320,15 +319,30 @@ def test_no_masks_says_what_to_give(tmp_path):
         imported(data, tmp_path, masks=data / "masks")
 
 
+def test_of_cameras_without_their_photo_the_others_are_used_and_these_named(tmp_path):
+    data = nerfstudio(tmp_path / "in")
+    (data / "images/02.png").unlink()
+    views, report = imported(data, tmp_path)
+    assert len(views.names) == 4 and np.max([*misses(views)]) < 0.15
+    assert value(report, "notes")[0].startswith("1 of 5 cameras are of photos that are not in")
+    for path in (data / "images").iterdir():
+        path.unlink()
+    with pytest.raises(StageError, match="holds cameras of none of the photos in .*; it names images/00.png"):
+        imported(data, tmp_path)
+
+
 def test_a_colmap_model_without_its_photos_asks_for_them(tmp_path):
     data = colmap(tmp_path / "in")
     (data / "images").rename(data / "elsewhere")
-    with pytest.raises(StageError, match="5 of 5 photos .* give their folder with --images"):
+    with pytest.raises(
+        StageError,
+        match="may be any of 2 photos .elsewhere/walk/00.png, .* give the folder that holds the photos alone",
+    ):
         imported(data, tmp_path, masks=data / "masks")
     views, _ = imported(data, tmp_path, images=data / "elsewhere", masks=data / "masks")
     assert len(views.names) == 5
     (data / "sparse/0/cameras.txt").write_text("1 PINHOLE")
-    with pytest.raises(StageError, match="not a readable COLMAP model"):
+    with pytest.raises(StageError, match="holds no cameras of COLMAP that can be read"):
         imported(data, tmp_path, images=data / "elsewhere", masks=data / "masks")
 
 

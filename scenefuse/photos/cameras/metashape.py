@@ -10,10 +10,10 @@ from scipy.optimize import least_squares
 
 from scenefuse.cloud.crs import usable
 from scenefuse.core.stage import StageError
+from scenefuse.core.tables import read_text
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.cameras.posed_photo import PosedPhoto
-from scenefuse.photos.photo_files import PhotosByName
+from scenefuse.photos.cameras.posed_photo import GivenCamera, colmap_camera
 
 # Parameters of its lens; those that are zero are left out of the file.
 PARAMETERS = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
@@ -25,35 +25,29 @@ LOCAL = "LOCAL_CS"
 MAX_ALTITUDE_M = 40e3
 
 
-def read_metashape(file: Path, folder: Path) -> list[PosedPhoto]:
+def read_metashape(file: Path) -> list[GivenCamera]:
     """The photos that were aligned, in the active component, and are not disabled; lenses of the kind frame.
 
     Args:
-        file: the XML.
-        folder: of the photos; the XML names them without their ending.
+        file: the XML; it names photos by their labels, mostly without their ending.
 
     Raises:
-        StageError: the file is no such XML, has a lens of another kind, or lies on the earth without a CRS.
+        StageError: a lens of another kind, or a chunk that lies on the earth without a CRS.
+        ValueError, KeyError, ET.ParseError: the file is no such XML.
     """
-    try:
-        chunk = ET.parse(file).getroot().find(".//chunk")
-        if chunk is None:
-            raise ValueError("it has no chunk")
-        sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
-        by_name, lenses, found, moved = PhotosByName(folder), {}, [], _local_from_chunk(chunk, str(file))
-        for camera in _cameras_of(chunk):
-            placed, number = camera.find("transform"), camera.attrib["sensor_id"]
-            if placed is None or not placed.text:
-                continue
-            if number not in lenses:
-                lenses[number] = _camera(sensors[number], f"{file}, sensor {number}")
-            label = camera.attrib["label"]
-            pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
-            if moved is not None:
-                pose[:3, :3], pose[:3, 3] = moved.rotation @ pose[:3, :3], moved.apply(pose[:3, 3])
-            found.append(PosedPhoto(label, by_name.find(label), lenses[number], pose, None, False))
-    except (OSError, ET.ParseError, KeyError, ValueError) as error:
-        raise StageError(f"{file} holds no cameras of Metashape ({error!r}); export them as Agisoft XML") from None
+    chunk = _chunk(file)
+    sensors = {sensor.attrib["id"]: sensor for sensor in chunk.iterfind("sensors/sensor")}
+    lenses, found, moved = {}, [], _local_from_chunk(chunk, str(file))
+    for camera in _cameras_of(chunk):
+        placed, number = camera.find("transform"), camera.attrib["sensor_id"]
+        if placed is None or not placed.text:
+            continue
+        if number not in lenses:
+            lenses[number] = _camera(sensors[number], f"{file}, sensor {number}")
+        pose = np.array(placed.text.split(), dtype=float).reshape(4, 4)
+        if moved is not None:
+            pose[:3, :3], pose[:3, 3] = moved.rotation @ pose[:3, :3], moved.apply(pose[:3, 3])
+        found.append(GivenCamera(camera.attrib["label"], lenses[number], pose))
     return found
 
 
@@ -63,9 +57,8 @@ def metashape_place(file: Path) -> Place | None:
     Raises:
         StageError: its CRS is none that is known, or one in which no cloud can lie.
     """
-    chunk = ET.parse(file).getroot().find(".//chunk")
-    reference = "" if chunk is None else (chunk.findtext("reference") or "").strip()
-    earth_from_chunk = None if chunk is None else _outside_from_chunk(chunk)
+    chunk = _chunk(file)
+    reference, earth_from_chunk = (chunk.findtext("reference") or "").strip(), _outside_from_chunk(chunk)
     if earth_from_chunk is None or not reference or reference.startswith(LOCAL) or not _on_earth(earth_from_chunk):
         return None
     try:
@@ -78,6 +71,17 @@ def metashape_place(file: Path) -> Place | None:
     crs = usable(crs, str(file))
     check_crs(crs, str(file))
     return Place(earth_from_chunk, True, crs)
+
+
+def _chunk(file: Path) -> ET.Element:
+    """The project's part of its XML; one with a document type is not parsed, for its entities may grow without end."""
+    text = read_text(file)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("it has a document type, which Metashape's files have not")
+    chunk = ET.fromstring(text).find(".//chunk")
+    if chunk is None:
+        raise ValueError("it has no chunk")
+    return chunk
 
 
 def _cameras_of(chunk: ET.Element) -> list[ET.Element]:
@@ -144,12 +148,12 @@ def _camera(sensor: ET.Element, where: str) -> pycolmap.Camera:
     size = sensor.find("resolution") if size is None else size
     if size is None:
         raise StageError(f"{where} has no resolution; export the cameras again")
-    width, height = int(size.attrib["width"]), int(size.attrib["height"])
+    width, height = float(size.attrib["width"]), float(size.attrib["height"])
     lens = {name: float(calibration.findtext(name, "0")) for name in PARAMETERS}
     focal, middle = [lens["f"] + lens["b1"], lens["f"]], [width / 2 + lens["cx"], height / 2 + lens["cy"]]
     # What Metashape calls P1 is P2 to OpenCV.
     params = [*focal, *middle, lens["k1"], lens["k2"], lens["p2"], lens["p1"], lens["k3"], 0.0, 0.0, 0.0]
-    camera = pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+    camera = colmap_camera("FULL_OPENCV", width, height, params)
     if any(lens[name] for name in ("b2", "k4", "p3", "p4")):
         _fit(camera, lens, where)
     return camera

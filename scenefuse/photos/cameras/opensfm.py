@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 
 from scenefuse.cloud.crs import plane, read_crs
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import read_lines
+from scenefuse.core.tables import read_lines, read_text
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.cameras.place import Place, check_crs
-from scenefuse.photos.cameras.posed_photo import PosedPhoto
-from scenefuse.photos.photo_files import COORDS, PhotosByName
+from scenefuse.photos.cameras.posed_photo import GivenCamera, colmap_camera
+from scenefuse.photos.photo_files import COORDS
 
 FILE = "reconstruction.json"
 # Where an OpenDroneMap project has it.
@@ -24,36 +24,23 @@ TOPOCENTRIC = "reconstruction.topocentric.json"
 
 
 def find_opensfm(data: Path) -> Path | None:
-    """The reconstruction.json of a folder, or the file itself; None where there is none."""
-    if data.is_file():
-        return data if data.name == FILE else None
+    """The reconstruction.json of a folder; None where there is none."""
     return next((data / place for place in PLACES if (data / place).is_file()), None)
 
 
-def read_opensfm(file: Path, folder: Path) -> list[PosedPhoto]:
+def read_opensfm(file: Path) -> list[GivenCamera]:
     """The posed photos of the reconstruction with most of them; lenses perspective and brown.
 
     OpenSfM counts pixels from the middle of the photo, in units of its longer side; a pose is an angle-axis rotation
     and a translation into the camera, whose axes are OpenCV's.
 
-    Args:
-        file: reconstruction.json.
-        folder: of the photos.
-
     Raises:
-        StageError: the file is no such JSON, or has a lens of another kind.
+        StageError: a lens is of another kind.
+        ValueError, KeyError, TypeError: the file is no such JSON.
     """
-    try:
-        parts = json.loads(file.read_text())
-        largest = max(parts, key=lambda part: len(part["shots"]))
-        by_name = PhotosByName(folder)
-        cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in largest["cameras"].items()}
-        return [
-            PosedPhoto(name, by_name.find(name), cameras[shot["camera"]], _pose(shot), None, False)
-            for name, shot in sorted(largest["shots"].items())
-        ]
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise StageError(f"{file} is no reconstruction of OpenSfM ({error!r}); export it again") from None
+    largest = max(json.loads(read_text(file)), key=lambda part: len(part["shots"]))
+    cameras = {name: _camera(entry, f"{file}, camera {name}") for name, entry in largest["cameras"].items()}
+    return [GivenCamera(name, cameras[shot["camera"]], _pose(shot)) for name, shot in sorted(largest["shots"].items())]
 
 
 def opensfm_place(file: Path) -> Place | None:
@@ -85,17 +72,17 @@ def opensfm_place(file: Path) -> Place | None:
 
 
 def _camera(entry: dict[str, Any], where: str) -> pycolmap.Camera:
-    width, height, kind = int(entry["width"]), int(entry["height"]), entry["projection_type"]
+    width, height, kind = float(entry["width"]), float(entry["height"]), entry["projection_type"]
     size = max(width, height)
     if kind == "perspective":
-        params = [entry["focal"] * size, width / 2, height / 2, entry["k1"], entry["k2"]]
-        return pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
+        return colmap_camera(
+            "RADIAL", width, height, [entry["focal"] * size, width / 2, height / 2, entry["k1"], entry["k2"]]
+        )
     if kind == "brown":
-        focal = [entry["focal_x"] * size, entry["focal_y"] * size]
-        middle = [width / 2 + entry["c_x"] * size, height / 2 + entry["c_y"] * size]
-        bent = [entry[key] for key in ("k1", "k2", "p1", "p2", "k3")]
-        params = [*focal, *middle, *bent, 0.0, 0.0, 0.0]
-        return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+        focal_x, focal_y = entry["focal_x"] * size, entry["focal_y"] * size
+        middle = width / 2 + entry["c_x"] * size, height / 2 + entry["c_y"] * size
+        bent_by = [entry[key] for key in ("k1", "k2", "p1", "p2", "k3")]
+        return colmap_camera("FULL_OPENCV", width, height, [focal_x, focal_y, *middle, *bent_by, 0.0, 0.0, 0.0])
     raise StageError(f"{where} is of the kind {kind}; perspective and brown are read")
 
 

@@ -1,7 +1,7 @@
 """A photo with the camera that another program found for it: at the photo's own size, and turned along with a photo
 that EXIF says is rotated, which stands upright here."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,7 +21,29 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 # Parameters of a lens that a turn leaves as they are.
 EVEN = ("f", "k", "k1", "k2", "k3", "k4", "k5", "k6")
 
+# Largest side of a photo, in pixels, of which a camera is believed.
+MAX_SIDE_PX = 100_000
+
 Size = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class GivenCamera:
+    """A camera as another program's file gives it.
+
+    Attributes:
+        name: of its photo.
+        camera: COLMAP's model of its lens, or what gives it for the file of the photo, where its size counts.
+        object_from_cam: (4, 4) float64 rigid pose, OpenCV axes.
+        mask: file of the photo's mask where the format names one.
+        held_out: the format keeps the photo for measuring.
+    """
+
+    name: str
+    camera: pycolmap.Camera | Callable[[Path], pycolmap.Camera]
+    object_from_cam: NDArray[np.float64]
+    mask: Path | None = None
+    held_out: bool = False
 
 
 @dataclass(frozen=True)
@@ -29,7 +51,7 @@ class PosedPhoto:
     """One photo on disk and its camera.
 
     Attributes:
-        name: what to call it, without folders; unique up to the ending.
+        name: as the program gives it.
         file: the photo.
         camera: COLMAP's model of its lens, for the photo's size or that of a larger or smaller original.
         object_from_cam: (4, 4) float64 rigid pose, OpenCV axes.
@@ -43,6 +65,24 @@ class PosedPhoto:
     object_from_cam: NDArray[np.float64]
     mask: Path | None
     held_out: bool
+
+
+def colmap_camera(model: str, width: float, height: float, params: Sequence[float]) -> pycolmap.Camera:
+    """A camera of COLMAP.
+
+    Raises:
+        ValueError: no such model of a perspective or fisheye lens, or numbers that no camera has.
+    """
+    if model not in pycolmap.CameraModelId.__members__ or model in ("INVALID", "EQUIRECTANGULAR"):
+        raise ValueError(f"the camera model {model} is not read; undistort the photos to PINHOLE first")
+    if not (1 <= width <= MAX_SIDE_PX and 1 <= height <= MAX_SIDE_PX and np.isfinite(params).all()):
+        raise ValueError(f"a camera's size is {width:g} x {height:g} pixels, and its parameters are {list(params)}")
+    camera = pycolmap.Camera(model=model, width=round(width), height=round(height), params=list(map(float, params)))
+    if not camera.verify_params():
+        raise ValueError(f"a camera has {len(params)} parameters, but {model} has {camera.params_info}")
+    if min(camera.params[k] for k in camera.focal_length_idxs()) <= 0:
+        raise ValueError("a focal length has to be positive")
+    return camera
 
 
 def at_size(camera: pycolmap.Camera, size: Size, where: str) -> pycolmap.Camera:

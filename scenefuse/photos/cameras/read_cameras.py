@@ -2,7 +2,13 @@
 bundle.out with list.txt, which RealityCapture and Metashape export too."""
 
 import re
+import struct
+import xml.etree.ElementTree as ET
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import pycolmap
@@ -10,14 +16,15 @@ import pycolmap
 from scenefuse.core.stage import StageError
 from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
+from scenefuse.photos.cameras.colmap import read_colmap
 from scenefuse.photos.cameras.metashape import metashape_place, read_metashape
 from scenefuse.photos.cameras.opensfm import find_opensfm, opensfm_place, read_opensfm
 from scenefuse.photos.cameras.place import Place
-from scenefuse.photos.cameras.posed_photo import FLIP, PosedPhoto
+from scenefuse.photos.cameras.posed_photo import FLIP, GivenCamera, PosedPhoto, colmap_camera
 from scenefuse.photos.cameras.transforms import TRANSFORMS, read_transforms
-from scenefuse.photos.photo_files import BUNDLER, PhotosByName, bundler_list, frame_name, stored_size
-from scenefuse.photos.workspace import posed_images, read_model
+from scenefuse.photos.photo_files import BUNDLER, bundler_list, colmap_models, files_by_name, stored_size
 
+Found = TypeVar("Found")
 LAYOUTS = (
     "sparse/ or sparse/0 (COLMAP), transforms.json (nerfstudio), transforms_train.json (Blender) or"
     " reconstruction.json (OpenSfM); or Metashape's XML or Bundler's .out"
@@ -28,98 +35,145 @@ REALITY = "in RealityCapture, export the registration as Bundler v0.3 (.out) wit
 EXPORTS = {".psx": METASHAPE, ".psz": METASHAPE, ".csv": REALITY, ".rcproj": REALITY}
 # What may follow a photo's name in the list: a zero, and its focal length by EXIF.
 FOCAL = re.compile(r"\s+0\s+[-+.\deE]+$")
+# What reading a damaged file ends with.
+DAMAGED = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError, MemoryError),
+    *(ET.ParseError, struct.error),
+)
+# How far the axes of a pose, as programs write it in a few digits, may be from a rotation's.
+MAX_SKEW = 1e-3
 
 
-def read_posed_photos(cameras: Path, folder: Path) -> tuple[list[PosedPhoto], str]:
-    """Photos and cameras of a file, or of a folder that holds one, and the program's name.
+def read_posed_photos(cameras: Path, folder: Path | None) -> tuple[list[PosedPhoto], str, list[str]]:
+    """Photos with their cameras, of a file or of a folder that holds one; the program's name; and notes, of photos that
+    are not there for instance.
 
     Args:
         cameras: of any program; of a COLMAP model and JSON in one folder the JSON is read.
-        folder: of the photos. A photo that is not there has the path that it would have.
+        folder: of the photos; None for images/ beside the cameras, or, without it and for JSON, for their own folder.
 
     Raises:
-        StageError: no known format, or cameras that cannot be read.
+        StageError: no known format, cameras that cannot be read, none of whose photos is there, or two of one photo.
     """
+    file, program = _format_of(cameras)
+    given, notes = _read(file, program)
+    if not given:
+        raise StageError(f"{cameras} holds no photo with a camera; reconstruct the photos first")
+    if folder is None:
+        beside = cameras if cameras.is_dir() else cameras.parent
+        images = beside / "images"
+        folder = images if images.is_dir() and program not in TRANSFORMS.values() else beside
+    masks = {one.mask for one in given}
+    files = files_by_name([one.name for one in given], folder, str(cameras))
+    files = {name: file for name, file in files.items() if file not in masks}
+    photos = [_posed(one, files[one.name]) for one in given if one.name in files]
+    missing = [one.name for one in given if one.name not in files]
+    if not photos:
+        raise StageError(
+            f"{cameras} holds cameras of none of the photos in {folder}; it names {', '.join(missing[:3])}, ..."
+        )
+    if missing:
+        notes.append(
+            f"{len(missing)} of {len(given)} cameras are of photos that are not in {folder} ({missing[0]}, ...)"
+        )
+    twice = next((file for file, count in Counter(photo.file for photo in photos).items() if count > 1), None)
+    if twice is not None:
+        raise StageError(f"two photos of {cameras} are both called {twice.name}; rename one")
+    return photos, program, notes
+
+
+def place_of(cameras: Path) -> Place | None:
+    """Where the cameras that `read_posed_photos` gives lie on the earth; None where their project does not say."""
+    file, program = _format_of(cameras)
+    places = {"Metashape": metashape_place, "OpenSfM": opensfm_place}
+    return _tried(places[program], file, program) if program in places else None
+
+
+def _format_of(cameras: Path) -> tuple[Path, str]:
+    """The file, or folder of a COLMAP model, that holds cameras, and the program whose format it has."""
     if not cameras.exists():
         raise StageError(f"the cameras {cameras} do not exist; correct the path")
     ending = cameras.suffix.lower()
     if ending in EXPORTS:
         raise StageError(f"{cameras} is not read; {EXPORTS[ending]}")
-    if ending == ".xml":
-        return read_metashape(cameras, folder), "Metashape"
-    if cameras.suffix == BUNDLER:
-        return _read_bundler(cameras, folder), "Bundler"
+    if cameras.is_file():
+        of_ending = {".xml": "Metashape", BUNDLER: "Bundler"}
+        program = "OpenSfM" if cameras.name.startswith("reconstruction") else TRANSFORMS.get(cameras.name, "nerfstudio")
+        return cameras, of_ending.get(ending, program)
     if (file := find_opensfm(cameras)) is not None:
-        return read_opensfm(file, folder), "OpenSfM"
-    jsons = [cameras] if cameras.is_file() else [cameras / name for name in TRANSFORMS if (cameras / name).is_file()]
-    if jsons:
-        return read_transforms(jsons[0], folder), TRANSFORMS.get(jsons[0].name, "nerfstudio")
-    for model in (cameras / "sparse/0", cameras / "sparse", cameras):
-        if (model / "images.bin").is_file() or (model / "images.txt").is_file():
-            return _read_colmap(model, folder), "COLMAP"
+        return file, "OpenSfM"
+    for name, program in TRANSFORMS.items():
+        if (cameras / name).is_file():
+            return cameras / name, program
+    if colmap_models(cameras):
+        return cameras, "COLMAP"
     raise StageError(f"{cameras} holds no cameras in a known format; give a folder with {LAYOUTS}")
 
 
-def place_of(cameras: Path) -> Place | None:
-    """Where the cameras that `read_posed_photos` gives lie on the earth; None where their project does not say."""
-    if cameras.suffix.lower() == ".xml":
-        return metashape_place(cameras)
-    file = find_opensfm(cameras)
-    return None if file is None else opensfm_place(file)
+def _read(file: Path, program: str) -> tuple[list[GivenCamera], list[str]]:
+    """The cameras of a file, or those of a folder's COLMAP model with most of them; and a note on the other models."""
+    if program != "COLMAP":
+        readers = {"Metashape": read_metashape, "Bundler": _read_bundler, "OpenSfM": read_opensfm}
+        return _tried(readers.get(program, read_transforms), file, program), []
+    found = [(_tried(read_colmap, model, program), model.relative_to(file)) for model in colmap_models(file)]
+    (largest, model), *others = sorted(found, key=lambda one: -len(one[0]))
+    counts = ", ".join(f"{other} with {len(given)}" for given, other in others)
+    notes = [f"the model {model} is taken, with {len(largest)} photos, and not {counts}"] if others else []
+    return largest, notes
 
 
-def _read_colmap(model: Path, folder: Path) -> list[PosedPhoto]:
-    reconstruction, photos, by_name = read_model(model), [], PhotosByName(folder)
-    for image in posed_images(reconstruction):
-        pose = np.eye(4)
-        pose[:3] = image.cam_from_world().inverse().matrix()
-        camera = reconstruction.cameras[image.camera_id]
-        photos.append(PosedPhoto(frame_name(image.name), by_name.find(image.name), camera, pose, None, False))
-    return photos
+def _tried(reader: Callable[[Path], Found], file: Path, program: str) -> Found:
+    """What a reader gives; StageError where the file is damaged."""
+    try:
+        return reader(file)
+    except StageError:
+        raise
+    except DAMAGED as error:
+        why = " ".join(str(error).split())[:200] or type(error).__name__
+        why = f"{why} is missing" if isinstance(error, KeyError) else why
+        raise StageError(f"{file} holds no cameras of {program} that can be read ({why}); export them again") from None
 
 
-def _read_bundler(file: Path, folder: Path) -> list[PosedPhoto]:
+def _posed(one: GivenCamera, file: Path) -> PosedPhoto:
+    """A given camera with the file of its photo; StageError where its pose is none."""
+    turn = one.object_from_cam[:3, :3]
+    if not np.isfinite(one.object_from_cam).all() or np.abs(turn.T @ turn - np.eye(3)).max() > MAX_SKEW:
+        raise StageError(f"the camera of {one.name} has no pose of a rotation and a position; export the cameras again")
+    camera = one.camera if isinstance(one.camera, pycolmap.Camera) else one.camera(file)
+    return PosedPhoto(one.name, file, camera, one.object_from_cam, one.mask, one.held_out)
+
+
+def _read_bundler(file: Path) -> list[GivenCamera]:
     """The photos that have a camera (v0.3 of the format: a focal length of 0 is none).
 
     The principal point is the photo's middle; k1 and k2 are radial, over undistorted coordinates, as COLMAP's.
-
-    Args:
-        file: bundle.out.
-        folder: of the photos; list.txt beside the file names them, in its order.
-
-    Raises:
-        StageError: there is no list, it is shorter than the cameras, or one of the files is not well formed.
+    list.txt beside the file names the photos, in its order.
     """
-    names = [FOCAL.sub("", line.strip()) for _, line in read_lines(_bundler_photos(file))]
-    by_name, found, cameras = PhotosByName(folder), [], _bundler_cameras(file)
-    if len(names) < len(cameras):
-        raise StageError(f"{file} has {len(cameras)} cameras, its list names {len(names)} photos; export both again")
-    for name, (lens, turn, shift) in zip(names, cameras):
-        photo = by_name.find(name)
-        if lens[0] > 0 and photo.is_file():
-            width, height = stored_size(photo)
-            params = [lens[0], width / 2, height / 2, lens[1], lens[2]]
-            camera = pycolmap.Camera(model="RADIAL", width=width, height=height, params=params)
-            pose = np.eye(4)
-            pose[:3, :3], pose[:3, 3] = (FLIP @ turn).T, -turn.T @ shift
-            found.append(PosedPhoto(photo.name, photo, camera, pose, None, False))
-    return found
-
-
-def _bundler_photos(file: Path) -> Path:
     listed = bundler_list(file)
     if listed is None:
         raise StageError(f"the list of photos of {file} is missing; put it beside it as list.txt")
-    return listed
+    names = [FOCAL.sub("", line.strip()) for _, line in read_lines(listed)]
+    cameras, found = _bundler_cameras(file), []
+    if len(names) < len(cameras):
+        raise StageError(f"{file} has {len(cameras)} cameras, its list names {len(names)} photos; export both again")
+    for name, ((focal, *bent), turn, shift) in zip(names, cameras):
+        if focal > 0:
+            pose = np.eye(4)
+            pose[:3, :3], pose[:3, 3] = (FLIP @ turn).T, -turn.T @ shift
+            found.append(GivenCamera(name, partial(_bundler_camera, focal, *bent), pose))
+    return found
+
+
+def _bundler_camera(focal: float, k1: float, k2: float, photo: Path) -> pycolmap.Camera:
+    width, height = stored_size(photo)
+    return colmap_camera("RADIAL", width, height, [focal, width / 2, height / 2, k1, k2])
 
 
 def _bundler_cameras(file: Path) -> list[tuple[Array, Array, Array]]:
     """Focal length and radial coefficients (3,), rotation (3, 3) and translation (3,) of each camera."""
     lines = [line.split() for _, line in read_lines(file)]
-    try:
-        count = int(lines[0][0])
-        rows = [np.array(line, dtype=float) for line in lines[1 : 1 + 5 * count]]
-        blocks = [np.stack(rows[5 * k : 5 * k + 5]) for k in range(count)]
-        return [(block[0], block[1:4], block[4]) for block in blocks]
-    except (ValueError, IndexError) as error:
-        raise StageError(f"{file} is no file of Bundler ({error}); export it again") from None
+    rows = [np.array(line, dtype=float) for line in lines[1 : 1 + 5 * int(lines[0][0])]]
+    blocks = [np.stack(rows[k : k + 5]) for k in range(0, len(rows), 5)]
+    if len(blocks) < int(lines[0][0]) or any(block.shape != (5, 3) for block in blocks):
+        raise ValueError(f"it has not the five lines of each of its {lines[0][0]} cameras")
+    return [(block[0], block[1:4], block[4]) for block in blocks]

@@ -1,7 +1,7 @@
 """Cameras of nerfstudio's transforms.json and of Blender's transforms_train.json."""
 
 import json
-import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,89 +10,83 @@ import pycolmap
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.photos.cameras.posed_photo import FLIP, PosedPhoto
-from scenefuse.photos.photo_files import PhotosByName, stored_size
+from scenefuse.core.tables import read_text
+from scenefuse.photos.cameras.posed_photo import FLIP, GivenCamera, colmap_camera
+from scenefuse.photos.photo_files import files_by_name, stored_size
 
 TRANSFORMS = {"transforms.json": "nerfstudio", "transforms_train.json": "Blender"}
+# What describes a camera, of a frame or of all of them.
+NUMBERS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2")
 PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV")
 
 
-def read_transforms(file: Path, folder: Path) -> list[PosedPhoto]:
+def read_transforms(file: Path) -> list[GivenCamera]:
     """The photos of a transforms JSON; beside Blender's transforms_train.json, transforms_test.json is held out.
 
-    Args:
-        file: the JSON; it names photos relative to its own folder.
-        folder: where else they may be.
-
     Raises:
-        StageError: the file is no such JSON, or has a lens that is no perspective one.
+        StageError: a lens is no perspective one, a frame lacks what it needs, a mask is missing.
+        ValueError, TypeError: the file is no such JSON.
     """
-    photos = _read(file, folder, False)
+    photos = _read(file, False)
     test = file.with_name("transforms_test.json")
-    if file.name == "transforms_train.json" and test.is_file():
-        photos += _read(test, folder, True)
-    common = Path(os.path.commonpath([photo.file.parent for photo in photos]))
-    return [
-        PosedPhoto("_".join(p.file.relative_to(common).parts), p.file, p.camera, p.object_from_cam, p.mask, p.held_out)
-        for p in photos
-    ]
+    return photos + (_read(test, True) if file.name == "transforms_train.json" and test.is_file() else [])
 
 
-def _read(file: Path, folder: Path, held_out: bool) -> list[PosedPhoto]:
-    try:
-        content = json.loads(file.read_text())
-    except (OSError, ValueError) as error:
-        raise StageError(f"{file} is no readable JSON ({error}); export it again") from None
+def _read(file: Path, held_out: bool) -> list[GivenCamera]:
+    content = json.loads(read_text(file))
     frames = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise StageError(f"{file} has no list of frames; give a transforms JSON as nerfstudio or Blender write it")
-    kept_out = {name for key in ("val_filenames", "test_filenames") for name in content.get(key) or []}
-    photos, by_name = [], PhotosByName(folder, file.parent)
+    kept_out = {str(name) for key in ("val_filenames", "test_filenames") for name in content.get(key) or []}
+    masks = _masks([str(frame["mask_path"]) for frame in frames if frame.get("mask_path")], file)
+    found = []
     for number, frame in enumerate(frames):
         values = {key: value for key, value in content.items() if key != "frames"} | frame
-        where = f"{file}, frame {number} ({values.get('file_path', 'no file_path')})"
-        if not isinstance(values.get("file_path"), str):
+        name, mask = values.get("file_path"), values.get("mask_path")
+        where = f"{file}, frame {number} ({name or 'no file_path'})"
+        if not isinstance(name, str):
             raise StageError(f"{where}: names no photo; every frame needs a file_path")
-        photo, mask = by_name.find(values["file_path"]), values.get("mask_path")
-        camera, pose = _camera(values, photo, where), _pose(values.get("transform_matrix"), where)
-        masked = None if mask is None else by_name.at(mask)
-        if mask is not None and masked is None:
+        if mask and mask not in masks:
             raise StageError(f"{where}: its mask {mask} does not exist; put it back, or take mask_path out")
-        photos.append(PosedPhoto("", photo, camera, pose, masked, held_out or values["file_path"] in kept_out))
-    return photos
+        camera, pose = _camera(values, where), _pose(values.get("transform_matrix"), where)
+        found.append(GivenCamera(name, camera, pose, masks[mask] if mask else None, held_out or name in kept_out))
+    return found
 
 
-def _camera(values: dict[str, Any], photo: Path, where: str) -> pycolmap.Camera:
-    """The lens of a frame; COLMAP's FULL_OPENCV holds all coefficients that the JSON may have."""
+def _masks(names: list[str], file: Path) -> dict[str, Path]:
+    """The masks by the names that a JSON gives them; none from another folder, where photos may be called alike."""
+    found = files_by_name(names, file.parent, str(file))
+    named = {name: Path(name.replace("\\", "/")).parent.name.casefold() for name in found}
+    return {name: mask for name, mask in found.items() if named[name] in ("", mask.parent.name.casefold())}
+
+
+def _camera(values: dict[str, Any], where: str) -> Callable[[Path], pycolmap.Camera]:
+    """The lens of a frame for its photo; COLMAP's FULL_OPENCV holds all coefficients that the JSON may have."""
     model = values.get("camera_model", "OPENCV")
     if model not in PERSPECTIVE or values.get("is_fisheye"):
         model = "fisheye" if model in PERSPECTIVE else model
         raise StageError(f"{where}: the camera model {model} is not read; undistort the photos to PINHOLE first")
     try:
-        numbers = {
-            key: float(values[key])
-            for key in ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "k1", "k2", "k3", "k4", "p1", "p2")
-            if values.get(key) is not None
-        }
+        numbers = {key: float(values[key]) for key in NUMBERS if values.get(key) is not None}
     except (TypeError, ValueError):
         raise StageError(f"{where}: the camera's values have to be numbers; correct them") from None
     if numbers.get("k4"):
         raise StageError(f"{where}: distortion with k4 is not read; undistort the photos to PINHOLE first")
-    if not {"w", "h"} <= numbers.keys():
-        numbers["w"], numbers["h"] = stored_size(photo)
-    width, height = numbers["w"], numbers["h"]
-    if "fl_x" in numbers:
-        focal = numbers["fl_x"]
-    elif "camera_angle_x" in numbers:
-        focal = 0.5 * width / np.tan(0.5 * numbers["camera_angle_x"])
-    else:
+    if not {"fl_x", "camera_angle_x"} & numbers.keys():
         raise StageError(f"{where}: no focal length; give fl_x (pixels) or camera_angle_x (radians)")
-    middle = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
-    bent = [numbers.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
-    params = [focal, numbers.get("fl_y", focal), *middle, *bent, 0.0, 0.0, 0.0]
-    if not (np.isfinite(params).all() and min(params[:2]) > 0):
-        raise StageError(f"{where}: a focal length has to be positive and all values finite; correct them")
-    return pycolmap.Camera(model="FULL_OPENCV", width=round(width), height=round(height), params=params)
+
+    def camera(photo: Path) -> pycolmap.Camera:
+        width, height = (numbers[side] for side in "wh") if {"w", "h"} <= numbers.keys() else stored_size(photo)
+        focal = numbers.get("fl_x") or 0.5 * width / np.tan(0.5 * numbers.get("camera_angle_x", 0.0))
+        middle = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
+        bent = [numbers.get(key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+        params = [focal, numbers.get("fl_y", focal), *middle, *bent, 0.0, 0.0, 0.0]
+        try:
+            return colmap_camera("FULL_OPENCV", width, height, params)
+        except ValueError as error:
+            raise StageError(f"{where}: {error}; correct it") from None
+
+    return camera
 
 
 def _pose(matrix: Any, where: str) -> NDArray[np.float64]:

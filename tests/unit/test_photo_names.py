@@ -1,0 +1,126 @@
+"""Photos by the names that other programs, lists and people give them."""
+
+import json
+import unicodedata
+
+import cv2
+import numpy as np
+import pytest
+
+from scenefuse.core.stage import StageError
+from scenefuse.photos.cameras.read_cameras import read_posed_photos
+from scenefuse.photos.photo_files import files_by_name, masks_by_name, photos_by_name
+
+
+@pytest.mark.parametrize(
+    ("given", "photo"),
+    [
+        ("a/IMG 1.JPG", "a/IMG 1.JPG"),
+        ("IMG 1.JPG", "a/IMG 1.JPG"),
+        ("C:\\Users\\me\\a\\IMG 1.JPG", "a/IMG 1.JPG"),
+        ("/home/me/photos/IMG 1.JPG", "a/IMG 1.JPG"),
+        ("./a/../IMG 1.JPG", "a/IMG 1.JPG"),
+        ("\ufeffIMG 1.JPG", "a/IMG 1.JPG"),
+        (' "IMG 1.JPG" ', "a/IMG 1.JPG"),
+        ("img 1.jpg", "a/IMG 1.JPG"),
+        ("IMG 1", "a/IMG 1.JPG"),
+        ("IMG 1.JPG.jpg", "a/IMG 1.JPG"),
+        ("IMG 1.DNG", "a/IMG 1.JPG"),
+        ("a_IMG 1.JPG", "a/IMG 1.JPG"),
+        (unicodedata.normalize("NFD", "Gärten.tif"), "Gärten.tif"),
+        (unicodedata.normalize("NFD", "GÄRTEN"), "Gärten.tif"),
+        ("IMG 2.JPG", None),
+        ("MG 1.JPG", None),
+        ("", None),
+        ("../../etc/passwd", None),
+    ],
+)
+def test_a_photo_is_found_however_its_name_is_written(given, photo):
+    found = photos_by_name([given], ["a/IMG 1.JPG", "Gärten.tif", "--help.png"], "list.txt")
+    assert found == ({given: photo} if photo else {})
+
+
+def test_names_that_differ_only_in_case_or_ending_are_told_apart():
+    known = ["a.jpg", "A.jpg", "a.png", "b/a.jpg"]
+    assert photos_by_name(known, known, "") == {name: name for name in known}
+    with pytest.raises(StageError, match="list.txt: a may be any of 4 photos"):
+        photos_by_name(["a"], known, "list.txt")
+
+
+def test_photos_of_one_name_in_two_folders_are_told_apart_by_as_much_of_the_path_as_there_is():
+    known = ["100/0.jpg", "101/0.jpg"]
+    names = ["D:/flight/100/0.jpg", "D:/flight/101/0.jpg", "D:/flight/102/0.jpg"]
+    assert photos_by_name(names, known, "") == {names[0]: known[0], names[1]: known[1]}
+    assert photos_by_name(known, ["100_0.jpg", "101_0.jpg"], "") == {"100/0.jpg": "100_0.jpg", "101/0.jpg": "101_0.jpg"}
+    with pytest.raises(StageError, match="0.jpg may be any of 2 photos"):
+        photos_by_name(["0.jpg"], known, "")
+    with pytest.raises(StageError, match="may both be the photo 0.jpg"):
+        photos_by_name(known, ["0.jpg"], "")
+
+
+def test_a_photo_that_is_gone_is_not_taken_from_another_folder():
+    known = ["images/1.png", "masks/1.png", "masks/2.png"]
+    assert photos_by_name(["images/1.png", "images/2.png"], known, "") == {"images/1.png": "images/1.png"}
+
+
+def test_masks_are_found_by_their_photos_names(tmp_path):
+    for name in ("a.jpg", "a_mask.PNG", "sub/b.JPG_mask.png", "c.png"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    found = masks_by_name(["a.jpg", "sub_b.JPG", "c.jpg"], tmp_path)
+    assert found == {"a.jpg": tmp_path / "a_mask.PNG", "sub_b.JPG": tmp_path / "sub/b.JPG_mask.png"}
+
+
+def test_names_lead_to_no_file_outside_the_folder(tmp_path):
+    (tmp_path / "photos").mkdir()
+    (tmp_path / "secret.jpg").touch()
+    names = ["../secret.jpg", str(tmp_path / "secret.jpg"), "a\0b.jpg", "x" * 5000, "..", "/"]
+    assert files_by_name(names, tmp_path / "photos", "") == {}
+
+
+TURN, PLACE = "1 0 0 0", "0 0 5"
+
+
+def model(folder, images, cameras="1 PINHOLE 40 30 50 50 20 15\n"):
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "cameras.txt").write_text(cameras)
+    (folder / "images.txt").write_text(images)
+    return folder
+
+
+def photos(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        cv2.imwrite(str(folder / name), np.zeros((30, 40, 3), np.uint8))
+    return folder
+
+
+@pytest.mark.parametrize("observed", ["\n\n", "\n", "\n1.5 2.5 -1 3 4 17\n"], ids=["empty lines", "no lines", "points"])
+def test_a_text_model_of_colmap_has_names_with_blanks(tmp_path, observed):
+    folder = photos(tmp_path / "photos", "DJI (drone) 1.JPG", "DJI (drone) 2.JPG")
+    lines = [f"{k} {TURN} {PLACE} 1 DJI (drone) {k}.JPG" for k in (1, 2)]
+    given = model(tmp_path / "sparse", "\ufeff# Image list\n" + observed.join(lines) + observed)
+    found, program, notes = read_posed_photos(given, folder)
+    assert [photo.file.name for photo in found] == ["DJI (drone) 1.JPG", "DJI (drone) 2.JPG"] and program == "COLMAP"
+    np.testing.assert_allclose(found[1].object_from_cam[:3, 3], [0, 0, -5])
+    assert notes == []
+
+
+def test_of_several_models_the_largest_is_taken_and_said(tmp_path):
+    folder = photos(tmp_path / "images", "a.jpg", "b.jpg", "c.jpg")
+    model(tmp_path / "sparse/0", f"1 {TURN} {PLACE} 1 a.jpg\n\n")
+    model(tmp_path / "sparse/1", f"2 {TURN} {PLACE} 1 b.jpg\n\n3 {TURN} {PLACE} 1 c.jpg\n\n")
+    found, _, notes = read_posed_photos(tmp_path, folder)
+    assert [photo.name for photo in found] == ["b.jpg", "c.jpg"]
+    assert notes == ["the model sparse/1 is taken, with 2 photos, and not sparse/0 with 1"]
+
+
+def test_photos_of_a_transforms_json_are_found_in_a_folder_of_another_name(tmp_path):
+    folder = photos(tmp_path / "photos", "a.JPG", "b.JPG")
+    lens = {"w": 40, "h": 30, "fl_x": 50}
+    frames = [{"file_path": f"images\\{name}.jpg", "transform_matrix": np.eye(4).tolist()} for name in "abc"]
+    (tmp_path / "cameras.json").write_text("\ufeff" + json.dumps(lens | {"frames": frames}))
+    for given in (folder, None):
+        found, _, notes = read_posed_photos(tmp_path / "cameras.json", given)
+        assert [photo.file.name for photo in found] == ["a.JPG", "b.JPG"]
+        assert len(notes) == 1 and notes[0].startswith("1 of 3 cameras are of photos that are not in")
