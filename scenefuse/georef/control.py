@@ -10,10 +10,9 @@ import pycolmap
 
 from scenefuse.cloud.crs import grid_name
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array, Sim3
 from scenefuse.georef.control_file import ControlFile, SurveyedPoint, read_control, unknown_photo
-from scenefuse.marks.clicks import Click
+from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.lengths import MAX_CLICK_MISS
 from scenefuse.marks.triangulation import intersect, model_pixel
 from scenefuse.photos.photos import Photo
@@ -92,13 +91,12 @@ def locate_points(
     Raises:
         StageError: a click in a photo that does not exist, or outside its photo.
     """
-    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
-    sizes = {composed(name): size for name, size in sizes.items()}
+    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
     located, notes = [], []
     for point in control.points:
         seen, lost = [], []
-        for click in point.clicks:
-            photo = composed(click.photo)
+        for click in in_photos(point.clicks, sizes, control.path):
+            photo = click.photo
             if photo not in sizes:
                 raise unknown_photo(control.path, point.name, photo, sizes)
             if photo in images:

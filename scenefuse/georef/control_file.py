@@ -9,9 +9,9 @@ import pyproj
 
 from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import comma_advice, composed, read_lines
+from scenefuse.core.tables import comma_advice, read_lines
 from scenefuse.core.transforms import Array
-from scenefuse.marks.clicks import Click
+from scenefuse.marks.clicks import Click, in_photos
 from scenefuse.marks.lengths import read_ends
 from scenefuse.photos.photo_files import SUFFIXES
 
@@ -149,12 +149,12 @@ def check_survey_files(names: list[str], control: Path | None = None, lengths: P
     Raises:
         StageError: what `read_control` and `read_ends` say; a click in a photo that does not exist.
     """
-    clicked: list[tuple[Path, Click]] = []
+    clicked: list[tuple[Path, list[Click]]] = []
     if control is not None:
-        clicked += [(control, click) for point in read_control(control).points for click in point.clicks]
+        clicked.append((control, [click for point in read_control(control).points for click in point.clicks]))
     if lengths is not None:
-        clicked += [(lengths, click) for click in read_ends(lengths).rows]
-    known = set(map(composed, names))
-    for path, click in clicked:
-        if composed(click.photo) not in known:
-            raise unknown_photo(path, click.name, click.photo, names)
+        clicked.append((lengths, list(read_ends(lengths).rows)))
+    for path, clicks in clicked:
+        for click in in_photos(clicks, names, path):
+            if click.photo not in names:
+                raise unknown_photo(path, click.name, click.photo, names)

@@ -4,8 +4,8 @@ The workflow imports this whenever it plans: nothing here takes long to import.
 """
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import comma_advice, composed, read_cells
-from scenefuse.photos.photo_files import upright_size
+from scenefuse.core.tables import comma_advice, read_cells
+from scenefuse.photos.photo_files import photos_by_name, upright_size
 
 Array = NDArray[np.float64]
 Cells = list[str]
@@ -103,6 +103,13 @@ class ScenePoints:
     path: Path
     points: list[str]
     positions: Array
+
+
+def in_photos(clicks: Iterable[Click], photos: Iterable[str], path: Path) -> list[Click]:
+    """Clicks with the names of these photos, where their file calls them a little otherwise; see `photos_by_name`."""
+    clicks = list(clicks)
+    found = photos_by_name([click.photo for click in clicks], photos, str(path))
+    return [replace(click, photo=found.get(click.photo, click.photo)) for click in clicks]
 
 
 def read_points(path: Path) -> Clicks | ScenePoints:
@@ -265,23 +272,21 @@ def check_marks(path: Path, photos: Mapping[str, Path] | None = None, used: list
             )
     if photos is None:
         return
-    files = {composed(name): file for name, file in photos.items()}
     names = list(photos) if used is None else used
-    taken = set(map(composed, names))
     sizes: dict[str, tuple[int, int]] = {}
-    for click in marked.rows:
-        photo = composed(click.photo)
-        if photo not in files:
+    for click in in_photos(marked.rows, photos, path):
+        photo = click.photo
+        if photo not in photos:
             raise StageError(
-                f"{path}: {click} is in {click.photo}, which is none of the {len(photos)} photos"
-                f" ({next(iter(files))}, ...); correct the name"
+                f"{path}: {click} is in {photo}, which is none of the {len(photos)} photos"
+                f" ({next(iter(photos))}, ...); correct the name"
             )
-        if photo not in taken:
+        if photo not in names:
             raise StageError(
-                f"{path}: {click} is in {click.photo}, but only {len(taken)} of the {len(photos)} photos are used"
+                f"{path}: {click} is in {photo}, but only {len(names)} of the {len(photos)} photos are used"
                 f" (object.frames), and this is none of them: click in one that is ({names[0]}, ...), or set"
                 f" max_frames to {len(photos)} and frame_step to 1"
             )
         if photo not in sizes:
-            sizes[photo] = upright_size(files[photo])
+            sizes[photo] = upright_size(photos[photo])
         check_inside(path, click, sizes[photo])

@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array
-from scenefuse.marks.clicks import Click, Clicks
+from scenefuse.marks.clicks import Click, Clicks, in_photos
 from scenefuse.marks.triangulation import model_pixel
 from scenefuse.photos.workspace import View, posed_images, ray_through, read_model
 
@@ -91,23 +90,22 @@ def clicks_per_photo(
         StageError: a click outside its photo, a box that is not two corners, no click inside and no box in a photo with
             a camera.
     """
-    images = {composed(image.name): image for image in posed_images(read_model(sparse))}
-    rows = {composed(view.name): k for k, view in enumerate(views)}
-    listed = None if sizes is None else {composed(name): size for name, size in sizes.items()}
+    images = {image.name: image for image in posed_images(read_model(sparse))}
+    rows = {view.name: k for k, view in enumerate(views)}
     left_out: list[str] = []
     found: dict[int, list[tuple[Click, Array]]] = {}
-    for click in labels.rows:
-        photo = composed(click.photo)
+    for click in in_photos(labels.rows, [*images, *(sizes or ())], labels.path):
+        photo = click.photo
         if photo in images and photo in rows:
             view = views[rows[photo]]
-            undistorted = _undistorted(labels.path, click, images[photo], view, listed)
+            undistorted = _undistorted(labels.path, click, images[photo], view, sizes)
             beyond = ((undistorted < 0) | (undistorted > [view.width, view.height])).any()
-            if not np.isfinite(undistorted).all() or (listed is not None and beyond):
+            if not np.isfinite(undistorted).all() or (sizes is not None and beyond):
                 left_out.append(f"{click} is in {photo}, whose edge is cut away there when it is undistorted")
             else:
                 found.setdefault(rows[photo], []).append((click, undistorted))
-        elif listed is None or photo in listed:
-            why = ", or is none of the photos" if listed is None else ""
+        elif sizes is None or photo in sizes:
+            why = ", or is none of the photos" if sizes is None else ""
             left_out.append(f"{click} is in {photo}, which has no camera (it could not be registered{why})")
         else:
             left_out.append(

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import composed
 from scenefuse.core.transforms import Array
-from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, read_points
+from scenefuse.marks.clicks import Click, Clicks, ScenePoints, check_inside, in_photos, read_points
 from scenefuse.photos.workspace import ray_through, read_model
 
 if TYPE_CHECKING:
@@ -73,12 +72,11 @@ def triangulate_consistent(
         StageError: a photo that is none of `sizes`, a click outside its photo, a point that is clicked once only. Each
             message names the point.
     """
-    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
-    sizes = None if sizes is None else {composed(name): size for name, size in sizes.items()}
+    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
     positions, residuals, labels = [], [], []
     registered, left_out = _registered(clicks, images, sizes)
     for label, own in registered.items():
-        seen, photos = [images[composed(click.photo)] for click in own], [click.photo for click in own]
+        seen, photos = [images[click.photo] for click in own], [click.photo for click in own]
         pixels = np.array([model_pixel(clicks.path, click, image, sizes) for click, image in zip(own, seen)])
         position, residual = intersect(seen, pixels)
         if position is None:
@@ -103,9 +101,9 @@ def triangulate_consistent(
 def marked_size(clicks: Clicks, model: pycolmap.Reconstruction, sizes: Sizes | None = None) -> float:
     """How large what is clicked is in the photos: median diagonal of the box of a photo's clicks, in pixels of the
     model's photos; 0 where no photo with a camera has two. Arguments as of `triangulate`."""
-    images = {composed(model.images[i].name): model.images[i] for i in model.reg_image_ids()}
-    sizes = {} if sizes is None else {composed(name): size for name, size in sizes.items()}
-    photos, spans = np.array([composed(photo) for photo in clicks.photos]), []
+    images = {model.images[i].name: model.images[i] for i in model.reg_image_ids()}
+    sizes, own = sizes or {}, in_photos(clicks.rows, images, clicks.path)
+    photos, spans = np.array([click.photo for click in own]), []
     for name in sorted(set(photos) & set(images)):
         camera = images[name].camera
         assert camera is not None
@@ -122,11 +120,11 @@ def _registered(
     camera."""
     found: dict[str, list[Click]] = {}
     lost: dict[str, list[str]] = {}
-    for click in clicks.rows:
-        photo, own = composed(click.photo), found.setdefault(click.label, [])
-        if photo in images:
+    for click in in_photos(clicks.rows, [*images, *(sizes or ())], clicks.path):
+        own = found.setdefault(click.label, [])
+        if click.photo in images:
             own.append(click)
-        elif sizes is None or photo in sizes:
+        elif sizes is None or click.photo in sizes:
             lost.setdefault(click.label, []).append(click.photo)
         else:
             raise StageError(
@@ -148,10 +146,10 @@ def _registered(
 
 
 def model_pixel(path: Path, click: Click, image: pycolmap.Image, sizes: Sizes | None) -> Array:
-    """A click (2,) in pixels of the model's photo; StageError when it lies outside. `sizes` by `composed` names."""
+    """A click (2,) in pixels of the model's photo; StageError when it lies outside."""
     assert image.camera is not None
     own = (image.camera.width, image.camera.height)
-    clicked = own if sizes is None else sizes.get(composed(click.photo), own)
+    clicked = own if sizes is None else sizes.get(click.photo, own)
     check_inside(path, click, clicked)
     return click.pixel * np.array(own) / np.array(clicked)
 

@@ -9,8 +9,9 @@ import numpy as np
 
 from scenefuse.cloud.crs import read_crs, to_wgs84
 from scenefuse.core.stage import StageError
-from scenefuse.core.tables import composed, read_lines
+from scenefuse.core.tables import read_lines
 from scenefuse.core.transforms import Array
+from scenefuse.photos.photo_files import photos_by_name
 
 LAYOUT = "photo x y [z [yaw pitch roll [horizontal sd [vertical sd]]]]"
 # XMP names of standard deviations in metres, as attributes or elements: DJI's, then Pix4D's (Parrot, senseFly, ...).
@@ -92,21 +93,16 @@ def read_geo(path: Path) -> dict[str, Position]:
 def positions_of(names: list[str], positions: dict[str, Position], path: Path) -> list[dict[str, Any]]:
     """The fields of a `Position` of each photo, None where the file has none.
 
-    A photo is named by its path below the folder, or without folders where only one photo has that name.
-
     Raises:
-        StageError: the file names none of the photos.
+        StageError: the file names none of the photos; what `photos_by_name` says.
     """
-    positions = {composed(name): position for name, position in positions.items()}
-    whole = [composed(name) for name in names]
-    last = [Path(name).name for name in whole]
-    keys = [name if name in positions or last.count(end) > 1 else end for name, end in zip(whole, last)]
-    if not any(key in positions for key in keys):
+    found = {photo: name for name, photo in photos_by_name(positions, names, str(path)).items()}
+    if not found:
         raise StageError(
             f"{path} names none of the photos beside it: it names {next(iter(positions))}, a photo is {names[0]};"
             " correct the names, or remove the file"
         )
-    return [asdict(positions.get(key, Position())) for key in keys]
+    return [asdict(positions[found[name]] if name in found else Position()) for name in names]
 
 
 def _position(place: Array, sd: Array) -> Position:

@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from scenefuse.core.stage import StageError
+from scenefuse.marks.clicks import in_photos, read_points
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.photo_files import files_by_name, masks_by_name, photos_by_name
+from scenefuse.photos.positions import positions_of, read_geo
 
 
 @pytest.mark.parametrize(
@@ -124,3 +126,15 @@ def test_photos_of_a_transforms_json_are_found_in_a_folder_of_another_name(tmp_p
         found, _, notes = read_posed_photos(tmp_path / "cameras.json", given)
         assert [photo.file.name for photo in found] == ["a.JPG", "b.JPG"]
         assert len(notes) == 1 and notes[0].startswith("1 of 3 cameras are of photos that are not in")
+
+
+def test_clicks_and_positions_are_of_the_photos_that_are_meant(tmp_path):
+    (tmp_path / "points.tsv").write_text("point\tphoto\tx_px\ty_px\na\tC:\\me\\img_1.jpg\t3\t4\na\timg_2\t5\t6\n")
+    clicks = read_points(tmp_path / "points.tsv")
+    assert [c.photo for c in in_photos(clicks.rows, ["b/IMG_1.JPG", "b/IMG_2.JPG"], clicks.path)] == [
+        "b/IMG_1.JPG",
+        "b/IMG_2.JPG",
+    ]
+    (tmp_path / "geo.txt").write_text("EPSG:4326\nimg_1 8.5 47.5 400\n")
+    first, second = positions_of(["b/IMG_1.JPG", "b/IMG_2.JPG"], read_geo(tmp_path / "geo.txt"), tmp_path / "geo.txt")
+    assert first["latitude_deg"] == 47.5 and second["latitude_deg"] is None

@@ -236,7 +236,7 @@ def test_feet_stay_feet_in_the_results(tmp_path, model):
         (lambda lines: [lines[0], "1 2 3 4 5"], "line 2: expected x y z"),
         (lambda lines: [lines[0], lines[1], lines[1]], "clicked more than once in"),
         (lambda lines: [*lines[:3], *changed(lines[3:4], "a", 0, lambda x: x + 1)], "different coordinates"),
-        (lambda lines: [line.replace(".jpg", ".JPG") for line in lines], "none of the 24 photos"),
+        (lambda lines: [line.replace(".jpg", "x.jpg") for line in lines], "none of the 24 photos"),
         (lambda lines: changed(lines, "b", 3, lambda x: x + 900), "lies outside"),
         (lambda lines: [line for line in lines if line[-1] not in "abcd"], "2 control points with a height"),
         (lambda lines: lines[:1] + [lines[k] for k in range(1, len(lines), 5)], "clicked in"),
