@@ -29,8 +29,7 @@ from scenefuse.masks.sam2 import Sam2, load_network
 from scenefuse.masks.sam2_weights import why_unavailable
 from scenefuse.masks.segmentation import MaskSettings, ScoredMasks, score_masks
 from scenefuse.masks.supplied import supplied_masks
-from scenefuse.masks.target import target_from_points
-from scenefuse.masks.votes import points_in_masks
+from scenefuse.masks.target import points_in_masks, target_from_points
 from scenefuse.photos.frames import original_sizes
 from scenefuse.photos.pictures import write_picture
 from scenefuse.photos.workspace import View, Workspace, read_workspace

@@ -14,7 +14,7 @@ from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.clicks import Clicks, ScenePoints
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.marks.triangulation import marked_size, triangulate_consistent
-from scenefuse.masks.grabcut import query_grabcut
+from scenefuse.masks.grabcut_passes import query_grabcut
 from scenefuse.masks.prompts import Segmenter, prompted_parts
 from scenefuse.masks.propagation import propagate
 from scenefuse.masks.sam2 import Sam2, query_sam2

@@ -9,7 +9,8 @@ import numpy as np
 from scenefuse.core.stage import StageError, setting
 from scenefuse.geometry.visual_hull import Hull, Mask, carve, mask_iou, silhouette
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.grabcut import along_edges, cleaned, first_cuts, second_cuts
+from scenefuse.masks.grabcut import along_edges, cleaned
+from scenefuse.masks.grabcut_passes import first_cuts, second_cuts
 from scenefuse.masks.sam2 import LOGITS_PX, Sam2, segment
 from scenefuse.masks.sam2_weights import DECODER, ENCODER
 from scenefuse.masks.target import Target

@@ -7,12 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import QhullError
 
-from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.geometry.visual_hull import Mask
 from scenefuse.marks.photo_clicks import PhotoClicks
+from scenefuse.masks.box import in_hull
 from scenefuse.masks.prompts import Prompts, agreement, distance_to, pixel_of
-from scenefuse.masks.target import MIN_OBJECT_POINTS, in_hull, without_outermost
 from scenefuse.photos.workspace import Workspace
 
 # Quality of a mask, by its method's own estimate, from which it votes: SAM 2's was 0.44 to 0.77 for the bronze statue's
@@ -22,6 +21,8 @@ MIN_QUALITY = 0.5
 MIN_AGREEMENT = 0.8
 # Share of a point's votes for one side from which it is known to be on that side.
 MIN_VOTE_SHARE = 0.8
+# Percentage of the object's points at each side, along each axis, that may be mismatched.
+OUTERMOST_PERCENT = 1.0
 # So many of these points, on which so many photos vote, span the object: a single mask may hold what is around it.
 MIN_SPANNING_POINTS, SPANNING_PHOTOS = 8, 2
 # Half width of the band along a mask's outline in which no point votes, as a share of the photo's longer side.
@@ -73,6 +74,15 @@ def vote_shares(photos: Workspace, made: dict[int, Voter]) -> Array:
         return votes / total
 
 
+def without_outermost(points: Array) -> Array:
+    """Of (N, 3) points of the object those that are not the outermost along an axis, where there are many."""
+    if not len(points):
+        return points
+    low = np.percentile(points, OUTERMOST_PERCENT, axis=0, method="lower")
+    high = np.percentile(points, 100 - OUTERMOST_PERCENT, axis=0, method="higher")
+    return points[((points >= low) & (points <= high)).all(1)]
+
+
 def known_points(photos: Workspace, made: dict[int, Voter]) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
     """(P,) 1 for sparse points known to be the object's, -1 for those known not to be, 0 for all others; and (P,) those
     of the others that the object's enclose.
@@ -106,23 +116,3 @@ def known_pixels(photos: Workspace, k: int, others: dict[int, Voter]) -> Prompts
 def agrees_with_others(photos: Workspace, k: int, mask: Mask, others: dict[int, Voter]) -> bool:
     """Whether a mask (H, W) agrees with the votes of the others; so it does where these know nothing of its photo."""
     return agreement(mask, known_pixels(photos, k, others), 0) >= MIN_AGREEMENT
-
-
-def points_in_masks(photos: Workspace, masks: list[Mask]) -> Array:
-    """(N, 3) sparse points that lie in the photos' masks (H, W) wherever they are seen, without the outermost.
-
-    Raises:
-        StageError: there are fewer than ten of them.
-    """
-    seen, hit = np.zeros(len(photos.points)), np.zeros(len(photos.points))
-    for rows, pixels, mask in zip(photos.seen, photos.seen_at, masks):
-        u, v = np.clip(pixels.astype(int), 0, np.array(mask.shape[::-1]) - 1).T
-        np.add.at(seen, rows, 1)
-        np.add.at(hit, rows, mask[v, u])
-    own = photos.points[(seen >= 2) & (hit > MIN_VOTE_SHARE * seen)]
-    if len(own) < MIN_OBJECT_POINTS:
-        raise StageError(
-            f"only {len(own)} sparse points lie in the supplied masks; "
-            "are they white on the object, and of these photos?"
-        )
-    return without_outermost(own)

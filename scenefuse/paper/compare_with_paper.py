@@ -34,8 +34,6 @@ from scenefuse.photos.workspace import posed_images, read_model
 from scenefuse.report.run_summary import ObjectSummary, RunInputs, summarise
 from scenefuse.report.values import find, load, number
 
-ON_DEMAND = ("fused_scene.json",)
-"""Files of an object that no run makes unless they are asked for, at any time."""
 _HEADINGS = (PAPER, HERE, SCENEFUSE, COMMON, NULL)
 _TITLES = {
     "2": "registration",
@@ -85,9 +83,8 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         StageError: no variant is given, or not one scene for each object.
     """
     results = Path(settings.compared_with)
-    summarised = _summarised(results)
-    beside = _of_other_results(run, results, [v for v in VARIANTS if v in {variant for _, variant in summarised}])
-    unfinished = why_not_finished(results, beside)
+    beside = _of_other_results(run, results)
+    unfinished = "" if (results / "summary/summary.txt").is_file() else f"{results} holds no finished run"
     rows: list[dict[str, Any]] = []
     for place, (item, other) in enumerate(zip(summarise(run).objects, summarise(beside).objects)):
         if item.alone:
@@ -95,8 +92,7 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         folder, its_folder = run.objects[place], beside.objects[place]
         scene = next(k for k, path in enumerate(run.scenes) if path.name == run.scene_of[place])
         pairs = [(folder, its_folder), (run.scenes[scene], beside.scenes[scene])]
-        absent = "" if (item.name, "full") in summarised else f"the run in {results} has no object {item.name}"
-        why = unfinished or absent or why_not_comparable(pairs, item, other)
+        why = unfinished or why_not_comparable(pairs, item, other)
         columns = {
             PAPER: Column(published(item.name), measured=False),
             HERE: column_of(item),
@@ -119,50 +115,15 @@ def compare_with_paper(*, run: RunInputs, settings: ComparisonSettings, table: P
         print(note, flush=True)
 
 
-def _summarised(results: Path) -> set[tuple[str, str]]:
-    """Objects and variants of the last run that wrote these results; what else lies there is from before."""
-    try:
-        table = pd.read_csv(results / "summary/registration.tsv", sep="\t", dtype=str)
-        return set(zip(table["object"], table["variant"]))
-    except (OSError, ValueError, KeyError):
-        return set()
-
-
-def _of_other_results(run: RunInputs, results: Path, variants: list[str]) -> RunInputs:
+def _of_other_results(run: RunInputs, results: Path) -> RunInputs:
     """The same scenes and objects in other results, whose depth maps may be split into other jobs."""
     return replace(
         run,
         chunks=0,
-        variants=variants or ["full"],
         jobs=JobRecords(results / "logs", results / "benchmarks"),
         scenes=tuple(results / "scenes" / folder.name for folder in run.scenes),
         objects=tuple(results / "objects" / folder.name for folder in run.objects),
     )
-
-
-def why_not_finished(results: Path, run: RunInputs) -> str:
-    """Why a results folder holds no finished run, or "".
-
-    A run writes its summary last; what it makes again is newer than the summary, or not there.
-
-    Args:
-        results: the folder.
-        run: its scenes and objects.
-    """
-    summary = results / "summary/summary.txt"
-    if not results.is_dir():
-        return f"{results} does not exist"
-    if not summary.is_file():
-        return f"{results} holds no finished run: it has no summary/summary.txt"
-    parts = ("*.json", "registration/*/*.json")
-    written = [file for folder in run.objects for part in parts for file in folder.glob(part)]
-    written = [file for file in written if file.name not in ON_DEMAND]
-    written += [folder / "dense.json" for folder in run.scenes if (folder / "dense.json").is_file()]
-    try:
-        newer = next((file for file in written if file.stat().st_mtime > summary.stat().st_mtime), None)
-    except FileNotFoundError as error:
-        newer = error.filename
-    return f"the run in {results} is not finished: {newer} is newer than its summary" if newer else ""
 
 
 def why_not_comparable(pairs: list[tuple[Path, Path]], item: ObjectSummary, other: ObjectSummary) -> str:
@@ -231,26 +192,10 @@ def paper_section(rows: list[dict[str, str]]) -> str:
 
 
 def _notes(rows: list[dict[str, str]]) -> list[str]:
-    """What is said of the cells of each object, once, with the rows that it is said of unless these are all."""
-    said: dict[tuple[str, str], list[dict[str, str]]] = {}
-    for row in rows:
-        if row["note"] != "-":
-            said.setdefault((row["object"], row["note"]), []).append(row)
-    own = {name: [row for row in rows if row["object"] == name] for name, _ in said}
-    made = dict.fromkeys(f"{row['object']}, {HERE}: {row['preset']}" for row in rows if row.get("preset", "-") != "-")
-    return [*made, *(f"{name}{_where(of, own[name])}: {note}" for (name, note), of in said.items())]
-
-
-def _where(of: list[dict[str, str]], rows: list[dict[str, str]]) -> str:
-    """Which of an object's rows some are: the variants of which they are all, else the measures."""
-    if len(of) == len(rows):
-        return ""
-    places = []
-    for variant in dict.fromkeys(row["variant"] for row in of):
-        measures = [row["measure"] for row in of if row["variant"] == variant]
-        all_of_it = len(measures) == sum(row["variant"] == variant for row in rows)
-        places.append(variant if all_of_it else f"{', '.join(measures)} of {variant}")
-    return f" ({'; '.join(places)})"
+    """How each object of this run was made, and what is said of the cells of each of its variants, once."""
+    made = [f"{row['object']}, {HERE}: {row['preset']}" for row in rows if row.get("preset", "-") != "-"]
+    said = [f"{row['object']}, {row['variant']}: {row['note']}" for row in rows if row["note"] != "-"]
+    return list(dict.fromkeys([*made, *said]))
 
 
 def _table(rows: list[dict[str, str]]) -> str:

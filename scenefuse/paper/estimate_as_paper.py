@@ -5,27 +5,28 @@ The chain, frame after frame, is brought into the frame that masks and registrat
 
 import shutil
 import time
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from scenefuse.core.checkpoints import key_of
-from scenefuse.core.stage import StageError, atomic_directory, quantity, write_json
+from scenefuse.core.stage import StageError, atomic_directory, quantity, value, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos, depth_photos
-from scenefuse.nerf.prior.monodepth import parameters, sample
+from scenefuse.nerf.prior.monodepth import sample
 from scenefuse.nerf.prior.refine_depth import DepthPrior, write_prior
 from scenefuse.nerf.prior.train_depth import align_maps, residual_at_checks
 from scenefuse.nerf.prior.training import Recipe, loss_quantities, optimise, predict, prepare_torch
-from scenefuse.paper.fused_depth import Content, consistency_between_views, map_quantities, print_quality
+from scenefuse.paper.fused_depth import Content, map_quantities
 from scenefuse.paper.monocular import (
     MonocularSettings,
     Networks,
     PoseNetwork,
+    Supervision,
     frames_of,
     monocular_losses,
     new_monocular_networks,
@@ -73,7 +74,7 @@ def place_chain(own: Array, known: Array) -> tuple[Array, Sim3]:
     return placed, fit
 
 
-def trajectory_error(name: str, poses: Array, reference: Array) -> dict[str, Any]:
+def trajectory_error(name: str, poses: Array, reference: Array) -> Content:
     """Errors of (V, 4, 4) poses against others after a similarity fitted to the centres; nothing when they coincide."""
     centres, target = poses[:, :3, 3], reference[:, :3, 3]
     try:
@@ -100,7 +101,7 @@ def write_posed(workspace: Path, posed: Path, views: Views, poses: Array) -> Non
         write_model(folder / "sparse", moved)
 
 
-def chain_quantities(own: Array, known: Array, used: Array, pose_source: str) -> dict[str, Any]:
+def chain_quantities(own: Array, known: Array, used: Array, pose_source: str) -> Content:
     """How far a chain is from SfM's poses, all (V, 4, 4), and what later stages read of those that are used."""
     error = trajectory_error("chain", own, known)
     return {
@@ -180,45 +181,77 @@ def estimate_as_paper(
         StageError: fewer than three frames, frames without motion, fewer than eight SfM points on the object to measure
             with, a chain that does not move, or a training that diverged.
     """
-    start = time.monotonic()
     device = prepare_torch(seed)
     views = load_views(workspace, masks, settings.width_px, hold_out_every)
     frames, networks = frames_of(views, device), new_monocular_networks(device)
-    supervision, recipe = supervision_of(frames), recipe_of(settings)
-    notes = few_frames(int(frames.trained.sum()))
-    print(
-        f"{len(views.names)} frames, {recipe.steps(frames)} steps of at most {recipe.batch_photos} frames", flush=True
-    )
-    checkpoint = checkpoints / key_of("paper, stage 1", recipe, seed, frames, supervision) / "state.pt"
-    objective = monocular_losses(networks, frames, supervision, recipe)
-    losses = optimise(networks.parts(), frames, objective, recipe, checkpoint, seed)
-    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
-    placed = place(raw, networks, frames, views, pose_source, seed)
-    content: Content = {
-        "workspace": quantity(outputs.posed.name, ""),
-        "photos": quantity(len(views.names), "1"),
-        "photos_held_out": quantity(int(views.held_out.sum()), "1"),
-        "width_px": quantity(views.images.shape[2], "px"),
-        "steps": quantity(recipe.steps(frames), "1"),
-        "parameters": quantity(parameters(networks.depth, networks.pose), "1"),
-        "device": quantity(str(device), ""),
-        "notes": quantity(notes, ""),
-        **write_stage(outputs, workspace, views, networks, placed, settings, pose_source),
-        **loss_quantities(losses),
-        **pose_quantities(networks.pose, frames, in_unit(views.object_from_cam, placed.unit)),
-    }
-    write_json(outputs.report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
-    checkpoint.unlink(missing_ok=True)
-    print_quality(content)
+    content = few_frames(int(frames.trained.sum()))
+    stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
+    stage.run(networks, supervision_of(frames), settings.epochs, content)
 
 
-def few_frames(count: int) -> list[str]:
+def few_frames(count: int) -> Content:
     """A note where there are fewer frames than the paper's batch holds."""
-    if count >= Recipe.batch_photos:
-        return []
-    note = f"{count} frames are fewer than the paper's batch of {Recipe.batch_photos}: a batch holds all of them once"
-    print(note, flush=True)
-    return [note]
+    notes = []
+    if count < Recipe.batch_photos:
+        notes = [f"{count} frames are fewer than the paper's batch of {Recipe.batch_photos}: a batch holds all of them"]
+        print(notes[0], flush=True)
+    return {"notes": quantity(notes, "")}
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What stages 1 and 3 have in common: networks are trained on frames, and what they say is written.
+
+    Attributes:
+        workspace: undistorted COLMAP workspace of the object.
+        outputs: see StageOutputs.
+        checkpoints: folder for training states.
+        views: the frames with SfM's poses.
+        frames: the same without any pose.
+        pose_source: whose poses the later stages use.
+        seed: of the batches.
+    """
+
+    workspace: Path
+    outputs: StageOutputs
+    checkpoints: Path
+    views: Views
+    frames: DepthPhotos
+    pose_source: PoseSource
+    seed: int
+
+    def run(self, networks: Networks, supervision: Supervision, epochs: int, content: Content) -> None:
+        """Train, and write depth maps, networks, poses and the report, with `content`."""
+        start, recipe = time.monotonic(), recipe_of(epochs)
+        print(f"{len(self.views.names)} frames, {recipe.steps(self.frames)} steps", flush=True)
+        key = key_of("paper", recipe, self.seed, self.frames, supervision, networks.state())
+        checkpoint = self.checkpoints / key / "state.pt"
+        objective = monocular_losses(networks, self.frames, supervision, recipe)
+        losses = optimise(networks.parts(), self.frames, objective, recipe, checkpoint, self.seed)
+        raw = predict(networks.depth, self.frames, supervision.colors, supervision.first)
+        placed = place(raw, networks, self.frames, self.views, self.pose_source, self.seed)
+        depth, known = placed.depth * placed.measured.masks, self.views.object_from_cam
+        maps = depth[:, 0].cpu().numpy()
+        with atomic_directory(self.outputs.stage) as folder:
+            write_prior(folder, self.views, DepthPrior(maps, (maps > 0).astype(np.float32)))
+            save_networks(folder / "networks.pt", networks, maps.shape[2], placed.unit)
+        write_posed(self.workspace, self.outputs.posed, self.views, placed.poses)
+        chain = chain_quantities(placed.chain, known, placed.poses, self.pose_source)
+        write_json(self.outputs.posed_json, chain)
+        aligned = residual_at_checks(align_maps(placed.depth, placed.measured, 0), placed.measured)
+        content |= {
+            "steps": quantity(recipe.steps(self.frames), "1"),
+            **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
+            "unit": quantity(placed.unit, "object units per unit of the networks"),
+            **map_quantities(depth, placed.measured),
+            "residual_each_map_aligned": quantity(aligned, "1"),
+            **loss_quantities(losses),
+            **pose_quantities(networks.pose, self.frames, in_unit(known, placed.unit)),
+            "seconds": quantity(round(time.monotonic() - start, 1), "s"),
+        }
+        write_json(self.outputs.report, content)
+        checkpoint.unlink(missing_ok=True)
+        print(f"depth maps written: {value(content, 'consistent_share'):.0%} agree with another view", flush=True)
 
 
 def place(
@@ -257,29 +290,3 @@ def in_unit(poses: Array, unit: float) -> Array:
     scaled = poses.copy()
     scaled[:, :3, 3] /= unit
     return scaled
-
-
-def write_stage(
-    outputs: StageOutputs,
-    workspace: Path,
-    views: Views,
-    networks: Networks,
-    placed: Placed,
-    settings: MonocularSettings,
-    pose_source: PoseSource,
-) -> Content:
-    """Write maps, networks and the posed workspace; what the stage's report says of them."""
-    depth, measured = placed.depth * placed.measured.masks, placed.measured
-    consistency, maps = consistency_between_views(depth, measured), depth[:, 0].cpu().numpy()
-    with atomic_directory(outputs.stage) as folder:
-        write_prior(folder, views, DepthPrior(maps, (maps > 0).astype(np.float32)))
-        save_networks(folder / "networks.pt", networks, asdict(settings) | {"unit": placed.unit})
-    write_posed(workspace, outputs.posed, views, placed.poses)
-    chain = chain_quantities(placed.chain, views.object_from_cam, placed.poses, pose_source)
-    write_json(outputs.posed_json, chain)
-    return {
-        **{name: part for name, part in chain.items() if name not in ("frame", "up_in_camera_frame")},
-        "unit": quantity(placed.unit, "object units per unit of the networks"),
-        **map_quantities(depth, consistency, measured),
-        "residual_each_map_aligned": quantity(residual_at_checks(align_maps(placed.depth, measured, 0), measured), "1"),
-    }

@@ -9,65 +9,36 @@ from torch import Tensor
 from scenefuse.core.stage import quantity
 from scenefuse.nerf.prior.inputs import DepthPhotos
 from scenefuse.nerf.prior.monodepth import inside, points_in_cam, project, sample
+from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT
 from scenefuse.nerf.prior.train_depth import residual_at_checks
 
 Content = dict[str, Any]
 
-# Difference between views at which agreement falls to 60 %, share of the object's diagonal.
-TOLERANCE = 0.01
-# Beyond so many tolerances, or standard deviations of two maps' difference, depths are of different surfaces.
+# Depths that differ by more standard deviations are of different surfaces.
 MAX_DEVIATIONS = 3.0
-# Where two maps differ, one is kept if its variance is smaller by this factor.
-VARIANCE_RATIO = 4.0
-# Standard deviation that no map is better than, in tolerances of consistency.
-MIN_DEVIATION = 0.3
-
-
-@dataclass(frozen=True)
-class ViewConsistency:
-    """How well a set of depth maps agrees with itself across views.
-
-    Attributes:
-        confidence: (V, 1, H, W) 0..1, 0 off the object.
-        variance: (V, 1, H, W) mean squared disagreement in depth, object units squared; infinite where no view agrees.
-    """
-
-    confidence: Tensor
-    variance: Tensor
 
 
 @torch.no_grad()
-def consistency_between_views(depth: Tensor, photos: DepthPhotos) -> ViewConsistency:
-    """Forward-backward consistency of each depth map with those of its source views.
+def variance_between_views(depth: Tensor, photos: DepthPhotos) -> Tensor:
+    """(V, 1, H, W) mean squared difference from the depths of source views, object units squared.
 
-    A source view agrees by exp(-(e / tolerance)^2 / 2), where e is the depth that came back minus the depth. A view
-    that sees something nearer does not count, because the point is occluded there; one that sees past the point counts
-    with 0. The confidence is the mean over the views that count, at least two.
+    Infinite where no source view agrees within MAX_DEVIATIONS times the difference that other depth maps may have, and
+    off the object. The square of this difference is added: no depth is better known.
 
     Args:
         depth: (V, 1, H, W), 0 where there is none.
         photos: the photos; their sources are the views compared with.
     """
-    depth, tolerance = depth * photos.masks, TOLERANCE * photos.diagonal
-    confidence, variance = torch.zeros_like(depth), torch.full_like(depth, torch.inf)
-    for view in range(len(depth)):
-        sources = photos.sources[view]
+    depth, tolerance = depth * photos.masks, MAP_AGREEMENT * photos.diagonal
+    variance = torch.full_like(depth, torch.inf)
+    for view, sources in enumerate(photos.sources):
         moves = photos.source_from_target(torch.full_like(sources, view), sources)
-        difference, seen = reprojection_differences(
-            depth[view : view + 1],
-            depth[sources],
-            moves,
-            photos.intrinsics[view : view + 1],
-            photos.intrinsics[sources],
-        )
-        counted = seen & (difference > -MAX_DEVIATIONS * tolerance)
-        votes = torch.exp(-0.5 * (difference / tolerance) ** 2) * counted
-        confidence[view, 0] = votes.sum(0) / counted.sum(0).clamp_min(2)
-        close = counted & (difference.abs() < MAX_DEVIATIONS * tolerance)
-        number = close.sum(0)
-        mean_square = (difference**2 * close).sum(0) / number.clamp_min(1)
-        variance[view, 0] = torch.where(number > 0, mean_square, torch.full_like(mean_square, torch.inf))
-    return ViewConsistency(confidence * (depth > 0), variance)
+        cameras = photos.intrinsics[view : view + 1], photos.intrinsics[sources]
+        difference, seen = reprojection_differences(depth[view : view + 1], depth[sources], moves, *cameras)
+        close = seen & (difference.abs() < MAX_DEVIATIONS * tolerance)
+        mean_square = (difference**2 * close).sum(0) / close.sum(0)
+        variance[view, 0] = torch.where(close.any(0), mean_square + tolerance**2, torch.inf)
+    return variance
 
 
 @dataclass(frozen=True)
@@ -86,56 +57,35 @@ class Blend:
 
 
 def blend_depths(predicted: Tensor, rendered: Tensor, photos: DepthPhotos) -> Blend:
-    """Blend two sets of (V, 1, H, W) depth maps, each weighted by its consistency between views."""
-    floor = MIN_DEVIATION * TOLERANCE * photos.diagonal
-    own, other = (consistency_between_views(depth, photos).variance for depth in (predicted, rendered))
-    depth, variance, blended = fuse_by_inverse_variance(predicted, rendered, own, other, floor)
-    depth = depth * photos.masks
-    weight = torch.where(depth > 0, floor**2 / variance, torch.zeros_like(depth)).clamp(0.0, 1.0)
-    area, on_object = photos.masks.sum().clamp_min(1), photos.masks > 0
-    shares = {
-        "accepted_share": float((depth > 0).sum() / area),
-        "blended_share": float((blended & on_object).sum() / area),
-        "rendered_share": float((rendered > 0).sum() / area),
-    }
-    return Blend(depth, weight, shares)
+    """Blend two sets of (V, 1, H, W) depth maps, each weighted by its agreement between views."""
+    variances = [variance_between_views(depth, photos) for depth in (predicted, rendered)]
+    depth, variance = fuse_by_inverse_variance(predicted, rendered, *variances)
+    weight = ((MAP_AGREEMENT * photos.diagonal) ** 2 / variance).clamp(0.0, 1.0)
+    both = (depth > 0) & torch.isfinite(variances[0]) & torch.isfinite(variances[1])
+    counted = {"accepted_share": depth > 0, "blended_share": both, "rendered_share": rendered > 0}
+    area = photos.masks.sum().clamp_min(1)
+    return Blend(depth, weight, {name: float(where.sum() / area) for name, where in counted.items()})
 
 
-def fuse_by_inverse_variance(
-    first: Tensor, second: Tensor, first_variance: Tensor, second_variance: Tensor, floor: float
-) -> tuple[Tensor, Tensor, Tensor]:
+def fuse_by_inverse_variance(first: Tensor, second: Tensor, *variances: Tensor) -> tuple[Tensor, Tensor]:
     """Blend two depth maps of the same view by inverse variance (after AltNeRF; method N12).
 
-    Where both have a finite variance and differ by less than three standard deviations of their difference, the
-    result is their mean weighted by 1 / variance. Where they differ by more, or only one has a variance, the pixel
-    keeps the map with the smaller variance if that is at least four times smaller; otherwise it keeps none.
+    A map without a variance has no weight. Where both have one and differ by more than three standard deviations of
+    their difference, neither is accepted.
 
     Args:
         first: (V, 1, H, W) depth, 0 where there is none.
         second: the other.
-        first_variance: (V, 1, H, W) squared units, infinite where no other view agrees.
-        second_variance: the other's.
-        floor: standard deviation that no map is better than, object units.
+        variances: of either, squared units, infinite where no other view agrees.
 
     Returns:
-        (V, 1, H, W) fused depth, 0 where rejected; its variance, infinite where rejected; bool, True where blended.
+        (V, 1, H, W) fused depth, 0 where rejected, and its variance, infinite where rejected.
     """
-    a = torch.where(first > 0, first_variance + floor**2, torch.inf)
-    b = torch.where(second > 0, second_variance + floor**2, torch.inf)
-    both = torch.isfinite(a) & torch.isfinite(b)
-    blended = both & ((first - second) ** 2 < MAX_DEVIATIONS**2 * (a + b))
-    weight_a, weight_b = 1.0 / a, 1.0 / b
-    total = (weight_a + weight_b).clamp_min(1e-30)
-    mean = (first * weight_a + second * weight_b) / total
-    only_a, only_b = (
-        ~blended & (VARIANCE_RATIO * a <= b) & torch.isfinite(a),
-        ~blended & (VARIANCE_RATIO * b <= a) & torch.isfinite(b),
-    )
-    nothing = torch.zeros_like(first)
-    depth = torch.where(blended, mean, torch.where(only_a, first, torch.where(only_b, second, nothing)))
-    infinite = torch.full_like(first, torch.inf)
-    variance = torch.where(blended, 1.0 / total, torch.where(only_a, a, torch.where(only_b, b, infinite)))
-    return depth, variance, blended
+    a, b = variances
+    rejected = (first - second) ** 2 >= MAX_DEVIATIONS**2 * (a + b)
+    weight = torch.where(rejected, 0.0, 1 / a + 1 / b)
+    mean = (first / a + second / b) / weight
+    return torch.where(weight > 0, mean, 0.0), 1 / weight
 
 
 def reprojection_differences(
@@ -166,21 +116,10 @@ def reprojection_differences(
     return (returned - depth.view(1, -1)).view(count, height, width), seen.view(count, height, width)
 
 
-def map_quantities(depth: Tensor, consistency: ViewConsistency, photos: DepthPhotos) -> Content:
-    """Residual at SfM points, share of the object's pixels that other views confirm, and the typical disagreement."""
-    on_object = photos.masks > 0
-    confirmed = consistency.confidence[on_object] > 0.5
-    finite = consistency.variance[on_object & torch.isfinite(consistency.variance)]
-    disagreement = float(finite.sqrt().median() / photos.diagonal) if len(finite) else None
+def map_quantities(depth: Tensor, photos: DepthPhotos) -> Content:
+    """Residual at SfM points, and the share of the object's pixels with which another view agrees."""
+    agrees = torch.isfinite(variance_between_views(depth, photos))
     return {
         "residual_after_alignment": quantity(residual_at_checks(depth, photos), "1"),
-        "consistent_share": quantity(float(confirmed.float().mean()) if len(confirmed) else 0.0, "1"),
-        "disagreement_over_diagonal": quantity(disagreement, "1"),
+        "consistent_share": quantity(float(agrees.sum() / photos.masks.sum().clamp_min(1)), "1"),
     }
-
-
-def print_quality(content: Content) -> None:
-    """One line for the log."""
-    residual, share = content["residual_after_alignment"]["value"], content["consistent_share"]["value"]
-    known = "no SfM points to check" if residual is None else f"median residual at SfM points {100 * residual:.2f} %"
-    print(f"depth maps written: {known}, {100 * share:.0f} % of the object confirmed by other views", flush=True)

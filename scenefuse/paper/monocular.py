@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
+from scenefuse.core.checkpoints import State
 from scenefuse.core.stage import StageError, quantity, setting
 from scenefuse.core.transforms import Array, rotation_angle_deg
 from scenefuse.nerf.prior.inputs import DepthPhotos
@@ -79,34 +80,31 @@ class Networks:
         """Both by name."""
         return {"depth": self.depth, "pose": self.pose}
 
-    def load(self, state: dict[str, Any]) -> None:
-        """Take the weights of `state`."""
-        for name, network in self.parts().items():
-            network.load_state_dict(state[name])
+    def state(self) -> State:
+        """The weights of both by name."""
+        return {name: network.state_dict() for name, network in self.parts().items()}
 
 
-def save_networks(path: Path, networks: Networks, settings: dict[str, Any]) -> None:
-    """What stage 3 continues from."""
-    weights = {name: network.state_dict() for name, network in networks.parts().items()}
-    torch.save(weights | {"settings": settings}, path)
+def save_networks(path: Path, networks: Networks, width_px: int, unit: float) -> None:
+    """What stage 3 continues from: the networks, the width of their frames, object units per unit of theirs."""
+    torch.save(networks.state() | {"width_px": width_px, "unit": unit}, path)
 
 
-def load_networks(path: Path) -> dict[str, Any]:
-    """What `save_networks` wrote: `depth` and `pose` for `Networks.load`, and `settings`.
+def load_networks(path: Path, device: torch.device) -> tuple[Networks, int, float]:
+    """What `save_networks` wrote.
 
     Raises:
-        StageError: the file is missing or holds something else.
+        StageError: the file is missing or damaged.
     """
-    if not path.is_file():
-        raise StageError(f"{path} does not exist; run stage 1 first")
+    networks = new_monocular_networks(device)
     try:
-        state = torch.load(path, map_location="cpu", weights_only=True)
+        saved = torch.load(path, map_location=device, weights_only=True)
+        for name, network in networks.parts().items():
+            network.load_state_dict(saved[name])
+        return networks, saved["width_px"], saved["unit"]
     except Exception as error:  # a truncated file raises any of half a dozen
         why = " ".join(str(error).split())[:200]
-        raise StageError(f"{path} cannot be read ({why}); delete it and run stage 1 again") from None
-    if not {"depth", "pose", "settings"} <= set(state):
-        raise StageError(f"{path} holds no networks of stage 1; delete it and run stage 1 again")
-    return state
+        raise StageError(f"{path} cannot be read ({why}); delete its folder and run stage 1 again") from None
 
 
 @torch.no_grad()
@@ -165,9 +163,9 @@ class MonocularSettings:
     """Width of the frames, pixels."""
 
 
-def recipe_of(settings: MonocularSettings) -> Recipe:
+def recipe_of(epochs: int) -> Recipe:
     """The paper's batches and warm-up, which are the shipped ones, and its last batches, which hold the rest."""
-    return Recipe(settings.epochs, even=False)
+    return Recipe(epochs, even=False)
 
 
 def frames_of(views: Views, device: torch.device) -> DepthPhotos:

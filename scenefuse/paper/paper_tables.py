@@ -136,22 +136,16 @@ def column_of(item: ObjectSummary) -> Column:
 
 def _told(item: ObjectSummary) -> str:
     """Of a run of the paper's recipe: whose poses it went on with, what it drew of the paper's rays, and its prior."""
-    fields = item.stages
-    source = find(fields, "stage1.pose_source")
-    said = {"chain": "poses are the pose network's, chained", "sfm": "poses are SfM's"}.get(str(source), "")
-    own, papers = (
-        (find(fields, f"stage2.rays_per_epoch{name}"), find(fields, f"stage2.seconds_estimated{name}"))
-        for name in ("", "_paper")
-    )
-    if None not in own + papers:
-        said += (
-            f"; stages 2 and 4 draw {own[0]} rays an epoch ({own[1]:.0f} s a stage, estimated before), where every"
-            f" pixel of the object once is {papers[0]} ({papers[1]:.0f} s)"
-        )
-    if find(fields, "stage2.field_is_the_papers") is False:
-        said += ", in a smaller field than the paper's"
-    prior = find(fields, "stage2.prior_confident_share")
-    return said + (f"; stage 2 has a depth for {100 * prior:.0f} % of the masks" if said and prior is not None else "")
+    said = {
+        "stage1.pose_source": "stages 2 to 4 have the poses of: {}",
+        "stage2.rays_per_epoch": "rays an epoch in stages 2 and 4: {}",
+        "stage2.rays_per_epoch_paper": "every pixel of the object once: {}",
+        "stage2.field_is_the_papers": "the paper's field: {}",
+        "stage2.prior_confident_share": "share of the masks with a depth in stage 2: {:.2f}",
+    }
+    if find(item.stages, "stage1.pose_source") is None:
+        return ""
+    return "; ".join(text.format(find(item.stages, key)) for key, text in said.items() if key in item.stages)
 
 
 def without(reason: str) -> Column:

@@ -1,39 +1,19 @@
 """Stage 3 by the paper: depth rendered by the NeRF, fused with stage 1's, refines the depth and the pose network."""
 
-import time
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from scenefuse.core.checkpoints import key_of
-from scenefuse.core.stage import StageError, quantity, write_json
-from scenefuse.core.transforms import Array
+from scenefuse.core.stage import StageError, quantity
 from scenefuse.nerf.prior.refine_depth import read_stage_maps
-from scenefuse.nerf.prior.training import loss_quantities, optimise, predict, prepare_torch
+from scenefuse.nerf.prior.training import prepare_torch
 from scenefuse.nerf.train_object_nerf import MIN_CONFIDENCE
-from scenefuse.paper.estimate_as_paper import (
-    PoseSource,
-    StageOutputs,
-    chained,
-    in_unit,
-    photos_at,
-    place,
-    write_stage,
-)
-from scenefuse.paper.fused_depth import blend_depths, print_quality
-from scenefuse.paper.monocular import (
-    MonocularSettings,
-    frames_of,
-    load_networks,
-    monocular_losses,
-    new_monocular_networks,
-    pose_quantities,
-    recipe_of,
-    supervision_of,
-)
+from scenefuse.paper.estimate_as_paper import PoseSource, Stage, StageOutputs, photos_at
+from scenefuse.paper.fused_depth import blend_depths
+from scenefuse.paper.monocular import MonocularSettings, frames_of, load_networks, supervision_of
 from scenefuse.photos.views import Views, load_views
 
 
@@ -81,37 +61,15 @@ def refine_as_paper(
     Raises:
         StageError: stage 1's folder holds no networks, stage 2's no depth map of any photo, or as in stage 1.
     """
-    start = time.monotonic()
     device = prepare_torch(seed)
-    state = load_networks(earlier.previous / "networks.pt")
-    unit = state["settings"]["unit"]
-    views = load_views(workspace, masks, state["settings"]["width_px"], hold_out_every)
-    used = load_views(poses, masks, state["settings"]["width_px"], hold_out_every).object_from_cam
-    frames, networks = frames_of(views, device), new_monocular_networks(device)
-    networks.load(state)
-    before = chained(networks.pose, frames)
-    predicted, rendered = _depths(earlier, views, device)
-    blend = blend_depths(predicted, rendered, photos_at(used, views, frames))
-    supervision, recipe = supervision_of(frames, blend.depth / unit, blend.weight), recipe_of(settings)
-    key = key_of("paper, stage 3", recipe, seed, frames, supervision, state)
-    checkpoint = checkpoints / key / "state.pt"
-    objective = monocular_losses(networks, frames, supervision, recipe)
-    losses = optimise(networks.parts(), frames, objective, recipe, checkpoint, seed)
-    raw = predict(networks.depth, frames, supervision.colors, supervision.first)
-    placed = place(raw, networks, frames, views, pose_source, seed)
-    settings = replace(settings, width_px=views.images.shape[2])
-    content = {
-        **{name: quantity(share, "1") for name, share in blend.shares.items()},
-        "steps": quantity(recipe.steps(frames), "1"),
-        "chain_moved_over_extent": quantity(shift_over_extent(before, placed.chain), "1"),
-        **write_stage(outputs, workspace, views, networks, placed, settings, pose_source),
-        **loss_quantities(losses),
-        **pose_quantities(networks.pose, frames, in_unit(views.object_from_cam, placed.unit)),
-    }
-    write_json(outputs.report, content | {"seconds": quantity(round(time.monotonic() - start, 1), "s")})
-    checkpoint.unlink(missing_ok=True)
-    print(f"accepted {100 * blend.shares['accepted_share']:.0f} % of the object's pixels", flush=True)
-    print_quality(content)
+    networks, width_px, unit = load_networks(earlier.previous / "networks.pt", device)
+    views, used = (load_views(folder, masks, width_px, hold_out_every) for folder in (workspace, poses))
+    frames = frames_of(views, device)
+    blend = blend_depths(*_depths(earlier, views, device), photos_at(used.object_from_cam, views, frames))
+    print(f"accepted {blend.shares['accepted_share']:.0%} of the object's pixels", flush=True)
+    content = {name: quantity(share, "1") for name, share in blend.shares.items()}
+    stage = Stage(workspace, outputs, checkpoints, views, frames, pose_source, seed)
+    stage.run(networks, supervision_of(frames, blend.depth / unit, blend.weight), settings.epochs, content)
 
 
 def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -123,9 +81,3 @@ def _depths(earlier: EarlierStages, views: Views, device: torch.device) -> tuple
     found = read_stage_maps(earlier.previous / "depth_maps", views), rendered * confident * views.masks
     predicted, kept = (torch.from_numpy(maps.astype(np.float32))[:, None].to(device) for maps in found)
     return predicted, kept
-
-
-def shift_over_extent(before: Array, after: Array) -> float:
-    """Root mean square shift of the centres of poses (V, 4, 4), as a share of their extent."""
-    extent = max(float(np.linalg.norm(np.ptp(before[:, :3, 3], axis=0))), 1e-9)
-    return float(np.sqrt(((after - before)[:, :3, 3] ** 2).sum(1).mean()) / extent)

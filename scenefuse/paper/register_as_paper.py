@@ -29,6 +29,7 @@ from scenefuse.core.stage import quantity, write_json
 from scenefuse.core.transforms import Array, Sim3, fit_sim3
 from scenefuse.geometry.alignment_picture import draw_alignment
 from scenefuse.geometry.icp import ScaleRange
+from scenefuse.geometry.ransac import triples_of_one_scale
 from scenefuse.register.coarse import COARSE_POINTS, coarse_quantities
 from scenefuse.register.decision import FineSettings, tilt_deg
 from scenefuse.register.fine import ledger_row, pose_quantities
@@ -42,17 +43,16 @@ VOXEL_FRACTION = 0.04
 # Neighbourhoods, in voxels, and their most points: normals, features.
 NORMAL_RADIUS, NORMAL_NEIGHBOURS = 2, 30
 FEATURE_RADIUS, FEATURE_NEIGHBOURS = 5, 100
-# RANSAC: triples, the least ratio of matched edges' lengths; the paper's inlier distance in voxels.
-RANSAC_POINTS, EDGE_LENGTH, RANSAC_DISTANCE = 3, 0.9, 1.5
+# RANSAC: the least ratio of matched edges' lengths; the paper's inlier distance in voxels.
+EDGE_LENGTH, RANSAC_DISTANCE = 0.9, 1.5
 # The paper's samples; the confidence in place of its 500.
 RANSAC_SAMPLES, CONFIDENCE = 4_000_000, 0.999
 # ICP: the paper's pairing distance in voxels; the spacing in voxels; the paper's iterations.
 ICP_DISTANCE, ICP_SPACING, ICP_ITERATIONS = 0.4, 0.5, 35
 # Open3D leaves mutual filtering out when fewer than this share of the points have a mutual match.
 MIN_MUTUAL_SHARE = 0.1
-# How much the sizes of object and crop, which is cut to it, may differ: matches that are wrong shrink the object into a
-# spot. Triples that are drawn at once.
-MAX_SCALE_FACTOR, TRIPLES_AT_ONCE = 2.0, 1 << 14
+# How much the sizes of object and crop, which is cut to it, may differ.
+MAX_SCALE_FACTOR = 2.0
 
 
 def register_as_paper(
@@ -152,7 +152,7 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
     agree = agreeing(*matched, RANSAC_DISTANCE * VOXEL_FRACTION, seed)
     said = f"{agree.sum()} of {len(pairs)} mutual matches agree"
     print(said, flush=True)
-    if agree.sum() < RANSAC_POINTS:
+    if agree.sum() < 3:
         return None, [f"{said}, too few: the scale is the RMS ratio of the whole clouds"]
     ratio = rms(matched[1][agree]) / rms(matched[0][agree])
     return ratio * scene.diagonal / cloud.diagonal, [said]
@@ -161,33 +161,22 @@ def matched_scale(cloud: Cloud, scene: Cloud, seed: int) -> tuple[float | None, 
 def agreeing(source: Array, target: Array, distance: float, seed: int) -> NDArray[np.bool_]:
     """Which matches (N, 3) and (N, 3) a similarity explains within `distance`: the most that RANSAC finds.
 
-    Triples of different matches, on either side as in space, of which every edge is by the same factor longer or
-    shorter than its match, but for the ratio that Open3D asks of edges, and by a factor of `MAX_SCALE_FACTOR` at most:
-    a similarity that shrinks the object into a spot explains everything.
+    Triples agree on one scale as Open3D asks it of edges, and it is within a factor of `MAX_SCALE_FACTOR` of 1: a
+    similarity that shrinks the object into a spot explains everything.
     """
     best = np.zeros(len(source), dtype=bool)
-    if len(source) < RANSAC_POINTS:
-        return best
-    rng, drawn, wanted = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES)
-    while drawn < wanted:
-        triples = rng.integers(0, len(source), (TRIPLES_AT_ONCE, RANSAC_POINTS))
-        drawn += TRIPLES_AT_ONCE
-        a, b = source[triples], target[triples]
-        edges = [np.linalg.norm(side - np.roll(side, 1, axis=1), axis=2) for side in (a, b)]
-        with np.errstate(divide="ignore", invalid="ignore"):
-            factor = edges[1] / edges[0]
-            alike = factor.min(1) / factor.max(1) >= EDGE_LENGTH  # not so where an edge has no length
-        likely = alike & (factor.min(1) > 1 / MAX_SCALE_FACTOR) & (factor.max(1) < MAX_SCALE_FACTOR)
-        for one, other in zip(a[likely], b[likely]):
+    rng, drawn, wanted, at_once = np.random.default_rng(seed), 0, float(RANSAC_SAMPLES), 1 << 14
+    while len(source) and drawn < wanted:
+        triples, drawn = triples_of_one_scale(source, target, at_once, EDGE_LENGTH, rng), drawn + at_once
+        for rows in triples.rows[np.abs(np.log(triples.scale)) < np.log(MAX_SCALE_FACTOR)]:
             try:
-                pose = fit_sim3(one, other)
+                pose = fit_sim3(source[rows], target[rows])
             except ValueError:  # along one line
                 continue
             found = np.linalg.norm(pose.apply(source) - target, axis=1) <= distance
             if found.sum() > best.sum():
                 best = found
-                enough = np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** RANSAC_POINTS, CONFIDENCE))
-                wanted = min(enough, RANSAC_SAMPLES)
+                wanted = min(RANSAC_SAMPLES, np.log(1 - CONFIDENCE) / np.log1p(-min(found.mean() ** 3, CONFIDENCE)))
     return best
 
 
@@ -234,7 +223,7 @@ def _ransac(clouds: tuple[Any, Any], features: tuple[Any, Any], distance: float,
             True,
             distance,
             registration.TransformationEstimationPointToPoint(False),
-            RANSAC_POINTS,
+            3,
             checks,
             registration.RANSACConvergenceCriteria(RANSAC_SAMPLES, CONFIDENCE),
         )

@@ -5,7 +5,6 @@ docs/paper.md lists which is which. How long stages are is a setting; in config/
 a NeRF's training the paper adds the order of depths, and longer steps of the hash grid at edges.
 """
 
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -16,12 +15,12 @@ from torch import Tensor
 from scenefuse.core.stage import quantity, read_json, write_json
 from scenefuse.nerf.encoding import encode
 from scenefuse.nerf.field import Field, FieldSettings
-from scenefuse.nerf.losses import SOLID_OPACITY, LossWeights
+from scenefuse.nerf.losses import DEPTH_DELTA, SOLID_OPACITY, LossWeights
 from scenefuse.nerf.prior.training import LEARNING_RATE, Recipe
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.rendered_maps import DEPTH_JUMP
 from scenefuse.nerf.train_object_nerf import NerfInputs, NerfSettings, prepare_device, train_stage
-from scenefuse.nerf.training import Nerf, NerfRecipe, Rendered, Schedule
+from scenefuse.nerf.training import OCCUPANCY_EVERY, Nerf, NerfRecipe, Rendered, Schedule
 from scenefuse.photos.views import load_views
 
 # Batches, warm-up and rate are the depth network's. The paper has neither samples near the prior, nor turned rays, nor
@@ -43,14 +42,14 @@ LOSSES = LossWeights(distortion_weight=0.0)
 FIELD = FieldSettings(levels=16, log2_table=19, finest=2048, width=64)
 # The paper gives no weight of its loss of relative depth.
 RANK_WEIGHT = 0.02
-# Pixels of a pair lie apart by this share of the photo's width (method N3), and their depths by this, in nerf units.
-MIN_APART, RANK_MARGIN = 0.02, 0.02
+# Pixels of a pair lie apart by this share of the photo's width (method N3).
+MIN_APART = 0.02
+# Their depths differ by this, in nerf units: twice what the loss of absolute depth takes for noise.
+RANK_MARGIN = 2 * DEPTH_DELTA
 # Rows of the fine levels that show nothing but edges take steps 1 + this times as long (method N9).
 EDGE_RATE = 1.0
-# Steps between looks at which rows show edges.
-EDGES_EVERY = 4
-# Half-width of the zone around mask edges and depth jumps that counts as an edge.
-EDGE_PX = 3
+# Half-width of the zone around mask edges and depth jumps that counts as an edge: rays are drawn beyond the band.
+EDGE_PX = NERF.mask_band_px + 1
 
 
 class OrderAndEdges:
@@ -84,9 +83,9 @@ class OrderAndEdges:
         self.edges = dilate(border | depth_jumps(photos.depths), EDGE_PX).float().to(device)
 
     def losses(self, rendered: Rendered, nerf: Nerf) -> dict[str, Tensor]:
-        """The loss of order; every few steps, edges are counted as well."""
+        """The loss of order; edges are counted whenever the occupancy is updated."""
         rays, ray, seen = rendered.rays, rendered.drawn.ray, rendered.seen
-        if rendered.step % EDGES_EVERY == 0:
+        if rendered.step % OCCUPANCY_EVERY == 0:
             self._count(rendered, nerf.field)
         nothing = torch.zeros_like(rays.length)
         distance, opacity = (nothing.index_put((ray,), part) for part in (seen.distance, seen.opacity))
@@ -178,7 +177,7 @@ def train_nerf_as_paper(
 
     Constants are those of `recipe`. An epoch of the paper shows every pixel of the object in every training photo once.
     On a GPU that is what is drawn, with the paper's field; on a CPU it is `rays_per_epoch`, with the field of the
-    settings, and what the paper's would take is said before and in the report.
+    settings; log and report say how many the paper's are.
 
     Args:
         workspace: undistorted COLMAP workspace of the object, with the poses of the stage before.
@@ -197,22 +196,13 @@ def train_nerf_as_paper(
     device = prepare_device(settings.device)
     letter = rays_of_an_epoch(workspace, masks, settings.width_px, hold_out_every)
     drawn = as_paper(settings, letter, device)
-    budgets = {"paper": (FIELD, letter), "drawn": (drawn.field, drawn.schedule.rays_per_epoch)}
-    epochs = settings.schedule.epochs
-    seconds = {name: epochs * rays * seconds_per_ray(field, device) for name, (field, rays) in budgets.items()}
-    print(
-        f"the paper's {epochs} epochs of {letter} rays would take about {seconds['paper']:.0f} s on this {device}; "
-        f"{drawn.schedule.rays_per_epoch} rays an epoch are drawn: about {seconds['drawn']:.0f} s",
-        flush=True,
-    )
+    print(f"{drawn.schedule.rays_per_epoch} rays an epoch are drawn, of the paper's {letter}", flush=True)
     train_stage(
         NerfInputs(workspace, masks, prior), stage, report, checkpoints, drawn, hold_out_every, seed, order_and_edges
     )
     content = read_json(report) | {
         "rays_per_epoch": quantity(drawn.schedule.rays_per_epoch, "1"),
         "rays_per_epoch_paper": quantity(letter, "1"),
-        "seconds_estimated": quantity(round(seconds["drawn"], 1), "s"),
-        "seconds_estimated_paper": quantity(round(seconds["paper"], 1), "s"),
         "field_is_the_papers": quantity(drawn.field == FIELD, ""),
     }
     write_json(report, content)
@@ -236,17 +226,3 @@ def rays_of_an_epoch(workspace: Path, masks: Path, width_px: int, hold_out_every
     """Pixels of the object in all training photos."""
     views = load_views(workspace, masks, width_px, hold_out_every)
     return int(views.masks[~views.held_out].sum())
-
-
-def seconds_per_ray(settings: FieldSettings, device: str) -> float:
-    """Seconds that training takes for a ray, by the field's own part of it: a quick measurement, an estimate."""
-    field = Field(settings, torch.Generator().manual_seed(0)).to(device)
-    rays, samples = 1 << 12, (NERF.samples_first + 3 * NERF.samples_last) / 4
-    x = torch.rand(16 * rays, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    for _ in range(2):  # the first compiles
-        start = time.perf_counter()
-        density, features = field.geometry(x)
-        (density.mean() + field.color(features, x[:rays]).mean()).backward()
-        float(field.table.grad.sum())  # type: ignore[union-attr]  # waits for a GPU
-        seconds = time.perf_counter() - start
-    return seconds * samples / len(x)

@@ -74,7 +74,7 @@ class Segmenter:
 
         The weights are fetched, as the workflow would, where nothing has tried that yet.
         """
-        from scenefuse.masks.grabcut import query_grabcut
+        from scenefuse.masks.grabcut_passes import query_grabcut
 
         settings = self._settings
         with self._busy:

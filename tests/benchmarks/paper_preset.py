@@ -126,8 +126,6 @@ def of_stages(folder: Path, known: ObjectTruth | None) -> dict[str, Any]:
     for number in sorted(reports.keys() & {2, 4}):
         rows[f"held-out PSNR, stage {number} (dB)"] = value(reports[number], "psnr_held_out")
         rows[f"rays, stage {number} (million)"] = _rays(reports[number]) / 1e6
-        if "seconds_estimated_paper" in reports[number]:
-            rows[f"seconds of the paper's rays, stage {number}"] = value(reports[number], "seconds_estimated_paper")
     return rows
 
 

@@ -12,7 +12,8 @@ from scenefuse.core.stage import StageError
 from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.clicks import Click, Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks
-from scenefuse.masks.grabcut import along_edges, grow_seeds, query_grabcut
+from scenefuse.masks.grabcut import along_edges, grow_seeds
+from scenefuse.masks.grabcut_passes import query_grabcut
 from scenefuse.masks.parts import with_parts
 from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.prompts import NO_PIXELS, Prompts, far_apart

@@ -20,7 +20,9 @@ from scenefuse.marks.clicks import read_points
 from scenefuse.marks.triangulation import marked_size
 from scenefuse.masks import make_masks as masks_module
 from scenefuse.masks.algebra import kept_part, mask_folders
-from scenefuse.masks.grabcut import cleaned, second_trimap, stamp
+from scenefuse.masks.box import find_ground, upright_box
+from scenefuse.masks.grabcut import cleaned, second_trimap
+from scenefuse.masks.grabcut_passes import stamp
 from scenefuse.masks.make_masks import MaskInputs, make_masks
 from scenefuse.masks.prompted import masks_from_prompts
 from scenefuse.masks.sam2 import Sam2Transformers, check_weights, segment
@@ -32,7 +34,7 @@ from scenefuse.masks.sam2_weights import (
     why_unavailable,
 )
 from scenefuse.masks.segmentation import MaskSettings
-from scenefuse.masks.target import find_ground, target_from_points, upright_box
+from scenefuse.masks.target import target_from_points
 from scenefuse.photos.pictures import read_rgb
 from scenefuse.photos.workspace import View, Workspace, read_model, read_workspace
 

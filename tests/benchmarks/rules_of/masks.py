@@ -159,8 +159,8 @@ RULES = [
     Rule("outlines move to edges", f"{M}.segmentation.along_edges", _mask_as_it_is(1)),
     Rule("gaps by their colours", f"{M}.grabcut.PINHOLE_SHARE", _never),
     Rule("masks trusted by a tolerant hull", f"{M}.segmentation.MAX_WRONG_UNTRUSTED_SHARE", lambda _: 0.0),
-    Rule("seeds grow along even colours", f"{M}.grabcut.grow_seeds", lambda _: lambda *__: None),
+    Rule("seeds grow along even colours", f"{M}.grabcut_passes.grow_seeds", lambda _: lambda *__: None),
     Rule("close prompts enclose a part", f"{M}.target.MAX_PART_EDGE_SHARE", lambda _: 0.0),
-    Rule("clicked specks stay", f"{M}.grabcut.prompted_parts", lambda _: lambda mask, *__: mask & False),
+    Rule("clicked specks stay", f"{M}.grabcut_passes.prompted_parts", lambda _: lambda mask, *__: mask & False),
     Rule("clicks on a point may miss by 3 %", f"{M}.prompted.MAX_MISS_SHARE", lambda _: 0.0),
 ]
