@@ -51,7 +51,7 @@ CPU = torch.device("cpu")
 
 
 def test_the_constants_are_the_papers():
-    nerf, depth = nerf_stage.NERF, recipe_of(MonocularSettings(15))
+    nerf, depth = nerf_stage.NERF, recipe_of(15)
     assert (nerf.learning_rate, nerf.grid_learning_rate, training.LEARNING_RATE) == (1e-3, 1e-3, 1e-3)
     assert (nerf.warmup_epochs, depth.warmup_epochs) == (2, 2)
     assert (nerf.images_per_batch, depth.batch_photos, depth.even) == (24, 24, False)
@@ -99,7 +99,7 @@ def test_a_batch_holds_24_frames_and_the_last_one_the_rest(tmp_path):
         return {"photometric": nothing, "smoothness": nothing}
 
     networks = new_monocular_networks(CPU)
-    optimise(networks.parts(), frames, losses, recipe_of(MonocularSettings(2)), tmp_path / "state.pt", 0)
+    optimise(networks.parts(), frames, losses, recipe_of(2), tmp_path / "state.pt", 0)
     assert sizes == [24, 24, 11] * 2  # of 60, one is held out
 
 
@@ -252,7 +252,8 @@ def test_bad_videos_are_one_sentence():
 
 
 def test_fewer_frames_than_a_batch_are_said(capsys):
-    assert few_frames(24) == [] and "23 frames are fewer than the paper's batch" in few_frames(23)[0]
+    assert value(few_frames(24), "notes") == []
+    assert "23 frames are fewer than the paper's batch" in value(few_frames(23), "notes")[0]
     assert "23 frames" in capsys.readouterr().out
 
 
@@ -289,7 +290,7 @@ def ball(tmp_path_factory):
     return root
 
 
-def test_all_stages_run_from_sfm_poses_and_stage_3_refines_both_networks(ball, tmp_path, monkeypatch):
+def test_stages_run_from_sfm_poses_and_stage_3_goes_on_from_the_networks_of_stage_1(ball, tmp_path, monkeypatch):
     # A hash grid learns too little in a test's few steps at the paper's rate.
     fast = replace(nerf_stage.NERF, learning_rate=1e-2, grid_learning_rate=2e-2, rays_per_image=20, occupancy_cells=32)
     monkeypatch.setattr(nerf_stage, "NERF", fast)
@@ -298,36 +299,26 @@ def test_all_stages_run_from_sfm_poses_and_stage_3_refines_both_networks(ball, t
     def outputs(stage, posed):
         return StageOutputs(tmp_path / stage, tmp_path / f"{stage}.json", tmp_path / posed, tmp_path / f"{posed}.json")
 
-    def nerf(stage, prior, posed):
-        field = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
-        settings = NerfSettings(device="cpu", width_px=48, field=field, schedule=Schedule(20, 6000))
-        train_nerf_as_paper(
-            workspace=tmp_path / posed, prior=tmp_path / prior, stage=tmp_path / stage,
-            report=tmp_path / f"{stage}.json", checkpoints=tmp_path / "checkpoints", settings=settings, **given,
-        )  # fmt: skip
-
     common = {"workspace": ball / "undistorted", "pose_source": "sfm", "checkpoints": tmp_path / "checkpoints"}
-    estimate_as_paper(outputs=outputs("stage1", "poses"), settings=MonocularSettings(2), **common, **given)
-    nerf("stage2", "stage1", "poses")
+    estimate_as_paper(outputs=outputs("stage1", "poses"), settings=MonocularSettings(1), **common, **given)
+    field = FieldSettings(levels=6, log2_table=12, coarsest=8, finest=64, width=16)
+    train_nerf_as_paper(
+        workspace=tmp_path / "poses", prior=tmp_path / "stage1", stage=tmp_path / "stage2",
+        report=tmp_path / "stage2.json", checkpoints=tmp_path / "checkpoints",
+        settings=NerfSettings(device="cpu", width_px=48, field=field, schedule=Schedule(10, 6000)), **given,
+    )  # fmt: skip
     refine_as_paper(
         poses=tmp_path / "poses", earlier=EarlierStages(tmp_path / "stage1", tmp_path / "stage2"),
-        outputs=outputs("stage3", "refined_poses"), settings=MonocularSettings(2), **common, **given,
+        outputs=outputs("stage3", "refined_poses"), settings=MonocularSettings(1), **common, **given,
     )  # fmt: skip
-    nerf("stage4", "stage3", "refined_poses")
-    first, refined, last = (read_json(tmp_path / f"{stage}.json") for stage in ("stage1", "stage3", "stage4"))
+    first, nerf, refined = (read_json(tmp_path / f"{stage}.json") for stage in ("stage1", "stage2", "stage3"))
     assert value(first, "pose_source") == value(refined, "pose_source") == "sfm"
     assert "9 frames are fewer" in value(first, "notes")[0] and value(refined, "rendered_share") > 0
-    assert value(refined, "chain_moved_over_extent") > 0
-    refine_as_paper(
-        poses=tmp_path / "poses", earlier=EarlierStages(tmp_path / "stage1", tmp_path / "stage2"),
-        outputs=outputs("none", "none_poses"), settings=MonocularSettings(0), **common, **given,
-    )  # fmt: skip
-    start, before = (load_networks(tmp_path / stage / "networks.pt") for stage in ("none", "stage1"))
-    for name in ("depth", "pose"):  # stage 3 goes on from stage 1
-        assert all(torch.equal(start[name][key], before[name][key]) for key in before[name])
-    before, after = (load_networks(tmp_path / stage / "networks.pt") for stage in ("stage1", "stage3"))
-    for name in ("depth", "pose"):
-        assert any(not torch.equal(before[name][key], after[name][key]) for key in before[name])
-    assert not value(last, "started_from_previous") and not value(last, "field_is_the_papers")
-    assert value(last, "rays_per_epoch_paper") >= value(last, "rays_per_epoch") == 6000
+    assert value(refined, "target_loss_first") > 0 and value(refined, "pose_loss_first") > 0
+    assert not value(nerf, "started_from_previous") and not value(nerf, "field_is_the_papers")
+    assert value(nerf, "rays_per_epoch_paper") >= value(nerf, "rays_per_epoch") == 6000
+    before, after = (load_networks(tmp_path / stage / "networks.pt", CPU)[0] for stage in ("stage1", "stage3"))
+    for name, network in before.parts().items():
+        steps = [float((a - b).abs().max()) for a, b in zip(network.parameters(), after.parts()[name].parameters())]
+        assert 0 < max(steps) < 2 * training.LEARNING_RATE  # one step of Adam
     assert [view.name for view in read_workspace(tmp_path / "refined_poses").views][:2] == ["01.png", "02.png"]
