@@ -1,30 +1,50 @@
 # What the summary reads, the command that writes it, and what is still to be done when a job has failed.
+from scenefuse.report.run_summary import (
+    OBJECT_FILES,
+    REGISTRATION_FILES,
+    SCENE_FILES,
+)
 
 
 def results_of(wildcards):
-    """Everything that the summary reads: what the last stage of each scene and object writes, and the truth where it is known."""
-    ends = [
-        "metrics.json",
-        "fusion.json",
-        "missing.json",
-        "frames.json",
-        *(f"registration/{variant}/metrics.json" for variant in list(VARIANTS)[1:]),
+    """Everything that the summary reads, and the clouds. `all` asks for it too, so that what was deleted is made again."""
+    scenes, objects = {}, {}
+    for name, row in SCENES.items():
+        given = what_is_given(row)
+        chunks = (
+            [f"depth/{chunk}.json" for chunk in CHUNKS] if given == "photos" else []
+        )
+        ends = ["dense.ply", "dense.json", "completed.json", "metrics.json"]
+        scenes[name] = [*SCENE_FILES[given], *chunks, *ends]
+    for name, row in OBJECTS.items():
+        objects[name] = [*OBJECT_FILES[what_is_given(row)], "object.ply"]
+        if name in JOINED:
+            objects[name] += ["evidence.json", "fusion.json", "missing.json"]
+            objects[name] += ["frames.json", "metrics.json"]
+            objects[name] += [
+                f"registration/{variant}/{file}"
+                for variant in VARIANTS
+                for file in REGISTRATION_FILES
+            ]
+            objects[name] += [
+                f"registration/{variant}/metrics.json" for variant in list(VARIANTS)[1:]
+            ]
+    for files, rows in ((scenes, SCENES), (objects, OBJECTS)):
+        for name, row in rows.items():
+            files[name] += ["truth.json"] if row.get("truth") else []
+    return [
+        f"results/{kind}/{name}/{file}"
+        for kind, found in (("scenes", scenes), ("objects", objects))
+        for name, files in found.items()
+        for file in files
     ]
-    scene_ends = ["dense.json", "completed.json", "metrics.json"]
-    files = [f"results/scenes/{name}/{end}" for name in SCENES for end in scene_ends]
-    files += [f"results/objects/{name}/{end}" for name in JOINED for end in ends]
-    files += [f"results/objects/{name}/object.json" for name in LONE]
-    files += [
-        f"results/scenes/{name}/truth.json"
-        for name, row in SCENES.items()
-        if row.get("truth")
-    ]
-    files += [
-        f"results/objects/{name}/truth.json"
-        for name, row in OBJECTS.items()
-        if row.get("truth")
-    ]
-    return files
+
+
+def what_is_given(row):
+    """What of a scene or an object its row gives: photos, cloud, or both."""
+    if not row.get("cloud"):
+        return "photos"
+    return "both" if row.get("photos") else "cloud"
 
 
 def scene_model(wildcards):
@@ -65,6 +85,36 @@ def result_folders(wildcards=None):
             if rows
         }
     )
+
+
+def mark_as_unfinished():
+    """Mark what the jobs of this run made before as incomplete. Each job that ends well removes its marks. What a failed job, a kill
+    or a power cut holds up keeps them, and the next run makes it again: Snakemake itself forgets a failed job, whose
+    parameters it records as if it had ended well, and a missing file alone is no reason to make what follows from it.
+    """
+    for job in workflow.dag.needrun_jobs():
+        if any(Path(output).exists() for output in job.output):
+            workflow.persistence.started(job)
+
+
+def record_failures():
+    """Let the jobs that failed or were stopped run again whatever is asked for next, and remove the marks of those that are not
+    reached by these."""
+    stopped = {
+        job
+        for jobs in workflow.scheduler.failed | workflow.scheduler.running
+        for job in (jobs if jobs.is_group() else [jobs])
+    }
+    for job in stopped:
+        for output in job.output:
+            record = workflow.persistence.metadata(output)
+            if record is not None:
+                record.params = []
+                workflow.persistence._write_record(str(output), record)
+    reached = set(workflow.dag.bfs(workflow.dag.depending, *stopped))
+    for job in set(workflow.dag.needrun_jobs()) - reached:
+        for output in job.output:
+            workflow.persistence._unmark_incomplete(str(output))
 
 
 def held_up(rule):

@@ -237,6 +237,7 @@ rule write_report:
 
 
 onstart:
+    mark_as_unfinished()
     from scenefuse.report.disk import forecast, forecast_note
 
     note = forecast_note(
@@ -254,6 +255,7 @@ onstart:
 
 
 onerror:
+    record_failures()
     stopped = getattr(workflow.scheduler, "_user_kill", None)
     keep_going = workflow.execution_settings.keep_going and not stopped
     for job in held_up("draw_scene") + held_up("complete_scene"):
