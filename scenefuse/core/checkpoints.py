@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from scenefuse.core.stage import StageError, atomic_file
+from scenefuse.core.stage import StageError, atomic_file, stopped_by
 
 # A kill costs half a minute of training at most, and saving takes well under a hundredth of the time.
 SAVE_EVERY_SECONDS = 30.0
@@ -123,7 +123,7 @@ def checkpointed(path: Path | None, state: Callable[[], State]) -> Iterator[Call
             save_checkpoint(path, state())
             saved = time.monotonic()
         if signals:
-            print(f"stopped after step {count}", flush=True)
+            print(f"error: {stopped_by(signals[0])} after step {count}", flush=True)
             sys.exit(128 + signals[0])
 
     with _held_back() as signals:

@@ -19,6 +19,11 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+OUT_OF_MEMORY = (
+    "the memory, or a limit on it (ulimit -v, a container's), is too small; raise the limit, end other programs, or use"
+    " fewer pixels (config/presets/draft.yaml)"
+)
+
 
 class StageError(Exception):
     """Something a person has to mend. The message says what is wrong, where, and what to do."""
@@ -50,10 +55,10 @@ def setting(
 def run(function: Callable[..., Any]) -> None:
     """Run a stage function as a command line built from its signature and docstring.
 
-    A StageError, a full disk or a file that may not be read or written ends in one sentence on stderr and exit status
-    1; a number that the function returns is the exit status. SIGTERM and SIGINT unwind the stack, so that temporary
-    outputs are removed; the process also gets SIGTERM when its parent dies. A log of the workflow, which sets
-    SCENEFUSE, begins with the command, to be pasted.
+    A StageError, a full disk, too little memory or a file that may not be read or written ends in one sentence on
+    stderr and exit status 1; a number that the function returns is the exit status. SIGTERM and SIGINT unwind the
+    stack, so that temporary outputs are removed; the process also gets SIGTERM when its parent dies. A log of the
+    workflow, which sets SCENEFUSE, begins with the command, to be pasted.
     """
     import tyro
 
@@ -67,6 +72,10 @@ def run(function: Callable[..., Any]) -> None:
         status = tyro.cli(function, config=(tyro.conf.FlagConversionOff, tyro.conf.OmitArgPrefixes))
     except StageError as error:
         print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except MemoryError as error:
+        why = f" ({error})" if str(error) else ""
+        print(f"error: {OUT_OF_MEMORY}{why}", file=sys.stderr)
         sys.exit(1)
     except (PermissionError, NotADirectoryError) as error:
         if error.filename is None:
@@ -102,21 +111,25 @@ def atomic_file(path: Path) -> Iterator[Path]:
     _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
     try:
         yield temporary
-        with open(temporary, "rb+") as file:  # Windows syncs only what may be written
-            os.fsync(file.fileno())
+        _sync(temporary)
         os.replace(temporary, path)
+        _sync(path.parent)
     finally:
         _remove_leftovers(path.parent, f".{path.stem}.tmp-", path.suffix)
 
 
 @contextlib.contextmanager
 def atomic_directory(path: Path) -> Iterator[Path]:
-    """Yield an empty temporary directory; on success it replaces `path`, else it is removed."""
+    """Yield an empty temporary directory; on success it is synced and replaces `path`, else it is removed."""
     path = Path(path)
     with scratch_directory(path) as temporary:
         yield temporary
+        for item in (*temporary.rglob("*"), temporary):
+            if not item.is_symlink():
+                _sync(item)
         shutil.rmtree(path, ignore_errors=True)
         os.replace(temporary, path)
+        _sync(path.parent)
 
 
 @contextlib.contextmanager
@@ -131,6 +144,18 @@ def scratch_directory(path: Path) -> Iterator[Path]:
         yield temporary
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _sync(path: Path) -> None:
+    """Write a file, or the names in a folder, to the disk, so that a power cut takes nothing of it."""
+    if path.is_dir() and sys.platform == "win32":
+        return
+    # Windows syncs only what may be written.
+    file = os.open(path, os.O_RDWR if sys.platform == "win32" else os.O_RDONLY)
+    try:
+        os.fsync(file)
+    finally:
+        os.close(file)
 
 
 def _remove_leftovers(folder: Path, start: str, suffix: str = "") -> None:
@@ -207,7 +232,15 @@ def _plain(item: Any) -> Any:
 
 
 def _exit_on_signal(number: int, _frame: Any) -> None:
+    print(f"error: {stopped_by(number)}", file=sys.stderr, flush=True)
     sys.exit(128 + number)
+
+
+def stopped_by(number: int) -> str:
+    """What a stage that a signal ends says."""
+    return (
+        f"stopped by {signal.Signals(number).name} from outside, as Ctrl-C or a time limit sends it; run again to go on"
+    )
 
 
 def _die_with_parent() -> None:

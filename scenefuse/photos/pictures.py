@@ -81,14 +81,7 @@ def write_depth(path: Path, depth: NDArray[np.float32]) -> None:
 
 def read_depth(path: Path) -> NDArray[np.float32]:
     """Read an (H, W) float32 map (depth or confidence); StageError when the file is missing or damaged."""
-    import pycolmap
-
-    depth_map = pycolmap.DepthMap()
-    try:
-        depth_map.read(path)
-    except Exception as error:
-        raise StageError(f"{path} is not a readable COLMAP map ({error}); rerun the stage that writes it") from None
-    return np.array(depth_map.to_array(), dtype=np.float32)
+    return _read_map(path, 1)[..., 0]
 
 
 def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
@@ -105,9 +98,24 @@ def write_normals(path: Path, normals: NDArray[np.float32]) -> None:
 
 def read_normals(path: Path) -> NDArray[np.float32]:
     """Read an (H, W, 3) float32 normal map; StageError when the file is missing or damaged."""
+    return _read_map(path, 3)
+
+
+def _read_map(path: Path, channels: int) -> NDArray[np.float32]:
+    """Read an (H, W, channels) map. COLMAP's own reader takes what a file that is cut short lacks for zeros."""
     try:
-        width, height, channels, values = path.read_bytes().split(b"&", 3)
-        planes = np.frombuffer(values, dtype="<f4").reshape(int(channels), int(height), int(width))
+        width, height, planes, values = path.read_bytes().split(b"&", 3)
+        pixels = np.frombuffer(values, dtype="<f4").reshape(channels, int(height), int(width))
+        if int(planes) != channels:
+            raise ValueError(f"it has {int(planes)} channels, not {channels}")
+    except FileNotFoundError:
+        raise StageError(f"{path} does not exist; {_made_again(path)}") from None
     except (OSError, ValueError) as error:
-        raise StageError(f"{path} is not a readable COLMAP map ({error}); rerun the stage that writes it") from None
-    return np.ascontiguousarray(np.moveaxis(planes, 0, 2), dtype=np.float32)
+        raise StageError(f"{path} is cut short or damaged ({error}); {_made_again(path)}") from None
+    return np.ascontiguousarray(np.moveaxis(pixels, 0, 2), dtype=np.float32)
+
+
+def _made_again(path: Path) -> str:
+    """How to get the maps of a stage again; Snakemake looks at their folder, not into it."""
+    stage = next((folder.parent for folder in path.parents if folder.name.endswith("_maps")), path.parent)
+    return f"delete {stage} and run again"

@@ -304,3 +304,15 @@ def test_errors_are_sentences(workspace, maps, tmp_path):
             **(fusion | {"settings": strict}),
         )
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("kind", ["depth", "normal"])
+def test_a_map_that_is_cut_short_is_an_error_that_names_it_and_its_stage(tmp_path, kind):
+    path = tmp_path / "stage4" / f"{kind}_maps" / "walk/1.png.bin"
+    pixels = np.ones((4, 5), np.float32)
+    write_depth(path, pixels) if kind == "depth" else write_normals(path, np.dstack([pixels] * 3))
+    read = read_depth if kind == "depth" else read_normals
+    assert (read(path) == 1).all()
+    path.write_bytes(path.read_bytes()[:-12])
+    with pytest.raises(StageError, match=rf"{path} is cut short or damaged .*; delete {tmp_path}/stage4 and run again"):
+        read(path)

@@ -95,6 +95,31 @@ def test_a_full_disk_is_one_sentence(tmp_path, monkeypatch, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_too_little_memory_is_one_sentence(monkeypatch, capsys):
+    def stage() -> None:
+        """Take more than there is."""
+        np.zeros(2**60, np.float32)
+
+    monkeypatch.setattr(sys, "argv", ["stage"])
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    with pytest.raises(SystemExit, match="1"):
+        run(stage)
+    said = capsys.readouterr().err
+    assert said.startswith("error: the memory, or a limit on it (ulimit -v") and said.count("\n") == 1
+
+
+def test_what_is_published_was_synced_before_its_name_is_there(tmp_path, monkeypatch):
+    synced = []
+    real = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda f: (synced.append(os.readlink(f"/proc/self/fd/{f}")), real(f)))
+    with atomic_directory(tmp_path / "d") as temporary:
+        (temporary / "maps").mkdir()
+        (temporary / "maps/a.bin").write_bytes(b"a")
+    inside = f"{tmp_path}/{temporary.name}"
+    assert synced[:-1] and set(synced[:-1]) == {inside, f"{inside}/maps", f"{inside}/maps/a.bin"}
+    assert synced[-1] == str(tmp_path)
+
+
 def test_json_holds_values_with_units_and_refuses_nan(tmp_path):
     write_json(tmp_path / "a.json", {"length": quantity(np.float64(1.5), "m"), "point": quantity(np.zeros(3), "m")})
     assert json.loads((tmp_path / "a.json").read_text())["length"] == {"value": 1.5, "unit": "m"}
@@ -128,11 +153,14 @@ def test_an_error_is_one_sentence_a_log_begins_with_the_command_and_a_signal_lea
     assert failed.returncode == 1
     assert failed.stderr == "error: the folder x is empty; give one with photos\n"
     workflow = os.environ | {"SCENEFUSE": str(tmp_path)}
-    process = subprocess.Popen([*command, "False"], stdout=subprocess.PIPE, text=True, env=workflow)
-    assert process.stdout is not None
+    process = subprocess.Popen(
+        [*command, "False"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=workflow
+    )
+    assert process.stdout is not None and process.stderr is not None
     assert process.stdout.readline() == f"python {script} --out {out} --fail False\n"
     assert process.stdout.readline() == "ready\n"
     time.sleep(0.1)
     process.send_signal(signal.SIGTERM)
     assert process.wait(10) == 128 + signal.SIGTERM
+    assert "error: stopped by SIGTERM from outside" in process.stderr.read()
     assert [p.name for p in tmp_path.iterdir()] == ["stage.py"]
