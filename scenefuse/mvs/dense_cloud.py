@@ -86,7 +86,7 @@ def fuse_depth_maps(
     agreed = fused[fused.fields["views"] >= settings.min_photos]
     if len(agreed) == 0:
         raise _no_points(settings)
-    kept = agreed[_near_others(agreed.points)]
+    kept = agreed[near_others(agreed.points)]
     print(f"{len(kept)} points, {len(agreed) - len(kept)} outliers dropped", flush=True)
     measured = sum(int((read_depth(_path(folder, "depth_maps", name)) > 0).sum()) for name, folder in maps.items())
     content = _report(kept, len(agreed) - len(kept), measured, stages, length_unit(georeference_json))
@@ -228,37 +228,14 @@ def _read_visibility(path: Path) -> NDArray[np.uint16]:
     return views
 
 
-def _near_others(points: Array) -> NDArray[np.bool_]:
+def near_others(points: Array) -> NDArray[np.bool_]:
     """(N,) True where a point's neighbours are about as near as they are for the others."""
     if len(points) <= OUTLIER_NEIGHBOURS:
         return np.ones(len(points), dtype=bool)
-    distance = neighbour_distance(points)
-    return distance <= OUTLIER_RATIO * np.median(distance)
-
-
-def neighbour_distance(points: Array) -> Array:
-    """(N,) mean distance of each point's OUTLIER_NEIGHBOURS neighbours.
-
-    Of a large cloud they are looked for slab by slab; infinite where they are too far off to be near others.
-    """
-    if len(points) <= WHOLE:
-        return _mean_distance(points, points, np.inf)
-    axis = int(np.ptp(points, axis=0).argmax())
-    order = np.argsort(points[:, axis], kind="stable")
-    along, found = points[order, axis], np.empty(len(points))
-    few = points[order[:WHOLE]]
-    # Beyond it, the mean of the neighbours alone is more than OUTLIER_RATIO times that of others.
-    reach = 2 * OUTLIER_RATIO * OUTLIER_NEIGHBOURS * float(np.median(_mean_distance(few, few, np.inf)))
+    tree, distance = cKDTree(points), np.empty(len(points))
     for rows in np.array_split(np.arange(len(points)), -(-len(points) // WHOLE)):
-        first, last = np.searchsorted(along, along[rows[[0, -1]]] + np.array([-reach, reach]))
-        found[order[rows]] = _mean_distance(points[order[first:last]], points[order[rows]], reach)
-    return found
-
-
-def _mean_distance(points: Array, at: Array, reach: float) -> Array:
-    """(M,) of the neighbours of some of the points, as far as they are within reach."""
-    neighbours = cKDTree(points).query(at, k=OUTLIER_NEIGHBOURS + 1, distance_upper_bound=reach, workers=threads())
-    return np.asarray(neighbours[0][:, 1:].mean(1))
+        distance[rows] = tree.query(points[rows], k=OUTLIER_NEIGHBOURS + 1, workers=threads())[0][:, 1:].mean(1)
+    return distance <= OUTLIER_RATIO * np.median(distance)
 
 
 @contextmanager

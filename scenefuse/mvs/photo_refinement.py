@@ -50,9 +50,7 @@ class RefinementSettings:
     """Smallest mean NCC of the best matches, -1..1; below it a depth is not photo-consistent where there is texture."""
 
 
-def refine_by_photos(
-    views: Views, poses: Array, depths: NDArray[np.float32], settings: RefinementSettings
-) -> RefinedDepths:
+def refine_by_photos(views: Views, depths: NDArray[np.float32], settings: RefinementSettings) -> RefinedDepths:
     """Depth maps (V, H, W) with every pixel moved along its ray to the best match.
 
     Windows of a photo are matched with those of the eight photos that show most of the same from about 15 degrees
@@ -61,8 +59,7 @@ def refine_by_photos(
     in photos that have the place in view, the depth is not photo-consistent.
 
     Args:
-        views: photos and intrinsics at the maps' size.
-        poses: (V, 4, 4) object_from_cam of the maps.
+        views: photos and cameras at the maps' size.
         depths: (V, H, W) along z, 0 for none.
         settings: reach, window and least score.
     """
@@ -71,8 +68,8 @@ def refine_by_photos(
         return result
     device = "cuda" if torch.cuda.is_available() else "cpu"
     window = settings.match_window_px
-    photos = [_gray(views.view(index), poses[index]) for index in range(len(depths))]
-    sources = choose_sources(views, poses, depths)
+    photos = [_gray(views.view(index)) for index in range(len(depths))]
+    sources = choose_sources(views, depths)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows) == 0:
@@ -88,10 +85,9 @@ def refine_by_photos(
     return result
 
 
-def _gray(view: View, pose: Array) -> View:
-    """A view with grey pixels, (H, W) float32 in 0..1, at a pose (4, 4) world_from_cam."""
-    gray = cv2.cvtColor(view.pixels, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0
-    return replace(view, pixels=gray, cam_from_world=np.asarray(np.linalg.inv(pose)))
+def _gray(view: View) -> View:
+    """A view with grey pixels, (H, W) float32 in 0..1."""
+    return replace(view, pixels=cv2.cvtColor(view.pixels, cv2.COLOR_RGB2GRAY).astype(np.float32) / 255.0)
 
 
 def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
@@ -101,9 +97,9 @@ def _cut(view: View, top: int, left: int, bottom: int, right: int) -> View:
     return replace(view, pixels=pixels, intrinsics=intrinsics, width=pixels.shape[1], height=pixels.shape[0])
 
 
-def choose_sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> NDArray[np.int64]:
+def choose_sources(views: Views, depths: NDArray[np.float32]) -> NDArray[np.int64]:
     """(V, S) for each photo those that show most of what it shows, from about 15 degrees beside it; the best first."""
-    places = np.full((len(depths), PLACES, 3), np.nan)
+    poses, places = views.object_from_cam, np.full((len(depths), PLACES, 3), np.nan)
     for index, depth in enumerate(depths):
         rows, columns = np.nonzero(depth > 0)
         if len(rows):
@@ -113,8 +109,7 @@ def choose_sources(views: Views, poses: Array, depths: NDArray[np.float32]) -> N
     centres, middles = poses[:, :3, 3], np.nan_to_num(places.mean(axis=1))
     worth = np.full((len(depths), len(depths)), -np.inf)
     for index, depth in enumerate(depths):
-        view = replace(views.view(index), cam_from_world=np.linalg.inv(poses[index]))
-        shown, pixels, away = view.visible(places.reshape(-1, 3))
+        shown, pixels, away = views.view(index).visible(places.reshape(-1, 3))
         there = depth[pixels[:, 1], pixels[:, 0]]
         shown = shown[(there == 0) | (away <= (1 + HIDDEN_SHARE) * there)]
         share = np.bincount(shown // PLACES, minlength=len(depths)) / PLACES

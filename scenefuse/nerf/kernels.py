@@ -242,7 +242,7 @@ def _shares(uniform, prior, near_count, total):
 
 @_inline
 def _walk(ray, span, occupancy, expected, width, buffers):
-    """Fill the beginnings, weights and nearness to the prior of the intervals of a ray that lie in occupied cells.
+    """Fill the beginnings, weights and nearness to the prior of the intervals of a ray that lie in cells of the hull.
 
     ray (6,): origin and direction; span: where it enters and leaves; occupancy as in `march`; expected, width: the
     prior; buffers: what is filled. Returns how many intervals there are, their total weight, how many are near.
@@ -312,14 +312,14 @@ def _place(r, jitter, shares, near_count, used, step, buffers, out):
 def march(rays, occupancy, jitter, uniform, prior, out):
     """Importance samples along rays through an occupancy grid.
 
-    A ray is cut into intervals of length `step` inside the unit cube; only those in occupied cells count. Their
+    A ray is cut into intervals of length `step` inside the unit cube; only those in cells of the hull count. Their
     probability mass mixes a uniform part, the compositing weights of the grid's cached density, and the intervals
-    near a depth prior; S equal shares of the mass give one sample each. Lengths are lengths of occupied ray.
+    near a depth prior; S equal shares of the mass give one sample each. Lengths are lengths of ray in the hull.
 
-    rays: origin, direction (R, 3); occupancy: alpha (G, G, G), opacity of one interval, negative in empty cells,
-    blocks_used (G / 4, G / 4, G / 4) uint8, whether any cell of the block is occupied (it stays in the cache, most of
-    the cube is empty), step; jitter (R, S) in 0..1; uniform: share of the samples spread evenly; prior: distance,
-    width, share (R,); out: t, delta (R, S), hit (R,) uint8.
+    rays: origin, direction (R, 3); occupancy: alpha (G, G, G), opacity of one interval, negative outside the hull,
+    blocks_used (G / 4, G / 4, G / 4) uint8, whether any cell of the block is in the hull (it stays in the cache,
+    most of the cube is empty), step; jitter (R, S) in 0..1; uniform: share of the samples spread evenly; prior:
+    distance, width, share (R,); out: t, delta (R, S), hit (R,) uint8.
     """
     origin, direction = rays
     distance, width, share = prior

@@ -16,7 +16,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, plane_normals, spacing, v
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import StageError, quantity, read_json, setting, threads, write_json
 from scenefuse.geometry.consistency import compare, extent, surface_points
-from scenefuse.mvs.dense_cloud import OUTLIER_NEIGHBOURS
+from scenefuse.mvs.dense_cloud import near_others
 from scenefuse.mvs.photo_refinement import RefinementSettings, refine_by_photos
 from scenefuse.mvs.sparse_depths import MASK_REACH_PX, sparse_depths
 from scenefuse.nerf.appearance import without_appearance
@@ -48,8 +48,6 @@ class CloudGates:
     """Share of the views that may see past a point."""
     mask_share: float = 0.1
     """Share of the views in whose mask a point need not lie."""
-    outlier_deviations: float = 3.0
-    """Points whose neighbours are farther than the mean by so many standard deviations are dropped."""
     min_component: float = 0.01
     """Connected groups with a smaller share of the points are dropped."""
 
@@ -108,19 +106,18 @@ def make_object_cloud(*, inputs: CloudInputs, cloud: Path, report: Path, setting
         known["up_in_camera_frame"] = up
     views = _views(inputs, saved["names"])
     maps = read_maps(inputs.stage, views, settings.gates.min_confidence)
-    poses, rendered = views.object_from_cam, max(int((maps.depths > 0).sum()), 1)
-    refined = refine_by_photos(views, poses, maps.depths, settings.refinement)
+    rendered = max(int((maps.depths > 0).sum()), 1)
+    refined = refine_by_photos(views, maps.depths, settings.refinement)
     maps = replace(maps, depths=np.where(refined.inconsistent, 0, refined.depths))
-    raw, diagonal = fuse_depths(_neutral(views, saved), poses, maps, settings)
+    raw, diagonal = fuse_depths(_neutral(views, saved), maps, settings)
     if len(raw) < MIN_POINTS:
         raise StageError(
             f"no surface found: {len(raw)} points of {inputs.stage} pass the gates; check masks and held-out renders, "
             "or lower min_views"
         )
     voxel = min(settings.spacing * diagonal, VOXEL_PIXELS * footprint(maps.depths, views.intrinsics))
-    thinned, gates = voxel_downsample(raw, voxel), settings.gates
-    cleaned = clean(thinned, gates.outlier_deviations, gates.min_component, voxel)
-    cleaned = with_plane_normals(cleaned)
+    thinned = voxel_downsample(raw, voxel)
+    cleaned = with_plane_normals(clean(thinned, settings.gates.min_component, voxel))
     shares = float(refined.moved.sum() / rendered), float(refined.inconsistent.sum() / rendered)
     write_cloud(cloud, cleaned)
     write_json(report, _report(raw, thinned, cleaned, shares, seed) | known)
@@ -137,18 +134,15 @@ class SurfaceMaps:
     normals: NDArray[np.float16]
 
 
-def fuse_depths(
-    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, settings: CloudSettings
-) -> tuple[Cloud, float]:
+def fuse_depths(views: Views, maps: SurfaceMaps, settings: CloudSettings) -> tuple[Cloud, float]:
     """Points of all views that other views confirm, each the mean of those that agree, and the object's diagonal.
 
     Args:
-        views: photos, masks and intrinsics at the maps' size.
-        poses: (V, 4, 4) object_from_cam that the maps were rendered with.
+        views: photos, masks and cameras at the maps' size.
         maps: of the views.
         settings: the gates.
     """
-    points = [surface_points(*view)[0] for view in zip(maps.depths, views.intrinsics, poses)]
+    points = [surface_points(*view)[0] for view in zip(maps.depths, views.intrinsics, views.object_from_cam)]
     together = np.concatenate(points)
     if len(together) == 0:
         return Cloud(together), 0.0
@@ -157,18 +151,19 @@ def fuse_depths(
     grown = np.stack([cv2.dilate(m.astype(np.uint8), np.ones((size, size), np.uint8)) > 0 for m in views.masks])
     tolerance = settings.gates.point_agreement * diagonal
     seen = grown, sparse_depths(views)
-    parts = [_confirmed(views, poses, maps, seen, tolerance, index, settings) for index in range(len(poses))]
+    parts = [_confirmed(views, maps, seen, tolerance, index, settings) for index in range(len(points))]
     return concatenate(parts), diagonal
 
 
 def _confirmed(
-    views: Views, poses: NDArray[np.float64], maps: SurfaceMaps, seen: tuple[NDArray[np.bool_], Maps],
+    views: Views, maps: SurfaceMaps, seen: tuple[NDArray[np.bool_], Maps],
     tolerance: float, index: int, settings: CloudSettings,
 ) -> Cloud:  # fmt: skip
     """The points of one view that pass the gates; `seen` (V, H, W) are the masks that points may lie in, and from
     which depth on they may lie beside them."""
-    points, rows, columns = surface_points(maps.depths[index], views.intrinsics[index], poses[index])
-    found = compare(points, index, maps.depths, seen[0], views.intrinsics, poses, tolerance, seen[1])
+    poses, intrinsics = views.object_from_cam, views.intrinsics
+    points, rows, columns = surface_points(maps.depths[index], intrinsics[index], poses[index])
+    found = compare(points, index, maps.depths, seen[0], intrinsics, poses, tolerance, seen[1])
     gates = settings.gates
     keep = found.agree + 1 >= settings.min_views
     keep &= found.through <= gates.through_share * (found.agree + found.through)
@@ -191,11 +186,9 @@ def footprint(depths: Maps, intrinsics: NDArray[np.float64]) -> float:
     return float(np.median(depths[rows, *pixels] / intrinsics[rows, 0, 0]))
 
 
-def clean(cloud: Cloud, deviations: float, min_component: float, step: float) -> Cloud:
-    """Drop points with far neighbours, then small groups that no chain of steps of 3 x `step` joins to the rest."""
-    near = min(OUTLIER_NEIGHBOURS + 1, len(cloud))
-    distance = cKDTree(cloud.points).query(cloud.points, k=near, workers=threads())[0][:, 1:].mean(1)
-    cloud = cloud[distance <= distance.mean() + deviations * distance.std()]
+def clean(cloud: Cloud, min_component: float, step: float) -> Cloud:
+    """Drop points far from all others, then small groups that no chain of steps of 3 x `step` joins to the rest."""
+    cloud = cloud[near_others(cloud.points)]
     pairs = cKDTree(cloud.points).query_pairs(MAX_STEP * step, output_type="ndarray")
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(cloud), len(cloud)))
     group = connected_components(graph, directed=False)[1]

@@ -12,18 +12,18 @@ from scenefuse.nerf.field import Field
 from scenefuse.nerf.occupancy import Occupancy
 from scenefuse.nerf.rays import camera_rays
 
-# Share of a ray's samples that is spread evenly over its occupied part: what the grid does not know yet is seen too.
+# Share of a ray's samples that is spread evenly over its part in the hull: what the grid does not know yet is seen too.
 UNIFORM_SHARE = 0.25
 
 
 @dataclass(frozen=True)
 class RaySamples:
-    """S samples on each ray that meets an occupied cell.
+    """S samples on each ray that meets the hull.
 
     Attributes:
         ray: (H,) int64, which of the R rays they belong to.
         t: (H, S) distance along the ray, increasing.
-        delta: (H, S) length of occupied ray that the sample stands for.
+        delta: (H, S) length of ray in the hull that the sample stands for.
     """
 
     ray: Tensor
@@ -56,7 +56,7 @@ def march(
         direction: (R, 3) unit vectors.
         occupancy: the grid.
         jitter: (R, S) in 0..1, position of each sample in its share of the ray.
-        uniform: share of the samples spread evenly over the occupied ray.
+        uniform: share of the samples spread evenly over the ray in the hull.
         prior: expected surface; a share of 0 where there is none.
     """
     if not (kernels.AVAILABLE and origin.device.type == "cpu"):
@@ -81,7 +81,7 @@ def march_reference(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """`kernels.march` in plain PyTorch: t (R, S), delta (R, S), hit (R,)."""
     step = occupancy.step
-    start, alpha, valid = _occupied_intervals(origin, direction, occupancy)
+    start, alpha, valid = _hull_intervals(origin, direction, occupancy)
     used = valid.sum(1, keepdim=True)
     mass = _mass(start + 0.5 * step, alpha, valid, uniform, prior)
     cdf = torch.cumsum(mass, 1)
@@ -98,8 +98,8 @@ def march_reference(
     return t, (end - edge) * step, used[:, 0] > 0
 
 
-def _occupied_intervals(origin: Tensor, direction: Tensor, occupancy: Occupancy) -> tuple[Tensor, Tensor, Tensor]:
-    """Rays cut into N intervals: where they start (R, N), their opacity, and which count; occupied ones come first."""
+def _hull_intervals(origin: Tensor, direction: Tensor, occupancy: Occupancy) -> tuple[Tensor, Tensor, Tensor]:
+    """Rays cut into N intervals: where they start (R, N), their opacity, which count; those in the hull come first."""
     step = occupancy.step
     safe = torch.where(direction.abs() < 1e-9, torch.full_like(direction, 1e-9), direction)
     a, b = -origin / safe, (1 - origin) / safe

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from scenefuse.core.stage import StageError, quantity
 from scenefuse.core.transforms import Sim3
-from scenefuse.geometry.consistency import compare, extent, normals_from_depth, surface_points
+from scenefuse.geometry.consistency import normals_from_depth
 from scenefuse.nerf.appearance import MIN_OPACITY, falloff_map, fitted_log_gain, gains_nearby
-from scenefuse.nerf.prior.refine_depth import MAP_AGREEMENT
+from scenefuse.nerf.prior.refine_depth import CONFIRMING_VIEWS, MAP_AGREEMENT, agreement
 from scenefuse.nerf.rays import PhotoTensors, dilate
 from scenefuse.nerf.render import RenderedView, render_view
 from scenefuse.nerf.training import Nerf
@@ -49,7 +49,7 @@ class RenderedMaps:
     Attributes:
         views: photos, masks and cameras.
         depths: (V, H, W) along z, 0 for none.
-        confidence: (V, H, W) in 0..1.
+        confidence: (V, H, W), opacity times the share of the views that should see a point and agree.
         rendered: V renders in nerf units, with the vignetting and `log_gain`; those of photos that do not measure
             quality have no colours.
         log_gain: (V, 3) of training photos as trained, of held-out ones as of the nearest (`gains_nearby`).
@@ -103,10 +103,9 @@ def render_maps(
         raise StageError(
             f"the NeRF found no surface: no ray reached an opacity of {MIN_OPACITY}; check the masks and the cameras"
         )
-    diagonal = extent(
-        np.concatenate([surface_points(*view)[0] for view in zip(depths, views.intrinsics, views.object_from_cam)])
-    )
-    confidence = _confidence(depths, rendered, views, settings.map_agreement * diagonal)
+    agree, through, diagonal = agreement(views, depths, settings.map_agreement)
+    opacity = np.stack([view.opacity.numpy() for view in rendered]).clip(0, 1)
+    confidence = (agree / np.maximum(agree + through, CONFIRMING_VIEWS) * opacity).astype(np.float32)
     return RenderedMaps(views, depths, confidence, rendered, log_gain, looks[1], measured, diagonal)
 
 
@@ -250,14 +249,3 @@ def _solid_depth(rendered: RenderedView) -> Tensor:
     """(H, W) median depth, 0 where the ray is not opaque or its weights are spread."""
     keep = (rendered.opacity > MIN_OPACITY) & (rendered.deviation < MAX_DEVIATION)
     return torch.where(keep, rendered.depth, torch.zeros_like(rendered.depth))
-
-
-def _confidence(depths: Maps, rendered: list[RenderedView], views: Views, tolerance: float) -> Maps:
-    """Opacity times the share of the views that should see a point and agree; of two views at least."""
-    confidence = np.zeros_like(depths)
-    for index in range(len(depths)):
-        points, rows, columns = surface_points(depths[index], views.intrinsics[index], views.object_from_cam[index])
-        found = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
-        share = found.agree / np.maximum(found.agree + found.through, 2)
-        confidence[index, rows, columns] = share * rendered[index].opacity.numpy()[rows, columns].clip(0, 1)
-    return confidence

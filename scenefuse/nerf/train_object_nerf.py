@@ -253,7 +253,6 @@ def _report(
         "depth_prior": quantity(prior is not None, ""),
         "prior_confident_share": quantity(prior and _confident_share(prior, given), "1"),
         "hull_share": quantity(float(given.volume.hull.mean()), "1"),
-        "occupied_share": quantity(float(nerf.occupancy.occupied.float().mean()), "1"),
         "diagonal": quantity(maps.diagonal, "object units"),
         **{f"loss_{name}": quantity(value, "1") for name, value in result.items() if name not in NO_LOSSES},
         "psnr_training": quantity(result.get("psnr"), "dB"),

@@ -33,8 +33,6 @@ from scenefuse.nerf.render import UNIFORM_SHARE, Composited, RayPrior, RaySample
 
 # Steps between updates of the grid (Mueller et al. 2022, appendix E.2).
 OCCUPANCY_EVERY = 16
-# The grid drops no cell in the first tenth of a training: the densities there mean nothing yet.
-PRUNE_FROM = 0.1
 # Samples fall to their last number by the middle of the training, when the grid knows the surface.
 SAMPLES_FALL_UNTIL = 0.5
 # The cosine ends at this share of the highest rate, not at nothing: the last steps still learn.
@@ -114,7 +112,6 @@ class Nerf:
             "field": {name: tensor.cpu() for name, tensor in self.field.state_dict().items()},
             "hull": self.occupancy.hull.cpu(),
             "density": self.occupancy.density.cpu(),
-            "occupied": self.occupancy.occupied.cpu(),
             "log_gain": self.appearance.log_gain.cpu(),
             "falloff": self.appearance.falloff.cpu(),
         }
@@ -127,11 +124,11 @@ def new_nerf(settings: FieldSettings, hull: Tensor, photos: int, seed: int, devi
 
 
 def go_on_from(nerf: Nerf, earlier: State) -> None:
-    """Take over the field and the densities of an earlier stage (`Nerf.state`); all of the new hull is occupied."""
+    """Take over the field and the densities of an earlier stage (`Nerf.state`)."""
     nerf.field.load_state_dict(earlier["field"])
     nerf.field.level_weight.fill_(1.0)
     hull = nerf.occupancy.hull
-    nerf.occupancy = Occupancy(hull, earlier["density"].to(hull.device), hull)
+    nerf.occupancy = Occupancy(hull, earlier["density"].to(hull.device))
 
 
 @dataclass(frozen=True)
@@ -154,7 +151,7 @@ class Rendered:
         step: its number.
         batch: the pixels of its R rays.
         rays: the rays.
-        drawn: samples on the H rays that meet an occupied cell.
+        drawn: samples on the H rays that meet the hull.
         sigma: (H, S) densities of the samples.
         seen: what the H rays look like.
     """
@@ -191,7 +188,7 @@ class Training:
         schedule: its length.
         recipe: batches, rates, samples.
         weights: of the losses.
-        warm: the NeRF is already trained: all levels are open and the grid is pruned from the start.
+        warm: the NeRF is already trained: all levels are open, and densities and appearance are found at the start.
         seed: decides every random draw together with the step's number.
         photo_weight: (V,) weight of each photo's colours, or None for 1.
         additions: of another recipe, or None.
@@ -267,7 +264,7 @@ def _resume(saved: State, nerf: Nerf, optimizer: torch.optim.Optimizer) -> int:
     nerf.field.load_state_dict(saved["model"]["field"])
     device = nerf.field.table.device
     nerf.appearance = Appearance(*(saved["model"][name].to(device) for name in ("log_gain", "falloff")))
-    nerf.occupancy = Occupancy(*(saved["model"][name].to(device) for name in ("hull", "density", "occupied")))
+    nerf.occupancy = Occupancy(*(saved["model"][name].to(device) for name in ("hull", "density")))
     optimizer.load_state_dict(saved["optimizer"])
     return int(saved["step"])
 
@@ -285,8 +282,7 @@ def _prepare(nerf: Nerf, training: Training, step: int) -> None:
     if not training.warm:
         coarse_to_fine(nerf.field, progress, training.recipe.coarse_until)
     if step % OCCUPANCY_EVERY == 0 and (step or training.warm):
-        prune = training.warm or progress > PRUNE_FROM
-        nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step, prune)
+        nerf.occupancy = updated(nerf.occupancy, nerf.field, training.seed, step)
     due = step in {round(share * training.steps) for share in APPEARANCE_AT} or (step == 0 and training.warm)
     if due and training.recipe.appearance:
         nerf.appearance = find_appearance(nerf.field, nerf.occupancy, training.photos)

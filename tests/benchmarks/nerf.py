@@ -76,7 +76,7 @@ def marching(rays: int, cells: int, samples: int) -> Callable[[], object]:
     generator = torch.Generator().manual_seed(0)
     grid = torch.stack(torch.meshgrid(*[torch.linspace(-1, 1, cells)] * 3, indexing="ij"))
     shell = ((grid.norm(dim=0) - 0.6).abs() < 0.1).contiguous()
-    occupancy = Occupancy(shell, 50 * shell.float(), shell)
+    occupancy = Occupancy(shell, 50 * shell.float())
     origin = torch.nn.functional.normalize(torch.randn(rays, 3, generator=generator)) * 2
     direction = torch.nn.functional.normalize(torch.rand(rays, 3, generator=generator) - 0.5 - origin)
     origin, prior = origin + 0.5, no_prior(rays, origin.device)

@@ -61,7 +61,7 @@ def fused(
             [read_normals(p) if (p := depth / "normal_maps" / n).is_file() else np.stack([z] * 3, -1) for n, z in read]
         )
         maps = SurfaceMaps(depths, (depths > 0).astype(np.float32), normals)
-        return fuse_depths(views, views.object_from_cam, maps, settings)[0]
+        return fuse_depths(views, maps, settings)[0]
     path = depth.with_name("fused.ply")
     fuse_depth_maps(
         workspace=folder / "undistorted", depth=[depth], depth_json=[report], cloud=path,
@@ -135,7 +135,7 @@ def cleaned(cloud: Cloud, folder: Path, own: dict[str, Any]) -> Cloud:
     """Thinned and cleaned like the object's cloud."""
     settings = build(CloudSettings, own["cloud"])
     step = settings.spacing * value(read_json(folder / "object.json"), "diagonal")  # the demo's pixels are larger
-    return clean(voxel_downsample(cloud, step), settings.gates.outlier_deviations, settings.gates.min_component, step)
+    return clean(voxel_downsample(cloud, step), settings.gates.min_component, step)
 
 
 def used(began: os.times_result) -> float:

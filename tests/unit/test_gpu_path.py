@@ -63,9 +63,7 @@ def test_training_and_rendering_on_a_gpu(gpu, tmp_path, of_paper):
 
 def test_depths_are_refined_by_photos_on_a_gpu(gpu):
     views, truth = plane_views(count=4)
-    refined = refine_by_photos(
-        views, views.object_from_cam, truth.astype(np.float32), RefinementSettings(match_reach_px=4.0)
-    )
+    refined = refine_by_photos(views, truth.astype(np.float32), RefinementSettings(match_reach_px=4.0))
     assert refined.depths.shape == truth.shape
 
 

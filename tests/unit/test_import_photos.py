@@ -372,9 +372,7 @@ OPTIONS = TrainingOptions(
     ),
     losses=LossWeights(),
     maps=RenderedMapSettings(map_agreement=0.03),
-    gates=CloudGates(
-        point_agreement=0.05, min_confidence=0.0, through_share=0.5, mask_share=0.3, outlier_deviations=4.0
-    ),
+    gates=CloudGates(point_agreement=0.05, min_confidence=0.0, through_share=0.5, mask_share=0.3),
 )
 
 

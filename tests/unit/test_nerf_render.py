@@ -39,7 +39,7 @@ def test_composite_by_hand():
 def test_uniform_marching_splits_the_occupied_length_evenly():
     occupied = torch.zeros(8, 8, 8, dtype=torch.bool)
     occupied[2:6] = True
-    grid = Occupancy(occupied, torch.zeros(8, 8, 8), occupied)
+    grid = Occupancy(occupied, torch.zeros(8, 8, 8))
     origin, direction = torch.tensor([[-1.0, 0.51, 0.51]]), torch.tensor([[1.0, 0.0, 0.0]])
     drawn = march(origin, direction, grid, torch.full((1, 4), 0.5), 1.0, _no_prior(1))
     step = grid.step
@@ -51,7 +51,7 @@ def test_uniform_marching_splits_the_occupied_length_evenly():
 def test_rays_that_meet_nothing_get_no_samples():
     occupied = torch.zeros(8, 8, 8, dtype=torch.bool)
     occupied[2:6] = True
-    grid = Occupancy(occupied, torch.zeros(8, 8, 8), occupied)
+    grid = Occupancy(occupied, torch.zeros(8, 8, 8))
     origin = torch.tensor([[-1.0, 0.5, 0.5], [0.1, -1.0, 0.5], [-1.0, 5.0, 0.5]])
     direction = torch.tensor([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
     assert march(origin, direction, grid, torch.full((3, 4), 0.5), 1.0, _no_prior(3)).ray.tolist() == [0]
@@ -63,10 +63,10 @@ def test_known_density_and_prior_draw_samples_to_the_surface():
     density[32:] = 1000.0
     origin, direction = torch.tensor([[-1.0, 0.5, 0.5]]), torch.tensor([[1.0, 0.0, 0.0]])
     jitter = torch.full((1, 16), 0.5)
-    by_density = march(origin, direction, Occupancy(occupied, density, occupied), jitter, 0.25, _no_prior(1))
+    by_density = march(origin, direction, Occupancy(occupied, density), jitter, 0.25, _no_prior(1))
     assert int(((by_density.t - 1.5).abs() < 0.05).sum()) >= 11
     prior = RayPrior(torch.tensor([1.3]), torch.tensor([0.05]), torch.tensor([0.6]))
-    by_prior = march(origin, direction, Occupancy(occupied, 0 * density, occupied), jitter, 0.25, prior)
+    by_prior = march(origin, direction, Occupancy(occupied, 0 * density), jitter, 0.25, prior)
     assert int(((by_prior.t - 1.3).abs() < 0.06).sum()) >= 9
 
 
@@ -74,7 +74,7 @@ def test_known_density_and_prior_draw_samples_to_the_surface():
 def test_marching_matches_the_reference():
     rng = torch.Generator().manual_seed(3)
     occupied = torch.rand(16, 16, 16, generator=rng) > 0.6
-    grid = Occupancy(occupied, torch.rand(16, 16, 16, generator=rng) * 5, occupied)
+    grid = Occupancy(occupied, torch.rand(16, 16, 16, generator=rng) * 5)
     origin = torch.rand(200, 3, generator=rng) * 3 - 1
     direction = torch.rand(200, 3, generator=rng) - origin
     direction = direction / direction.norm(dim=1, keepdim=True)

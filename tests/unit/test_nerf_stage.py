@@ -53,7 +53,6 @@ GATES = CloudGates(
     min_confidence=0.0,
     through_share=0.5,
     mask_share=0.3,
-    outlier_deviations=4.0,
     min_component=0.02,
 )
 

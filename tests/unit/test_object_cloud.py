@@ -44,7 +44,7 @@ def test_fused_points_lie_on_the_sphere_and_floaters_are_carved():
     damaged[0, rows[spoiled], columns[spoiled]] *= 0.8
     normals = np.zeros((*depths.shape, 3), np.float16)
     maps = SurfaceMaps(damaged, ((depths > 0) * 0.8).astype(np.float32), normals)
-    cloud, diagonal = fuse_depths(views, views.object_from_cam, maps, SETTINGS)
+    cloud, diagonal = fuse_depths(views, maps, SETTINGS)
     distance = np.abs(np.linalg.norm(cloud.points - CENTER, axis=1) - RADIUS)
     assert len(cloud) > 1000
     assert distance.max() < 0.02 * diagonal
@@ -82,7 +82,7 @@ def test_cleaning_drops_a_small_group_and_far_points():
     grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3)
     island = grid[:4] + [100.0, 0.0, 0.0]
     far_off = np.array([[10.0, 10.0, 60.0]])
-    cleaned = clean(Cloud(np.concatenate([grid, island, far_off])), 3.0, 0.02, 1.0)
+    cleaned = clean(Cloud(np.concatenate([grid, island, far_off])), 0.02, 1.0)
     assert len(cleaned) == len(grid) and cleaned.points[:, 2].max() == 0 and cleaned.points[:, 0].max() < 20
 
 

@@ -161,9 +161,10 @@ def test_depths_are_refined_with_photos_that_show_the_same_place():
         view=lambda k: photos[k],
         intrinsics=np.stack([view.intrinsics for view in photos]),
         sizes=np.array([[120, 160]]),
+        object_from_cam=np.stack([view.world_from_cam for view in photos]),
     )
-    poses = np.stack([view.world_from_cam for view in photos])
-    for index, chosen in enumerate(choose_sources(views, poses, depths)):
+    poses = views.object_from_cam
+    for index, chosen in enumerate(choose_sources(views, depths)):
         apart = np.abs(poses[chosen, 0, 3] - poses[index, 0, 3])
         # A photo shows 7.3 m of the wall, and 15 degrees beside it are 2.7 m.
         assert apart.max() < 7 and np.abs(apart - 2.7).min() < 0.5

@@ -13,7 +13,7 @@ def test_wrong_depths_of_a_textured_plane_come_back():
     views, truth = plane_views(count=8, width=160, height=120)
     views = speckled(views, truth)
     wrong = wrong_depths(truth)
-    refined = refine_by_photos(views, views.object_from_cam, wrong, RefinementSettings(match_reach_px=8))
+    refined = refine_by_photos(views, wrong, RefinementSettings(match_reach_px=8))
     known = truth > 0
     error = [np.median(np.abs(d - truth)[known] / truth[known]) for d in (wrong, refined.depths)]
     assert error[1] < 0.2 * error[0]
@@ -24,7 +24,7 @@ def test_wrong_depths_of_a_textured_plane_come_back():
 def test_smooth_surfaces_are_left_alone():
     views, truth = plane_views(count=8, width=160, height=120)
     depths = truth.astype(np.float32)
-    refined = refine_by_photos(views, views.object_from_cam, depths, RefinementSettings(match_reach_px=8))
+    refined = refine_by_photos(views, depths, RefinementSettings(match_reach_px=8))
     assert refined.moved[truth > 0].mean() < 0.05 and refined.inconsistent[truth > 0].mean() < 1e-3
     assert np.quantile(np.abs(refined.depths - depths)[truth > 0] / truth[truth > 0], 0.9) < 1e-6
 
@@ -33,7 +33,7 @@ def test_depths_stay_where_nothing_can_be_matched():
     views, truth = plane_views(count=8, width=96, height=72)
     plain = replace(views, images=np.full_like(views.images, 120))
     wrong = wrong_depths(truth)
-    refined = refine_by_photos(plain, plain.object_from_cam, wrong, RefinementSettings(match_reach_px=8))
+    refined = refine_by_photos(plain, wrong, RefinementSettings(match_reach_px=8))
     assert not (refined.moved | refined.inconsistent).any() and np.array_equal(refined.depths, wrong)
 
 
@@ -59,7 +59,7 @@ def test_no_depth_moves_farther_than_its_reach():
     wrong = (np.where(far, 1.06, 1.008)[:, None, None] * truth).astype(np.float32)
     worth = worth_of_a_pixel(views, wrong)
     for reach, repaired in ((1, ~far), (8, far | ~far)):
-        refined = refine_by_photos(views, views.object_from_cam, wrong, RefinementSettings(match_reach_px=reach))
+        refined = refine_by_photos(views, wrong, RefinementSettings(match_reach_px=reach))
         for k, found in enumerate(refined.depths):
             start, end, true = wrong[k][known[k]], found[known[k]], truth[k][known[k]]
             assert (np.abs(1 / end - 1 / start) < 1.1 * reach * worth[k]).all()
@@ -69,5 +69,5 @@ def test_no_depth_moves_farther_than_its_reach():
 def test_a_textured_surface_far_from_where_it_is_is_not_photo_consistent():
     views, truth = plane_views(count=8, width=160, height=120)
     views, far_off = speckled(views, truth), (1.3 * truth).astype(np.float32)
-    refined = refine_by_photos(views, views.object_from_cam, far_off, RefinementSettings(match_reach_px=1))
+    refined = refine_by_photos(views, far_off, RefinementSettings(match_reach_px=1))
     assert refined.inconsistent[truth > 0].mean() > 0.9

@@ -42,7 +42,7 @@ class DepthPrior:
 
 
 def confirm(
-    views: Views, depths: Maps, settings: RefinementSettings = SHIPPED, agreement: float = MAP_AGREEMENT
+    views: Views, depths: Maps, settings: RefinementSettings = SHIPPED, map_agreement: float = MAP_AGREEMENT
 ) -> tuple[DepthPrior, dict[str, Any]]:
     """Depth maps (V, H, W) as a prior, and what the report of their stage says of it.
 
@@ -55,13 +55,13 @@ def confirm(
         views: photos, masks and cameras at the maps' size.
         depths: along z in object units, 0 for none.
         settings: of the refinement by photos.
-        agreement: largest difference of depth that agrees, share of the object's diagonal.
+        map_agreement: largest difference of depth that agrees, share of the object's diagonal.
     """
     training = np.flatnonzero(~views.held_out)
     seen, before = views.select(training), depths[training] * views.masks[training]
-    matched = refine_by_photos(seen, seen.object_from_cam, before, settings)
+    matched = refine_by_photos(seen, before, settings)
     kept = np.where(matched.inconsistent, 0, matched.depths).astype(np.float32)
-    agree, through = _agreement(seen, kept, agreement)
+    agree, through, _ = agreement(seen, kept, map_agreement)
     share = np.where(matched.moved, 1, agree / np.maximum(agree + through, CONFIRMING_VIEWS))
     share = np.where(agree >= CONFIRMING_VIEWS, share, 0).astype(np.float32)
     prior = DepthPrior(depths * views.masks, np.zeros_like(depths))
@@ -74,15 +74,17 @@ def confirm(
     }
 
 
-def _agreement(views: Views, depths: Maps, agreement: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """(V, H, W) how many other views have the same surface, and how many see through it."""
+def agreement(views: Views, depths: Maps, share: float) -> tuple[NDArray[np.int32], NDArray[np.int32], float]:
+    """(V, H, W) how many other views have the same surface, and how many see through it; the object's diagonal, of
+    which depths of one place differ by `share` at most."""
     known = [surface_points(*view) for view in zip(depths, views.intrinsics, views.object_from_cam)]
-    tolerance = agreement * extent(np.concatenate([points for points, _, _ in known]))
+    diagonal = extent(np.concatenate([points for points, _, _ in known]))
+    cameras, tolerance = (views.intrinsics, views.object_from_cam), share * diagonal
     agree, through = np.zeros((2, *depths.shape), np.int32)
     for index, (points, rows, columns) in enumerate(known):
-        others = compare(points, index, depths, views.masks, views.intrinsics, views.object_from_cam, tolerance)
-        agree[index, rows, columns], through[index, rows, columns] = others.agree, others.through
-    return agree, through
+        found = compare(points, index, depths, views.masks, *cameras, tolerance)
+        agree[index, rows, columns], through[index, rows, columns] = found.agree, found.through
+    return agree, through, diagonal
 
 
 def write_prior(folder: Path, views: Views, prior: DepthPrior) -> None:
