@@ -32,7 +32,10 @@ COARSE = CoarseSettings(ransac_samples=10000, scale_steps=9, yaw_steps=16, candi
 LITTLE: dict[str, Any] = {"voxel_fraction": 0.012, "turn_steps": 12}
 R, G = "scenefuse.register", "scenefuse.geometry"
 # Rules of these modules leave the candidates as they are.
-AFTER_CANDIDATES = tuple(f"{R}.{name}." for name in ("refinement", "likelihood", "uncertainty"))
+AFTER_CANDIDATES = (
+    *(f"{R}.{name}." for name in ("refinement", "likelihood", "uncertainty")),
+    f"{G}.icp._without_overhang", f"{G}.icp.POINT_WEIGHT",
+)  # fmt: skip
 
 
 @cache
