@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.geometry.depth_test import BEHIND, depth_buffer, depth_test
+from scenefuse.geometry.depth_test import Where, depth_buffer, depth_test
 from scenefuse.geometry.visual_hull import least_framing
 from scenefuse.photos.workspace import View, read_workspace, with_mask
 
@@ -155,7 +155,7 @@ def count(
     for one in views:
         rows, pixels, _ = one.visible(in_object)
         near = in_object[rows]
-        unhidden = depth_test(near, depth_buffer(near, one, cell), HIDDEN_CELLS * cell) != BEHIND
+        unhidden = depth_test(near, depth_buffer(near, one, cell), HIDDEN_CELLS * cell) != Where.BEHIND
         rows, pixels = rows[unhidden], pixels[unhidden]
         shown[rows] += 1
         inside[rows] += one.pixels[pixels[:, 1], pixels[:, 0]]

@@ -1,10 +1,11 @@
 """Compare: the points of an object and of the scene around it against each other, and what goes and why (F4).
 
-Photos have measured both sides by now (`measure`), and the object has settled (`evidence.settle`). What photos see
+Photos have measured both sides by now (`measure`), and the object has settled (`settle`). What photos see
 through goes; where both sides measured a place, one stays.
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +20,18 @@ from scenefuse.photos.workspace import View
 
 Mask = NDArray[np.bool_]
 
-KEPT, SEEN_THROUGH, REPLACED = 0, 1, 3
-"""What becomes of a point of the scene, field `reason` of those taken away."""
+
+class Reason(IntEnum):
+    """What becomes of a point of the scene, field `reason` of those taken away."""
+
+    KEPT = 0
+    SEEN_THROUGH = 1
+    REPLACED = 3
+
+
 REASONS = {
-    SEEN_THROUGH: "photos see a surface behind it",
-    REPLACED: "the object measured the place better",
+    Reason.SEEN_THROUGH: "photos see a surface behind it",
+    Reason.REPLACED: "the object measured the place better",
 }
 # Share of the diagonal that a point must lie before or behind a surface to be seen through or hidden.
 MARGIN = 0.01
@@ -53,7 +61,7 @@ class Compared:
     Attributes:
         added: (N,) of the object's points that come into the scene.
         contradicted: (N,) of the object's points that are not measured, those that photos see through.
-        reason: (M,) uint8 of the scene's points: KEPT, or why it is taken away.
+        reason: (M,) uint8 of the scene's points: Reason.KEPT, or why it is taken away.
     """
 
     added: Mask
@@ -80,19 +88,19 @@ def compare(obj: Measured, scene: Measured, views: list[View], share: float = 1.
     # What is measured stays: all photos of a pot before a wall have the wall behind it.
     is_open = seen.in_view - seen.hidden
     through = seen.through >= np.maximum(THROUGH_PHOTOS, THROUGH_SHARE * is_open)
-    reason[through & ~scene.surface] = SEEN_THROUGH
+    reason[through & ~scene.surface] = Reason.SEEN_THROUGH
 
     both = concatenate([surface, scene.cloud[scene.surface]])
     behind = see(obj.cloud.points, both, views, spacing(both.points), MARGIN * diagonal)
     contradicted = ~obj.surface & (behind.through >= THROUGH_PHOTOS)
 
     worse, better = better_measured(obj, scene, diagonal, share)
-    reason[worse & (reason == KEPT)] = REPLACED
+    reason[worse & (reason == Reason.KEPT)] = Reason.REPLACED
     added = obj.surface & ~better
-    replaced = np.flatnonzero(scene.surface & (reason == REPLACED))
-    stays = concatenate([obj.cloud[added], scene.cloud[reason == KEPT]])
+    replaced = np.flatnonzero(scene.surface & (reason == Reason.REPLACED))
+    stays = concatenate([obj.cloud[added], scene.cloud[reason == Reason.KEPT]])
     reach = SAME_PLACE_SPACINGS * spacing(scene.cloud.points)
-    reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = KEPT
+    reason[replaced[_alone(scene.cloud.points[replaced], stays, reach)]] = Reason.KEPT
     return Compared(added, contradicted, reason)
 
 

@@ -14,10 +14,10 @@ from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import atomic_file, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, rotation_between
-from scenefuse.fuse.evidence import around
 from scenefuse.fuse.fuse_object import photos_of
 from scenefuse.fuse.measure import with_normals
-from scenefuse.fuse.missing import CLASSES, Missing, find_missing_surface
+from scenefuse.fuse.missing import Lack, Missing, find_missing_surface
+from scenefuse.fuse.modes import around
 from scenefuse.fuse.next_photos import CLEARANCE, UPWARDS, Plan, plan_stations, reach_of_stations
 from scenefuse.fuse.write import added_by, read_changes, together
 from scenefuse.geometry.photo_check import Photos
@@ -153,7 +153,7 @@ def _silhouette(view: View, path: Path) -> View:
 
 def _report(missing: Missing, plan: Plan, unit: str) -> dict[str, Any]:
     """Shares of the object's surface, and what the stations would close, with units."""
-    shares = {name: missing.share(kind) for kind, name in CLASSES.items()}
+    shares = {kind.name.lower(): missing.share(kind) for kind in Lack}
     return {
         "status": quantity("found", ""),
         "surface_cells": quantity(missing.covered_cells + len(missing.cells), "cells"),

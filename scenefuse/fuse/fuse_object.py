@@ -6,20 +6,29 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.cloud.tiled_cloud import Rows, open_cloud
 from scenefuse.core.machine import use_threads
 from scenefuse.core.stage import quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3, box_around
-from scenefuse.fuse.evidence import NEAR, Checked, evidence_report, fuse_by_evidence
-from scenefuse.fuse.measure import NERF_ONLY, unchecked, with_normals, with_pose_uncertainty
-from scenefuse.fuse.modes import NEAR_SPACINGS, Fused, FusionSettings, color_notes, fuse_by_distance
-from scenefuse.fuse.write import FROM_OBJECT, FROM_SCENE, together, with_source
+from scenefuse.fuse.compare import REASONS, Reason
+from scenefuse.fuse.measure import Evidence, unchecked
+from scenefuse.fuse.modes import (
+    NEAR,
+    NEAR_SPACINGS,
+    Checked,
+    Fused,
+    FusionSettings,
+    color_notes,
+    fuse_by_distance,
+    fuse_by_evidence,
+)
+from scenefuse.fuse.write import Source, frame_ledger, together, with_source
 from scenefuse.geometry.photo_check import Photos, moved_photos, pack, read_photos
 from scenefuse.photos.geodesy import length_unit
 from scenefuse.photos.workspace import read_workspace
-from scenefuse.register.frame_ledger import frame_ledger
 from scenefuse.register.uncertainty import Uncertainty
 
 
@@ -80,8 +89,6 @@ def fuse_object(*, inputs: FusionInputs, outputs: FusionOutputs, settings: Fusio
     whole, part, obj = open_cloud(inputs.scene), read_cloud(inputs.crop), read_cloud(inputs.object)
     registration, crop_json = read_json(inputs.fine_json), read_json(inputs.crop_json)
     settings, notes = possible(settings, inputs.object_workspace is not None, inputs.scene_workspace is not None)
-    if whole.like.normals is not None:
-        obj = with_normals(obj)
     placed, step = is_placed(registration), spacing(part.points)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object"))) if placed else None
     rows, scene = whole.near(*_region(obj, pose, crop_json, step))
@@ -128,15 +135,12 @@ def _region(obj: Cloud, pose: Sim3 | None, crop_json: dict[str, Any], step: floa
 def _by_evidence(
     obj: Cloud, scene: Cloud, pose: Sim3, inputs: FusionInputs, registration: dict[str, Any], settings: FusionSettings
 ) -> tuple[Fused, Checked]:
-    """`fuse_by_evidence` of an object in its own frame, with what its pose adds to the deviations."""
+    """`fuse_by_evidence` of an object in its own frame."""
     placed = obj.transformed(pose)
     photos = photos_of(inputs.object_workspace, obj.points, pose), photos_of(inputs.scene_workspace, placed.points)
-    fused, checked = fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration))
-    covariance = value(registration, "covariance") if "covariance" in registration else None
-    if covariance is not None:
-        added = with_pose_uncertainty(fused.added, np.array(covariance), placed.points.mean(0))
-        fused = replace(fused, added=added)
-    return fused, checked
+    stated = value(registration, "covariance") if "covariance" in registration else None
+    on_world = None if stated is None else np.array(stated)
+    return fuse_by_evidence(placed, scene, *photos, settings, uncertainty_on_scene(registration), on_world)
 
 
 def possible(settings: FusionSettings, object_photos: bool, scene_photos: bool) -> tuple[FusionSettings, list[str]]:
@@ -185,7 +189,7 @@ def photos_of(workspace: Path | None, points: Array, frame: Sim3 | None = None) 
 
 def _write(fused: Fused, rows: Rows, crop_json: dict[str, Any], outputs: FusionOutputs) -> None:
     """The clouds; rows: (N,) of the part of the scene in its cloud."""
-    kept, added = with_source(fused.kept, FROM_SCENE), with_source(fused.added, FROM_OBJECT)
+    kept, added = with_source(fused.kept, Source.SCENE), with_source(fused.added, Source.OBJECT)
     write_cloud(outputs.fused, together(_in_box(kept, crop_json), added))
     checked = fused.scene[fused.rows]
     checked.fields["row"], checked.fields["reason"] = rows[fused.rows].astype(np.uint32), fused.reason
@@ -202,7 +206,7 @@ def _report(
 ) -> dict[str, Any]:
     """What was added and taken away, with units."""
     added = fused.added
-    unconfirmed = None if checked is None else int((checked.obj.fields["evidence"] == NERF_ONLY).sum())
+    unconfirmed = None if checked is None else int((checked.obj.fields["evidence"] == Evidence.NERF_ONLY).sum())
     return {
         "status": quantity("fused" if is_placed(registration) else "unregistered", ""),
         "registration": quantity(value(registration, "status"), ""),
@@ -219,6 +223,52 @@ def _report(
         "color_gain": quantity(fused.gain, "1"),
         "color_bias": quantity(fused.bias, "of 255"),
     }
+
+
+def evidence_report(fused: Fused, checked: Checked | None, unit: str) -> dict[str, Any]:
+    """What photos say of both sides' points; without `evidence`, only what was taken away.
+
+    `object_points` are `object_measured` and `object_nerf_only`; the measured ones are added or better in the scene. Of
+    the others, photos see through `object_contradicted`; fewer than three could be compared at `object_unasked`.
+    `added_photos` is how many photos confirm the measured points that were added.
+    """
+    removed = {text: int((fused.reason == code).sum()) for code, text in REASONS.items()}
+    content = {"scene_removed": quantity(removed, "points")}
+    if checked is None:
+        return content | {"notes": quantity(["no photo was compared"], "")}
+    fields, of_scene = checked.obj.fields, checked.scene.fields["evidence"] == Evidence.MEASURED
+    measured, left = fields["evidence"] == Evidence.MEASURED, checked.reason == Reason.KEPT
+    middle = float(np.median(fields["deviation"][measured])) if measured.any() else None
+    masks = {
+        "object_measured": measured,
+        "object_nerf_only": fields["evidence"] == Evidence.NERF_ONLY,
+        "object_contradicted": checked.contradicted,
+        "object_better_in_scene": measured & ~checked.added,
+        "object_added": checked.added,
+        "object_unasked": ~measured & np.isnan(fields["match"]),
+        "scene_measured": of_scene,
+        "scene_stereo_only": ~of_scene,
+        "scene_kept": left,
+        "scene_kept_measured": left & of_scene,
+    }
+    return content | {
+        "object_points": quantity(len(measured), "points"),
+        "scene_checked": quantity(len(left), "points"),
+        **{name: quantity(int(mask.sum()), "points") for name, mask in masks.items()},
+        "deviation_median": quantity(middle, unit),
+        "object_measured_share": quantity(float(measured.mean()) if len(measured) else None, "1"),
+        "added_photos": quantity(_quantiles(fields["photos"][checked.added & measured]), "photos"),
+        "settled_by": quantity(checked.moved, "diagonals"),
+        "notes": quantity(checked.notes, ""),
+    }
+
+
+def _quantiles(values: NDArray[Any]) -> dict[str, float] | None:
+    """Least, median and largest of (N,) values, and the twentieth from below."""
+    if not len(values):
+        return None
+    places = {"least": 0.0, "5 %": 0.05, "median": 0.5, "largest": 1.0}
+    return {name: float(np.quantile(values, place, method="lower")) for name, place in places.items()}
 
 
 def _in_box(cloud: Cloud, crop_json: dict[str, Any]) -> Cloud:

@@ -1,6 +1,7 @@
 """Measure: which points of a cloud photos confirm, how exactly, and the fields in which a fused cloud says so (F4)."""
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
@@ -10,10 +11,19 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, plane_normals, spacing
 from scenefuse.core.stage import threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.geometry.icp import similarity_rows
 from scenefuse.geometry.photo_check import Matches, Photos, match_in
 
-UNCHECKED, MEASURED, NERF_ONLY, STEREO_ONLY = 0, 1, 2, 3
-"""Values of the field `evidence`."""
+
+class Evidence(IntEnum):
+    """Values of the field `evidence`."""
+
+    UNCHECKED = 0
+    MEASURED = 1
+    NERF_ONLY = 2
+    STEREO_ONLY = 3
+
+
 FIELDS = ("photos", "match", "deviation", "world_deviation", "evidence")
 """What is known of a point: photos that confirm it, mean NCC of the best, one standard deviation, and one of these."""
 # A point is measured where photos confirm this share of it and its neighbours: here and there one matches by chance.
@@ -84,16 +94,19 @@ def with_normals(cloud: Cloud) -> Cloud:
     return replace(cloud, normals=plane_normals(cloud.points, index).astype(np.float32))
 
 
-def with_evidence(known: Measured, otherwise: int) -> Cloud:
-    """The cloud with only these fields: what photos know of its points, and `evidence`: MEASURED or `otherwise`."""
+def with_evidence(known: Measured, otherwise: Evidence, of_pose: Array | float = 0.0) -> Cloud:
+    """The cloud with only these fields: what photos know of its points, and `evidence`: MEASURED or `otherwise`.
+
+    `of_pose` (N,) is what the uncertainty of its pose adds to `world_deviation`, see `deviations_of_pose`.
+    """
     matches = known.matches
     deviation = np.where(np.isfinite(matches.deviation), matches.deviation, np.nan).astype(np.float32)
     fields: dict[str, NDArray[Any]] = {
         "photos": matches.photos.astype(np.uint16),
         "match": np.where(matches.tested > 0, matches.match, np.nan).astype(np.float32),
         "deviation": deviation,
-        "world_deviation": deviation.copy(),
-        "evidence": np.where(known.surface, MEASURED, otherwise).astype(np.uint8),
+        "world_deviation": np.hypot(deviation.astype(np.float64), of_pose).astype(np.float32),
+        "evidence": np.where(known.surface, Evidence.MEASURED, otherwise).astype(np.uint8),
     }
     return replace(known.cloud, fields=fields)
 
@@ -101,21 +114,19 @@ def with_evidence(known: Measured, otherwise: int) -> Cloud:
 def unchecked(cloud: Cloud) -> Cloud:
     """The cloud with the same fields, empty: it was matched in no photo."""
     nothing, none = np.full(len(cloud), np.nan), np.zeros(len(cloud), np.int64)
-    return with_evidence(Measured(cloud, Matches(nothing, nothing, none, none, *[nothing] * 3), none > 0), UNCHECKED)
+    return with_evidence(
+        Measured(cloud, Matches(nothing, nothing, none, none, *[nothing] * 3), none > 0), Evidence.UNCHECKED
+    )
 
 
-def with_pose_uncertainty(cloud: Cloud, covariance: Array, centre: Array) -> Cloud:
-    """Points of an object, `world_deviation` with what its pose adds along their normals (method M10).
+def deviations_of_pose(cloud: Cloud, covariance: Array, centre: Array) -> Array:
+    """Standard deviations (N,) of points with normals, along these, by the uncertainty of their pose (method M10).
 
     Args:
-        cloud: in the scene, with normals and fields of evidence.
+        cloud: in the scene.
         covariance: (7, 7) of the pose about `centre`: rotation vector (radians), shift, log scale.
         centre: (3,) in the scene.
     """
-    if cloud.normals is None:
-        return cloud
-    lever, normals = cloud.points - centre, cloud.normals.astype(np.float64)
-    along = np.column_stack([np.cross(lever, normals), normals, (lever * normals).sum(1)])
-    of_pose = np.einsum("ni,ij,nj->n", along, covariance, along)
-    whole = np.sqrt(cloud.fields["deviation"].astype(np.float64) ** 2 + np.maximum(of_pose, 0))
-    return replace(cloud, fields=cloud.fields | {"world_deviation": whole.astype(np.float32)})
+    assert cloud.normals is not None
+    along = similarity_rows(cloud.points - centre, cloud.normals.astype(np.float64))
+    return np.asarray(np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", along, covariance, along), 0)))

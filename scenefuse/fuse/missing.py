@@ -5,6 +5,7 @@ of an object); Laurentini 1994 (the visual hull bounds what can be unknown).
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +21,15 @@ from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, match_in
 from scenefuse.geometry.visual_hull import Outline, count_silhouettes
 from scenefuse.photos.workspace import View
 
-NEVER_SEEN, UNTEXTURED, CONTRADICTED = 1, 2, 3
-"""Field `missing` of a cell's centre."""
-CLASSES = {
-    NEVER_SEEN: "never_seen",
-    UNTEXTURED: "untextured",
-    CONTRADICTED: "contradicted",
-}
+
+class Lack(IntEnum):
+    """Why a cell is missing, field `missing` of its centre."""
+
+    NEVER_SEEN = 1
+    UNTEXTURED = 2
+    CONTRADICTED = 3
+
+
 # Cells along the object's diagonal; so many around its points are looked at too.
 CELLS, BORDER_CELLS = 100, 3
 # A cell is covered by points of the completed scene within so many sides of it.
@@ -53,7 +56,7 @@ class Missing:
     """Surface of an object that the completed scene lacks.
 
     Attributes:
-        cells: centres of its cells, with normals towards empty space and the field `missing`, a key of CLASSES.
+        cells: centres of its cells, with normals towards empty space and the field `missing`, a value of `Lack`.
         side: of a cell, unit of the frame.
         covered_cells: cells of the object's surface that the completed scene has.
         seen_through: points of the object that photos see through: nothing is there, so nothing is missing.
@@ -201,8 +204,8 @@ def _classes(
         # Photos from nearly the same place say nothing of a point's place: they are not tested.
         seen = np.maximum(seen, np.minimum(shown, matches.tested + 1))
         texture = np.maximum(texture, matches.texture)
-    kinds = np.where(texture < MIN_TEXTURE, UNTEXTURED, CONTRADICTED)
-    return np.where(seen < CONFIRMING_PHOTOS, NEVER_SEEN, kinds).astype(np.uint8)
+    kinds = np.where(texture < MIN_TEXTURE, Lack.UNTEXTURED, Lack.CONTRADICTED)
+    return np.where(seen < CONFIRMING_PHOTOS, Lack.NEVER_SEEN, kinds).astype(np.uint8)
 
 
 def _plain(cloud: Cloud) -> Cloud:

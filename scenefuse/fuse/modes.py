@@ -1,4 +1,8 @@
-"""How an object comes into a scene: the settings, fusion by distances alone, colours that follow the scene's (F1)."""
+"""How an object comes into a scene: by what photos know of both sides' points (F4), or by distances alone (F1).
+
+By evidence a point goes through four steps: it is measured (`measure`), the object settles (`settle`), both sides are
+compared (`compare`), and what changes is written (`write`).
+"""
 
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -7,22 +11,35 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
+from scenefuse.cloud.clouds import Cloud, sampled_rows, spacing, voxel_downsample
+from scenefuse.cloud.tiled_cloud import Rows
 from scenefuse.core.stage import setting, threads
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.fuse.compare import KEPT, REPLACED, SAME_PLACE_SPACINGS
-from scenefuse.fuse.measure import FIELDS, unchecked
-from scenefuse.fuse.write import Changes, Rows
+from scenefuse.fuse.compare import SAME_PLACE_SPACINGS, Reason, compare, gaps
+from scenefuse.fuse.measure import (
+    FIELDS,
+    Evidence,
+    deviations_of_pose,
+    measure,
+    measure_again,
+    unchecked,
+    with_evidence,
+    with_normals,
+)
+from scenefuse.fuse.settle import settle
+from scenefuse.fuse.write import GAINS, MIN_PAIRS, SEAM_SPACINGS, Changes, feathered, with_colors_of
+from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, Photos, moved_photos
+from scenefuse.register.uncertainty import Uncertainty
 
 # Points farther than SAME_PLACE_SPACINGS of the scene from all of its points are new to it, or so many median distances
 # between the clouds where both exist, if that is more: noise does not add a second layer.
 FILL_RESIDUALS = 1.5
-# Least and largest gain of an object's colours, and pairs of points that it is computed from at least.
-GAINS, MIN_PAIRS = (0.5, 2.0), 50
 # Points of the scene within so many of its spacings of the object's box are compared with it.
 NEAR_SPACINGS = 10.0
-# Width of the seam over which colours blend, in spacings of the scene.
-SEAM_SPACINGS = 4.0
+# The scene is checked in the object's box, widened by this share of its diagonal.
+NEAR = 0.05
+# Points of the scene around an object that are checked; of a denser scene a random choice, which the others follow.
+MAX_CHECKED = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -48,7 +65,7 @@ class Fused:
     Attributes:
         scene: its points with the fields of evidence.
         rows: (M,) rising, of these points, those that were checked.
-        reason: (M,) uint8, KEPT or why the point is taken away.
+        reason: (M,) uint8, Reason.KEPT or why the point is taken away.
         added: the object's points that come in, with the same fields.
         gain: (3,) colour gain of the object.
         bias: (3,) colour bias, 0..255.
@@ -66,7 +83,7 @@ class Fused:
     @property
     def removed(self) -> Rows:
         """(R,) rows of the points that are taken away."""
-        return self.rows[self.reason != KEPT]
+        return self.rows[self.reason != Reason.KEPT]
 
     @property
     def kept(self) -> Cloud:
@@ -76,7 +93,145 @@ class Fused:
     def changes(self, rows: Rows) -> Changes:
         """What changes in a scene's cloud that has the part's points in these rows (N,)."""
         fields = {name: self.scene.fields[name][self.rows] for name in FIELDS}
-        return Changes(rows[self.rows], self.reason != KEPT, fields)
+        return Changes(rows[self.rows], self.reason != Reason.KEPT, fields)
+
+
+@dataclass(frozen=True)
+class Checked:
+    """What the photos of both sides say of their points.
+
+    Attributes:
+        settled: settled_from_placed, by which the object was moved before its points were compared.
+        moved: RMS distance of that, over the object's diagonal; None where it could not be settled.
+        obj: the object's points, moved, with the fields of evidence.
+        added: (N,) of the object's points that come into the scene.
+        contradicted: (N,) of the object's points that are not measured, those that photos see through.
+        scene: the scene's points around it, with the fields of evidence.
+        reason: (M,) uint8 of the scene's points: Reason.KEPT, or why it is taken away.
+        notes: what a user should know.
+    """
+
+    settled: Sim3
+    moved: float | None
+    obj: Cloud
+    added: NDArray[np.bool_]
+    contradicted: NDArray[np.bool_]
+    scene: Cloud
+    reason: NDArray[np.uint8]
+    notes: list[str]
+
+
+def fuse_by_evidence(
+    obj: Cloud,
+    scene: Cloud,
+    obj_photos: Photos,
+    scene_photos: Photos,
+    settings: FusionSettings,
+    on_scene: Uncertainty | None = None,
+    on_world: Array | None = None,
+) -> tuple[Fused, Checked]:
+    """Fuse by what photos know of the points of both sides; see `check`.
+
+    Args:
+        obj: the object in the scene's frame, registered.
+        scene: the scene around it, or all of it.
+        obj_photos: the object's photos in the scene's frame.
+        scene_photos: the scene's photos that see the object.
+        settings: see FusionSettings.
+        on_scene: how uncertain the object's pose on the scene is, where it is known.
+        on_world: the same against the world, a covariance (7, 7) about the object's mean, for `world_deviation`.
+    """
+    certain = None if on_scene is None else on_scene.size(obj.diagonal)
+    rows = np.flatnonzero(around(scene, obj))
+    near = scene[rows]
+    checked = check(obj, near, obj_photos, scene_photos, settings.nerf_only, certain, on_world)
+    step = spacing(near.points)
+    moved, gain, bias = with_colors_of(checked.obj, near, SAME_PLACE_SPACINGS * step, settings.match_colors)
+    added = thinned(moved[checked.added], settings.density * step)
+    added = feathered(added, near[checked.reason == Reason.KEPT], SEAM_SPACINGS * step, SAME_PLACE_SPACINGS * step)
+    whole = unchecked(scene)
+    for name, values in whole.fields.items():
+        values[rows] = checked.scene.fields[name]
+    return Fused(whole, rows, checked.reason, added, gain, bias, SAME_PLACE_SPACINGS * step), checked
+
+
+def around(scene: Cloud, obj: Cloud) -> NDArray[np.bool_]:
+    """(N,) points of the scene that are checked: in the object's box, widened by NEAR."""
+    low, high, margin = obj.points.min(0), obj.points.max(0), NEAR * obj.diagonal
+    return ((scene.points >= low - margin) & (scene.points <= high + margin)).all(1)
+
+
+def check(
+    obj: Cloud,
+    scene: Cloud,
+    obj_photos: Photos,
+    scene_photos: Photos,
+    nerf_only: bool,
+    certain: float | None = None,
+    on_world: Array | None = None,
+) -> Checked:
+    """Measure the points of an object and of the scene around it in the photos of both, settle the object, compare.
+
+    A side without photos is measured by the other's; a scene's point also counts as measured where the object's photos
+    confirm it. Of a scene of more than MAX_CHECKED points each of the others shares the fate of the nearest of these.
+
+    Args:
+        obj: the object in the scene's frame, registered.
+        scene: the scene's points around it.
+        obj_photos: of the object, in the scene's frame.
+        scene_photos: of the scene.
+        nerf_only: whether points of the object that no photo confirms are added where the scene has none.
+        certain: how certain the registration was; see `settle`.
+        on_world: see `fuse_by_evidence`.
+    """
+    diagonal, chosen = obj.diagonal, np.sort(sampled_rows(len(scene), MAX_CHECKED, seed=0))
+    notes = _photo_notes(obj_photos, scene_photos)
+    mine = measure(obj, obj_photos if _is_enough(obj_photos) else scene_photos, diagonal)
+    theirs = measure(scene[chosen], scene_photos if _is_enough(scene_photos) else obj_photos, diagonal)
+    if not mine.surface.any():
+        notes.append("no photo confirms any point of the object, so nothing is added")
+
+    found = settle(mine.cloud[mine.surface], theirs.cloud[theirs.surface], diagonal, certain)
+    settled, moved = found or (Sim3.identity(), None)
+    if moved is None:
+        notes.append(
+            "the object stays where the registration put it: too little is measured on both sides, or it would move far"
+        )
+    elif moved == 0:
+        notes.append("the object stays where the registration put it: that is more certain than what the surfaces say")
+    mine, obj_photos = mine.moved(settled), moved_photos(obj_photos, settled)
+
+    theirs = measure_again(theirs, obj_photos, diagonal)
+    decided = compare(mine, theirs, obj_photos.views + scene_photos.views, len(chosen) / max(len(scene), 1))
+    added, reason = decided.added, decided.reason
+    if nerf_only:
+        unconfirmed = ~mine.surface & ~decided.contradicted
+        added = added | gaps(mine.cloud.points, unconfirmed, added, theirs.cloud.points[reason == Reason.KEPT])
+    known = with_evidence(theirs, Evidence.STEREO_ONLY)
+    if len(chosen) < len(scene):
+        notes.append(
+            f"of {len(scene)} points of the scene near the object {len(chosen)} were checked; the others follow the"
+            " nearest"
+        )
+        nearest = cKDTree(known.points).query(scene.points, workers=threads())[1]
+        known = replace(scene, fields={name: values[nearest] for name, values in known.fields.items()})
+        reason = reason[nearest]
+    of_pose = 0.0 if on_world is None else deviations_of_pose(mine.cloud, on_world, obj.points.mean(0))
+    own = with_evidence(mine, Evidence.NERF_ONLY, of_pose)
+    return Checked(settled, moved, own, added, decided.contradicted, known, reason, notes)
+
+
+def _is_enough(photos: Photos) -> bool:
+    return len(photos.views) >= CONFIRMING_PHOTOS
+
+
+def _photo_notes(obj_photos: Photos, scene_photos: Photos) -> list[str]:
+    """What a user should know of sides with too few photos."""
+    return [
+        f"fewer than {CONFIRMING_PHOTOS} photos of the {name} see it: it is judged by those of the {other}"
+        for photos, name, other in ((obj_photos, "object", "scene"), (scene_photos, "scene", "object"))
+        if not _is_enough(photos)
+    ]
 
 
 def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings: FusionSettings) -> Fused:
@@ -90,6 +245,8 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
         settings: see FusionSettings.
     """
     moved, step = obj.transformed(pose), spacing(part.points)
+    if scene.normals is not None:
+        moved = with_normals(moved)
     low, high = moved.points.min(0) - NEAR_SPACINGS * step, moved.points.max(0) + NEAR_SPACINGS * step
     near = np.flatnonzero(((scene.points >= low) & (scene.points <= high)).all(1))
     near = near if len(near) else np.arange(len(scene))
@@ -107,47 +264,8 @@ def fuse_by_distance(obj: Cloud, scene: Cloud, part: Cloud, pose: Sim3, settings
     added = thinned(moved, settings.density * step)
     if settings.mode != "append":
         added = feathered(added, scene[np.setdiff1d(near, removed)], SEAM_SPACINGS * step, fill)
-    reason = np.full(len(removed), REPLACED, np.uint8)
+    reason = np.full(len(removed), Reason.REPLACED, np.uint8)
     return Fused(unchecked(scene), removed, reason, unchecked(added), gain, bias, fill)
-
-
-def color_notes(fused: Fused, obj: Cloud, scene: Cloud) -> tuple[Fused, list[str]]:
-    """The fusion, added points grey where only the scene has colours, and what a user should know of the colours."""
-    notes = []
-    if scene.colors is not None and obj.colors is None:
-        notes.append("the object has no colours: its points are grey in the scene")
-        grey = np.full((len(fused.added), 3), 128, np.uint8)
-        fused = replace(fused, added=replace(fused.added, colors=grey))
-    if np.isin(fused.gain, GAINS).any():
-        notes.append(
-            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
-            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
-            " fusion.match_colors: false leaves them as they are"
-        )
-    return fused, notes
-
-
-def with_colors_of(obj: Cloud, scene: Cloud, reach: float, wanted: bool) -> tuple[Cloud, Array, Array]:
-    """The object with its colours brought to the scene's by pairs of points within `reach`; the gain and bias (3,)."""
-    gain, bias = np.ones(3), np.zeros(3)
-    if not wanted or obj.colors is None or scene.colors is None or len(scene) == 0:
-        return obj, gain, bias
-    distance, partner = cKDTree(scene.points).query(obj.points, distance_upper_bound=reach, workers=threads())
-    close = np.isfinite(distance)
-    if close.sum() < MIN_PAIRS:
-        return obj, gain, bias
-    gain, bias = match_colors(obj.colors[close], scene.colors[partner[close]])
-    return replace(obj, colors=_bytes(obj.colors * gain + bias)), gain, bias
-
-
-def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
-    """Gain and bias (3,) per channel with gain a + bias = b, from pairs (M, 3): medians and mean deviations."""
-    mine, theirs = a.astype(np.float64), b.astype(np.float64)
-    middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
-    wide_a = np.abs(mine - middle_a).mean(0)
-    wide_b = np.abs(theirs - middle_b).mean(0)
-    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), *GAINS)
-    return gain, middle_b - gain * middle_a
 
 
 def thinned(cloud: Cloud, wanted: float) -> Cloud:
@@ -166,19 +284,17 @@ def thinned(cloud: Cloud, wanted: float) -> Cloud:
     return best
 
 
-def feathered(added: Cloud, kept: Cloud, width: float, fill: float) -> Cloud:
-    """The added points with colours blended into what is kept, over `width` from the seam; no point moves.
-
-    At the seam a point's colour is the mean of its own and its nearest kept neighbours'; the share of the neighbours
-    falls linearly to nothing.
-    """
-    if len(kept) < 8 or len(added) == 0 or added.colors is None or kept.colors is None:
-        return added
-    distance, partner = cKDTree(kept.points).query(added.points, k=4, workers=threads())
-    share = 0.5 * np.clip(1 - (distance[:, :1] - fill) / width, 0, 1)
-    around = kept.colors[partner].astype(np.float64).mean(1)
-    return replace(added, colors=_bytes((1 - share) * added.colors + share * around))
-
-
-def _bytes(colors: Array) -> NDArray[np.uint8]:
-    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+def color_notes(fused: Fused, obj: Cloud, scene: Cloud) -> tuple[Fused, list[str]]:
+    """The fusion, added points grey where only the scene has colours, and what a user should know of the colours."""
+    notes = []
+    if scene.colors is not None and obj.colors is None:
+        notes.append("the object has no colours: its points are grey in the scene")
+        grey = np.full((len(fused.added), 3), 128, np.uint8)
+        fused = replace(fused, added=replace(fused.added, colors=grey))
+    if np.isin(fused.gain, GAINS).any():
+        notes.append(
+            "the scene shows the object much darker or lighter, or with less or more contrast, than its own photos: its"
+            f" colours are changed by the most that is done (gain {', '.join(f'{g:.2f}' for g in fused.gain)});"
+            " fusion.match_colors: false leaves them as they are"
+        )
+    return fused, notes

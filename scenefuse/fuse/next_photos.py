@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, spacing, voxel_downsample
 from scenefuse.core.transforms import Array, look_at, rotation_between
-from scenefuse.fuse.missing import CONTRADICTED, SPARSEST, UNTEXTURED, Missing
+from scenefuse.fuse.missing import SPARSEST, Lack, Missing
 from scenefuse.geometry.depth_test import shown_in
 from scenefuse.photos.workspace import View
 
@@ -72,7 +72,7 @@ def plan_stations(missing: Missing, obj: Cloud, around: Cloud, close_ups: list[V
         close_ups: the object's cameras in the scene's frame, for lens and distance.
         up: (3,) unit vector opposite to gravity.
     """
-    cells = missing.cells[missing.cells.fields["missing"] != UNTEXTURED]
+    cells = missing.cells[missing.cells.fields["missing"] != Lack.UNTEXTURED]
     if len(cells) == 0 or not close_ups:
         return Plan([], 0.0)
     middle, distance = _close_ups_from(obj, close_ups)
@@ -170,7 +170,7 @@ def _tried(
 ) -> NDArray[np.bool_]:
     """(P, K) contradicted cells that a close-up shows from nearly the same direction as the P stations would."""
     tried = np.zeros((len(photos), len(cells)), dtype=bool)
-    rows = np.flatnonzero(cells.fields["missing"] == CONTRADICTED)
+    rows = np.flatnonzero(cells.fields["missing"] == Lack.CONTRADICTED)
     if len(rows) == 0:
         return tried
     part = cells[rows]

@@ -6,22 +6,34 @@ that is read.
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from scenefuse.cloud.clouds import Cloud, concatenate, records_of
 from scenefuse.cloud.readers.las import LAS_DIMENSIONS
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud, open_cloud, reserved
-from scenefuse.core.transforms import Array
-from scenefuse.fuse.compare import KEPT
-from scenefuse.fuse.measure import FIELDS, MEASURED, unchecked
+from scenefuse.core.stage import StageError, quantity, read_json, threads
+from scenefuse.core.transforms import Array, Sim3
+from scenefuse.fuse.compare import Reason
+from scenefuse.fuse.measure import FIELDS, Evidence, unchecked
 
-FROM_SCENE, FROM_OBJECT = 0, 1
-"""Values of the field `source` of an object's clouds."""
+# Least and largest gain of an object's colours, and pairs of points that it is computed from at least.
+GAINS, MIN_PAIRS = (0.5, 2.0), 50
+# Width of the seam over which colours blend, in spacings of the scene.
+SEAM_SPACINGS = 4.0
+
+
+class Source(IntEnum):
+    """Values of the field `source` of an object's clouds."""
+
+    SCENE = 0
+    OBJECT = 1
 
 
 @dataclass(frozen=True)
@@ -47,7 +59,7 @@ class Changes:
             rows: (N,) rising, of these points in the scene's cloud.
             cloud: the points.
         """
-        part, left = with_source(unchecked(cloud), FROM_SCENE), np.ones(len(cloud), dtype=bool)
+        part, left = with_source(unchecked(cloud), Source.SCENE), np.ones(len(cloud), dtype=bool)
         if was_completed(cloud):
             known = {name: cloud.fields[name].astype(values.dtype) for name, values in part.fields.items()}
             part = replace(part, fields=known)
@@ -75,7 +87,7 @@ def read_changes(checked: Path) -> Changes:
     """The changes that an object makes, from what its fusion wrote of the scene's points; none where it is empty."""
     tiles = open_cloud(checked)
     fields = tiles.read(np.arange(len(tiles.low)))[1].fields
-    rows, removed = fields["row"].astype(np.int64), fields["reason"] != KEPT
+    rows, removed = fields["row"].astype(np.int64), fields["reason"] != Reason.KEPT
     return Changes(rows, removed, {name: fields[name] for name in FIELDS})
 
 
@@ -89,7 +101,7 @@ def merged(changes: list[Changes]) -> Changes:
     rows = np.concatenate([np.zeros(0, np.int64), *(one.rows for one in changes)])
     removed = np.concatenate([np.zeros(0, bool), *(one.removed for one in changes)])
     fields = {name: np.concatenate([one.fields[name] for one in changes]) for name in FIELDS if changes}
-    order = np.lexsort((fields["evidence"] == MEASURED, rows)) if changes else np.zeros(0, np.int64)
+    order = np.lexsort((fields["evidence"] == Evidence.MEASURED, rows)) if changes else np.zeros(0, np.int64)
     last = np.flatnonzero(np.diff(rows[order], append=-1))
     starts = np.concatenate([[0], last[:-1] + 1]) if len(last) else last
     gone = np.logical_or.reduceat(removed[order], starts) if len(last) else removed
@@ -101,7 +113,7 @@ def added_by(fused: Path) -> Cloud:
     """The points that an object brought in, from the cloud of its surroundings."""
     tiles = open_cloud(fused)
     whole = tiles.read(np.arange(len(tiles.low)))[1]
-    return whole[whole.fields["source"] == FROM_OBJECT]
+    return whole[whole.fields["source"] == Source.OBJECT]
 
 
 def after_fusion(scene: TiledCloud, checked: Path, fused: Path, low: Array, high: Array) -> Cloud:
@@ -164,3 +176,95 @@ def _with_columns_of(like: Cloud, cloud: Cloud) -> Cloud:
             for name, values in like.fields.items()
         },
     )
+
+
+def with_colors_of(obj: Cloud, scene: Cloud, reach: float, wanted: bool) -> tuple[Cloud, Array, Array]:
+    """The object with its colours brought to the scene's by pairs of points within `reach`; the gain and bias (3,)."""
+    gain, bias = np.ones(3), np.zeros(3)
+    if not wanted or obj.colors is None or scene.colors is None or len(scene) == 0:
+        return obj, gain, bias
+    distance, partner = cKDTree(scene.points).query(obj.points, distance_upper_bound=reach, workers=threads())
+    close = np.isfinite(distance)
+    if close.sum() < MIN_PAIRS:
+        return obj, gain, bias
+    gain, bias = match_colors(obj.colors[close], scene.colors[partner[close]])
+    return replace(obj, colors=_bytes(obj.colors * gain + bias)), gain, bias
+
+
+def match_colors(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Array, Array]:
+    """Gain and bias (3,) per channel with gain a + bias = b, from pairs (M, 3): medians and mean deviations."""
+    mine, theirs = a.astype(np.float64), b.astype(np.float64)
+    middle_a, middle_b = np.median(mine, axis=0), np.median(theirs, axis=0)
+    wide_a = np.abs(mine - middle_a).mean(0)
+    wide_b = np.abs(theirs - middle_b).mean(0)
+    gain = np.clip(wide_b / np.maximum(wide_a, 1.0), *GAINS)
+    return gain, middle_b - gain * middle_a
+
+
+def feathered(added: Cloud, kept: Cloud, width: float, fill: float) -> Cloud:
+    """The added points with colours blended into what is kept, over `width` from the seam; no point moves.
+
+    At the seam a point's colour is the mean of its own and its nearest kept neighbours'; the share of the neighbours
+    falls linearly to nothing.
+    """
+    if len(kept) < 8 or len(added) == 0 or added.colors is None or kept.colors is None:
+        return added
+    distance, partner = cKDTree(kept.points).query(added.points, k=4, workers=threads())
+    share = 0.5 * np.clip(1 - (distance[:, :1] - fill) / width, 0, 1)
+    around = kept.colors[partner].astype(np.float64).mean(1)
+    return replace(added, colors=_bytes((1 - share) * added.colors + share * around))
+
+
+def _bytes(colors: Array) -> NDArray[np.uint8]:
+    return np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+
+
+def frame_ledger(pose: Sim3 | None, object_json: Path | None, georeference_json: Path | None) -> dict[str, Any]:
+    """The transforms between the frames of one object (docs/frames.md), as quantities; null where one is not known.
+
+    Frames: `nerf` (normalised, what the field is trained in), `object` (the object's cameras), `scene`, `world`
+    (easting, northing, height in the scene's CRS, where it is georeferenced; the file's own coordinates where the scene
+    was given as a cloud), `file` (the own coordinates of an object that was given as a cloud).
+
+    Args:
+        pose: scene_from_object of the added points; None for an object that is not fused.
+        object_json: JSON of the object cloud, with `nerf_from_object` or `object_from_file`, or None.
+        georeference_json: JSON of the scene, with `crs_from_scene` where it is known, or None.
+
+    Raises:
+        StageError: a stored matrix is no similarity.
+    """
+    nerf = _read(object_json, "nerf_from_object")
+    file = _read(object_json, "object_from_file")
+    world = _read(georeference_json, "crs_from_scene")
+    world_from_object = world @ pose if world and pose else None
+    known = {
+        "nerf_from_object": nerf,
+        "object_from_file": file,
+        "scene_from_object": pose,
+        "world_from_scene": world,
+        "world_from_object": world_from_object,
+        "world_from_file": world_from_object @ file if world_from_object and file else None,
+        "scene_from_nerf": pose @ nerf.inverse() if pose and nerf else None,
+    }
+    content: dict[str, Any] = {}
+    for name, transform in known.items():
+        content[name] = quantity(None if transform is None else transform.matrix, "")
+        content[f"{name}_inverse_error"] = quantity(None if transform is None else round_trip(transform), "1")
+    return content
+
+
+def round_trip(transform: Sim3) -> float:
+    """Largest entry of T T^-1 - I: how well the inverse undoes the transform."""
+    return float(np.abs(transform.matrix @ transform.inverse().matrix - np.eye(4)).max())
+
+
+def _read(path: Path | None, name: str) -> Sim3 | None:
+    """One transform of a stage JSON, or None where the file does not hold it."""
+    entry = None if path is None else read_json(path).get(name)
+    if entry is None or entry["value"] is None:
+        return None
+    try:
+        return Sim3.from_matrix(np.array(entry["value"]))
+    except (ValueError, np.linalg.LinAlgError) as error:
+        raise StageError(f"{name} in {path} is {error}; delete the file and rerun its stage") from None

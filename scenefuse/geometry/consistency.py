@@ -12,7 +12,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from scenefuse.core.transforms import Array
-from scenefuse.geometry.depth_test import AT, BEHIND, IN_FRONT, place
+from scenefuse.geometry.depth_test import Where, place
 from scenefuse.photos.workspace import View
 
 # Views that a view is compared with at most: what more photos cost then grows with them, not with their square.
@@ -143,11 +143,11 @@ def _compare(points, compared, depths, masks, covered, intrinsics, frame_from_ca
                     counts[3, n] += 1
                 measured = depths[other, row, column]
                 found = place(z, measured, measured, tolerance)
-                if found == IN_FRONT:
+                if found == Where.IN_FRONT:
                     counts[1, n] += 1
-                elif found == BEHIND:
+                elif found == Where.BEHIND:
                     counts[2, n] += 1
-                elif found == AT:
+                elif found == Where.AT:
                     counts[0, n] += 1
                     # The other view's depth, taken along the ray through the point itself, not the pixel's centre.
                     for axis in range(3):
@@ -238,8 +238,8 @@ def _count(depth, other, there, back, max_error, max_px, agree, through):  # typ
                 off_x = (back[0, 0] * bx + back[0, 1] * by + back[0, 2] * e + back[0, 3]) / bz - (column + 0.5)
                 off_y = (back[1, 0] * bx + back[1, 1] * by + back[1, 2] * e + back[1, 3]) / bz - (row + 0.5)
                 near = off_x * off_x + off_y * off_y <= max_px * max_px
-                same |= near and place(z, e, e, max_error * z) == AT
-                behind &= (not near) and place(z, e, e, 0.0) == IN_FRONT
+                same |= near and place(z, e, e, max_error * z) == Where.AT
+                behind &= (not near) and place(z, e, e, 0.0) == Where.IN_FRONT
             if same:
                 agree[row, column] += np.uint16(1)
             elif behind:

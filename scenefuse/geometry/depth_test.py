@@ -8,6 +8,7 @@ Source: Merrell et al. 2007 (visibility constraints between depth maps).
 """
 
 from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,6 @@ from scenefuse.geometry.photo_kernel import MIN_COSINE
 from scenefuse.photos.pictures import read_depth
 from scenefuse.photos.workspace import View, posed_images, read_model, view_of
 
-OUTSIDE, UNKNOWN, IN_FRONT, AT, BEHIND = range(5)
 # Cosine of the angle between a normal and the direction to a camera, from which on a surface stands in the way.
 FACING_COSINE = 0.1
 # Side of a cell in spacings of the surface's points, so that a surface has no holes between them.
@@ -32,21 +32,32 @@ MIN_CELLS_HIDING, MIN_CELLS_BEHIND = 5, 7
 MIN_MEASURED = 0.1
 
 
+class Where(IntEnum):
+    """Where a point lies beside what a depth map shows on its ray."""
+
+    OUTSIDE = 0
+    """Of the picture."""
+    UNKNOWN = 1
+    IN_FRONT = 2
+    AT = 3
+    BEHIND = 4
+
+
 @vectorize(cache=True)
 def place(depth, nearest, farthest, tolerance):  # type: ignore[no-untyped-def]
-    """UNKNOWN, IN_FRONT, AT or BEHIND: a depth beside the nearest and the farthest that a map holds there, 0 for none.
+    """Where a depth lies beside the nearest and the farthest that a map holds there, 0 for none; never OUTSIDE.
 
     A NumPy ufunc that Numba's kernels also call.
     """
     if nearest > 0 and depth < nearest - tolerance:
-        return np.int8(IN_FRONT)
+        return np.int8(Where.IN_FRONT)
     if farthest > 0 and depth > farthest + tolerance:
-        return np.int8(BEHIND)
-    return np.int8(AT) if nearest > 0 and farthest > 0 else np.int8(UNKNOWN)
+        return np.int8(Where.BEHIND)
+    return np.int8(Where.AT) if nearest > 0 and farthest > 0 else np.int8(Where.UNKNOWN)
 
 
 def depth_test(points: Array, view: View, tolerance: float, farthest: Array | None = None) -> NDArray[np.int8]:
-    """(N,) where points (N, 3) lie beside a view's depth map: OUTSIDE of the picture, UNKNOWN, IN_FRONT, AT or BEHIND.
+    """(N,) where points (N, 3) lie beside a view's depth map, as values of `Where`.
 
     Args:
         points: in the view's world.
@@ -56,7 +67,7 @@ def depth_test(points: Array, view: View, tolerance: float, farthest: Array | No
     """
     rows, pixels, depth = view.visible(points)
     at = pixels[:, 1], pixels[:, 0]
-    found = np.full(len(points), OUTSIDE, np.int8)
+    found = np.full(len(points), Where.OUTSIDE, np.int8)
     found[rows] = place(depth, view.pixels[at], (view.pixels if farthest is None else farthest)[at], tolerance)
     return found
 
@@ -108,9 +119,9 @@ def see(points: Array, surface: Cloud, views: list[View], spacing: float, margin
     for view in views if len(surface) > 1 else ():
         nearest, farthest = _surface_in(surface, view, spacing)
         found = depth_test(points, nearest, margin, farthest)
-        in_view += found != OUTSIDE
-        hidden += found == BEHIND
-        through += found == IN_FRONT
+        in_view += found != Where.OUTSIDE
+        hidden += found == Where.BEHIND
+        through += found == Where.IN_FRONT
     return Visibility(in_view, hidden, through)
 
 
@@ -125,7 +136,7 @@ def shown_in(
     nearest, farthest = _surface_in(surface, view, spacing, both_sides=True)
     found, towards = depth_test(points, nearest, margin, farthest), view.centre - points
     front = (normals * towards).sum(1) >= MIN_COSINE * np.linalg.norm(towards, axis=1)
-    return np.asarray(front & (found != OUTSIDE) & (found != BEHIND))
+    return np.asarray(front & (found != Where.OUTSIDE) & (found != Where.BEHIND))
 
 
 def _surface_in(surface: Cloud, view: View, spacing: float, both_sides: bool = False) -> tuple[View, Array]:
@@ -169,8 +180,8 @@ class FreeSpace:
         measured, beyond = np.zeros(len(points), dtype=np.int64), np.zeros(len(points), dtype=np.int64)
         for view in self.views:
             found = depth_test(points, view, self.tolerance)
-            measured += found >= IN_FRONT
-            beyond += found == IN_FRONT
+            measured += found >= Where.IN_FRONT
+            beyond += found == Where.IN_FRONT
         seen = measured > 0
         if seen.mean() < MIN_MEASURED:
             return None

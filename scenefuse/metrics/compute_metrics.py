@@ -9,7 +9,7 @@ from scenefuse.cloud.clouds import read_cloud
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse.fuse_object import FROM_OBJECT
+from scenefuse.fuse.write import Source
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
 from scenefuse.register.agreement import registration_metrics
 
@@ -47,7 +47,7 @@ def compute_metrics(
     found["status"] = quantity(value(registration, "status"), "")
     content: dict[str, Any] = {"registration": found}
     if fused is not None:
-        part = completion_of(scene.points, read_cloud(fused), FROM_OBJECT, diagonal)
+        part = completion_of(scene.points, read_cloud(fused), Source.OBJECT, diagonal)
         radius = {"surface_variation_radius": quantity(variation_radius(part, settings), unit)}
         content["completion"] = completion_metrics([part], settings, seed) | radius
     _write(report, content)

@@ -10,8 +10,8 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import atomic_directory, read_json
 from scenefuse.core.transforms import Array, box_corners
-from scenefuse.fuse.measure import NERF_ONLY
-from scenefuse.fuse.missing import CLASSES, CONTRADICTED, NEVER_SEEN, UNTEXTURED
+from scenefuse.fuse.measure import Evidence
+from scenefuse.fuse.missing import Lack
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
 from scenefuse.photos.workspace import read_views
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, sides, upright
@@ -25,9 +25,9 @@ COLORS = {
     "unconfirmed": (150, 60, 170),
     "crop": (40, 95, 185),
     "object": (245, 170, 85),
-    NEVER_SEEN: (214, 38, 31),
-    UNTEXTURED: (52, 101, 196),
-    CONTRADICTED: (150, 60, 170),
+    Lack.NEVER_SEEN: (214, 38, 31),
+    Lack.UNTEXTURED: (52, 101, 196),
+    Lack.CONTRADICTED: (150, 60, 170),
 }
 # Points of an object's 3D view: with three objects and a scene, the page stays well below 15 MB.
 VIEW_POINTS = 150_000
@@ -209,7 +209,7 @@ def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Im
     """Scene points grey, added points coloured, those of them that no photo confirms in another colour."""
     tile, added = (430, 350), _added(join.after)
     kinds = join.after.fields.get("evidence", np.zeros(len(added), np.uint8))
-    unconfirmed = added & (kinds == NERF_ONLY)
+    unconfirmed = added & (kinds == Evidence.NERF_ONLY)
     shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
     colors = np.where(added[:, None], COLORS["added"], COLORS["scene"])
     colors = (np.where(unconfirmed[:, None], COLORS["unconfirmed"], colors) * shade).astype(np.uint8)
@@ -243,7 +243,7 @@ def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.floa
     images: list[Image | None] = [_plan_view(join, cloud, sizes, colors.astype(np.uint8), tile)]
     for turn, height in zip(turns, heights):
         images.append(render(cloud, orbit_camera(join.framed, turn, height, tile), sizes, colors.astype(np.uint8)))
-    counts = ", ".join(f"{name.replace('_', ' ')} {(kinds == kind).sum()}" for kind, name in CLASSES.items())
+    counts = ", ".join(f"{kind.name.lower().replace('_', ' ')} {(kinds == kind).sum()}" for kind in Lack)
     shown = f", the best {len(away)} shown" if len(away) < len(join.stations) else ""
     note = f"missing cells: {counts} (red, blue, purple); stations: {len(join.stations)}{shown}; see next_photos.csv"
     columns = ["from above, with the stations", *titles]

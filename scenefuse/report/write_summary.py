@@ -13,7 +13,7 @@ import pandas as pd
 
 from scenefuse.core.stage import atomic_file
 from scenefuse.core.version import VERSION
-from scenefuse.fuse.missing import CLASSES
+from scenefuse.fuse.missing import Lack
 from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.disk import disk_line, disk_table
 from scenefuse.report.run_summary import (
@@ -283,7 +283,8 @@ def _still_missing(fusion: Fields) -> str:
     if share is None:
         return ""
     shares = (
-        f"{name.replace('_', ' ')} {_three(100 * find(fusion, f'missing.{name}'))} %" for name in CLASSES.values()
+        f"{name.replace('_', ' ')} {_three(100 * find(fusion, f'missing.{name}'))} %"
+        for name in (k.name.lower() for k in Lack)
     )
     text = f"{_three(100 * share)} % of {find(fusion, 'missing.of') or 'its surface'} ({', '.join(shares)})"
     stations, shows = find(fusion, "missing.stations"), find(fusion, "missing.stations_show")

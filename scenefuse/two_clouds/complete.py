@@ -22,12 +22,11 @@ from scenefuse.core.stage import StageError, quantity, scratch_directory, write_
 from scenefuse.core.transforms import Sim3
 from scenefuse.core.version import VERSION
 from scenefuse.fuse.fuse_object import possible
-from scenefuse.fuse.measure import unchecked, with_normals
+from scenefuse.fuse.measure import unchecked
 from scenefuse.fuse.modes import NEAR_SPACINGS, FusionSettings, color_notes, fuse_by_distance
 from scenefuse.fuse.write import (
-    FROM_OBJECT,
-    FROM_SCENE,
     Changes,
+    Source,
     together,
     was_completed,
     with_source,
@@ -90,8 +89,6 @@ def complete(
     """
     start = time.perf_counter()
     settings, notes = possible(settings, False, False)
-    if scene.like.normals is not None:
-        obj = with_normals(obj)
     moved, reach = scene_from_object.apply(obj.points), max(NEAR_SPACINGS * spacing(scene.part.points), around)
     rows, near = scene.near(moved.min(0) - reach, moved.max(0) + reach)
     fused = fuse_by_distance(obj, near, scene.part if scene.every == 1 else near, scene_from_object, settings)
@@ -103,7 +100,7 @@ def complete(
     left_out = sorted({*near.fields, *obj.fields} - known)
     if left_out:
         notes.append(f"completed.ply leaves out the columns {', '.join(left_out)}")
-    source = scene.last + 1 if was_completed(near) else FROM_OBJECT
+    source = scene.last + 1 if was_completed(near) else Source.OBJECT
     changes, added = fused.changes(rows), with_source(fused.added, source)
     after = together(changes.left_of(rows, near), added)
     return Completed(
@@ -141,10 +138,10 @@ def _write_report(path: Path, done: Completed, object: Path, scene: CloudFile, n
         print(f"note       {note}", flush=True)
     crs = las_crs(scene.summary.path)
     unit, name = ("scene units", None) if crs is None else unit_and_name(crs)
-    earlier = {str(number): f"{number} in {scene.summary.path.name}" for number in range(FROM_OBJECT, done.source)}
+    earlier = {str(number): f"{number} in {scene.summary.path.name}" for number in range(Source.OBJECT, done.source)}
     kept = scene.summary.count - len(done.removed)
     content = {
-        "sources": quantity({str(FROM_SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
+        "sources": quantity({str(Source.SCENE): "scene", **earlier, str(done.source): object.stem}, ""),
         "points": quantity(kept + len(done.added), "points"),
         "scene_points": quantity(kept, "points"),
         "removed_points": quantity(len(done.removed), "points"),
@@ -205,7 +202,7 @@ def append_to_las(path: Path, scene: CloudFile, done: Completed) -> list[str]:
                 if "red" in own:
                     brightest = max(brightest, *(int(np.max(part[name], initial=0)) for name in COLOR))
                 if not again:
-                    unknown = with_source(unchecked(Cloud(np.zeros((len(chunk), 3)))), FROM_SCENE).fields
+                    unknown = with_source(unchecked(Cloud(np.zeros((len(chunk), 3)))), Source.SCENE).fields
                     _fill_in(part, {names[name]: values for name, values in unknown.items()})
                 writer.write_points(part)
             colors = 1 if 0 < brightest <= 255 else 257

@@ -24,11 +24,10 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
 from scenefuse.core.stage import StageError, read_json, run, threads, value
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.fuse.evidence import around, fuse_by_evidence
 from scenefuse.fuse.fuse_object import uncertainty_on_scene
-from scenefuse.fuse.measure import MEASURED
-from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
-from scenefuse.fuse.write import FROM_OBJECT, together
+from scenefuse.fuse.measure import Evidence
+from scenefuse.fuse.modes import FusionSettings, around, fuse_by_distance, fuse_by_evidence
+from scenefuse.fuse.write import Source, together
 from scenefuse.geometry.icp import step_to_planes
 from scenefuse.geometry.photo_check import CONFIRMING_PHOTOS, moved_photos, read_photos
 from scenefuse.metrics.evaluate_object import (
@@ -242,8 +241,8 @@ def certificate_rows(case: Case) -> Iterator[dict[str, Any]]:
     evidence, fused = read_json(folder / "evidence.json"), read_cloud(folder / "fused.ply")
     settled = Sim3.from_matrix(np.array(value(read_json(folder / "fusion.json"), "scene_from_object")))
     truth_from_scene = case.known.fit.truth_from_model @ settled.inverse()
-    added = fused[fused.fields["source"] == FROM_OBJECT]
-    measured = (added.fields["evidence"] == MEASURED) & (added.fields["photos"] >= CONFIRMING_PHOTOS)
+    added = fused[fused.fields["source"] == Source.OBJECT]
+    measured = (added.fields["evidence"] == Evidence.MEASURED) & (added.fields["photos"] >= CONFIRMING_PHOTOS)
     placed = truth_from_scene.apply(added.points[measured])
     aligned = surface_alignment(placed, case.known)
     points, bounds = aligned.apply(placed), 2 * truth_from_scene.scale * added.fields["deviation"][measured]

@@ -3,9 +3,9 @@
 import numpy as np
 
 from scenefuse.cloud.clouds import write_cloud
-from scenefuse.fuse.compare import KEPT, REPLACED
+from scenefuse.fuse.compare import Reason
 from scenefuse.fuse.measure import unchecked
-from scenefuse.fuse.write import FROM_OBJECT, with_source
+from scenefuse.fuse.write import Source, with_source
 
 
 def write_changes(folder, scene, added, rows=(), removed=(), evidence=0):
@@ -14,6 +14,6 @@ def write_changes(folder, scene, added, rows=(), removed=(), evidence=0):
     checked = unchecked(scene[rows])
     checked.fields["evidence"][:] = evidence
     checked.fields["row"] = rows.astype(np.uint32)
-    checked.fields["reason"] = np.where(np.isin(rows, removed), REPLACED, KEPT).astype(np.uint8)
+    checked.fields["reason"] = np.where(np.isin(rows, removed), Reason.REPLACED, Reason.KEPT).astype(np.uint8)
     write_cloud(folder / "checked.ply", checked)
-    write_cloud(folder / "fused.ply", with_source(unchecked(added), FROM_OBJECT))
+    write_cloud(folder / "fused.ply", with_source(unchecked(added), Source.OBJECT))

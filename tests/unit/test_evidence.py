@@ -9,16 +9,15 @@ from support.photographed_plane import BLANK, photographs
 from scenefuse.cloud.clouds import Cloud, concatenate
 from scenefuse.core.stage import value
 from scenefuse.core.transforms import Sim3
-from scenefuse.fuse import compare, evidence
+from scenefuse.fuse import compare, modes
 from scenefuse.fuse.compare import (
-    KEPT,
-    REPLACED,
-    SEEN_THROUGH,
+    Reason,
     better_measured,
 )
-from scenefuse.fuse.evidence import check, evidence_report, fuse_by_evidence, settle
-from scenefuse.fuse.measure import FIELDS, MEASURED, NERF_ONLY, STEREO_ONLY, Measured, with_pose_uncertainty
-from scenefuse.fuse.modes import FusionSettings
+from scenefuse.fuse.fuse_object import evidence_report
+from scenefuse.fuse.measure import FIELDS, Evidence, Measured, deviations_of_pose
+from scenefuse.fuse.modes import FusionSettings, check, fuse_by_evidence
+from scenefuse.fuse.settle import settle
 from scenefuse.geometry.photo_check import Matches, moved_photos, pack
 
 NOBODY = pack([])
@@ -50,23 +49,25 @@ def test_the_sharper_side_stays_where_both_measured(near, far):
     found = check(obj, scene, near, far, nerf_only=False)
     assert found.added.mean() > 0.97
     inside, outside = scene.points[:, 0] < 0.3, scene.points[:, 0] > 0.5
-    assert (found.reason[inside] == REPLACED).mean() > 0.95 and (found.reason[outside] == KEPT).all()
-    assert (found.scene.fields["evidence"][outside] == MEASURED).mean() > 0.9
+    assert (found.reason[inside] == Reason.REPLACED).mean() > 0.95 and (found.reason[outside] == Reason.KEPT).all()
+    assert (found.scene.fields["evidence"][outside] == Evidence.MEASURED).mean() > 0.9
     # The other way round the scene is the sharper one, and nothing comes in where it is.
     farther = pack(photographs(8, 9.0, radius=6.0))
     found = check(scene, obj, farther, near, nerf_only=False)
     assert found.added[scene.points[:, 0] < 0.3].mean() < 0.05 and found.added[scene.points[:, 0] > 0.5].mean() > 0.9
-    assert (found.reason == KEPT).all()
+    assert (found.reason == Reason.KEPT).all()
 
 
 def test_a_rough_object_does_not_take_the_place_of_a_smooth_scene(near, far):
     rough, smooth = sheet(-0.8, 0.8, 0.015, noise=0.012), sheet(-0.8, 0.8, 0.02)
     found = check(rough, smooth, near, far, nerf_only=False)
     inside = np.abs(smooth.points[:, 0]) < 0.6
-    assert (found.reason[inside] == KEPT).mean() > 0.95 and found.added[np.abs(rough.points[:, 0]) < 0.6].mean() < 0.02
+    assert (found.reason[inside] == Reason.KEPT).mean() > 0.95 and found.added[
+        np.abs(rough.points[:, 0]) < 0.6
+    ].mean() < 0.02
     # A rough scene gives way to a smooth object.
     found = check(smooth, rough, near, far, nerf_only=False)
-    assert (found.reason[np.abs(rough.points[:, 0]) < 0.6] != KEPT).mean() > 0.95 and found.added.mean() > 0.95
+    assert (found.reason[np.abs(rough.points[:, 0]) < 0.6] != Reason.KEPT).mean() > 0.95 and found.added.mean() > 0.95
 
 
 def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):
@@ -74,7 +75,7 @@ def test_ground_beside_an_object_stays_where_photos_confirm_it(near, far):
     obj, scene = sheet(-0.8, 0.0, 0.02), sheet(-0.8, 0.8, 0.12)
     found = check(obj, scene, near, far, nerf_only=False)
     beside = (scene.points[:, 0] > 0.03) & (scene.points[:, 0] < 0.17) & (np.abs(scene.points[:, 1]) < 0.9)
-    assert beside.any() and (found.reason[beside] == KEPT).all()
+    assert beside.any() and (found.reason[beside] == Reason.KEPT).all()
 
 
 def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_object(near, far):
@@ -84,7 +85,7 @@ def test_what_photos_see_through_goes_from_the_scene_and_does_not_come_with_the_
     obj = concatenate([sheet(-0.8, 0.8, 0.03), floating])
     found = check(obj, scene, near, far, nerf_only=True)
     middle = np.abs(scene.points[:, 1]) < 0.6
-    assert (found.reason[above & middle] == SEEN_THROUGH).all()
+    assert (found.reason[above & middle] == Reason.SEEN_THROUGH).all()
     last = np.arange(len(obj)) >= len(obj) - len(floating)
     last &= np.abs(obj.points[:, 1]) < 0.6
     assert not found.added[last].any() and found.contradicted[last].all()
@@ -95,16 +96,16 @@ def test_what_the_scene_measured_goes_only_where_something_is_left_beside_it(nea
     holed = obj.points[:, 0] > 0.1
     monkeypatch.setattr(compare, "better_measured", lambda *_: (np.ones(len(scene), dtype=bool), holed))
     found = check(obj, scene, near, far, nerf_only=False)
-    assert (found.reason[scene.points[:, 0] < 0.0] == REPLACED).all()
+    assert (found.reason[scene.points[:, 0] < 0.0] == Reason.REPLACED).all()
     inside = (scene.points[:, 0] > 0.25) & (scene.points[:, 0] < 0.35) & (np.abs(scene.points[:, 1]) < 0.8)
-    assert inside.any() and (found.reason[inside] == KEPT).all()
+    assert inside.any() and (found.reason[inside] == Reason.KEPT).all()
 
 
 def test_of_a_very_dense_scene_some_points_are_checked_and_the_others_follow(near, far, monkeypatch):
     floating = sheet(-0.2, 0.2, 0.03, z=0.3)
     obj, scene = sheet(-0.8, 0.4, 0.03), concatenate([sheet(-0.8, 0.8, 0.02), floating])
     whole = check(obj, scene, near, far, nerf_only=False)
-    monkeypatch.setattr(evidence, "MAX_CHECKED", len(scene) // 2)
+    monkeypatch.setattr(modes, "MAX_CHECKED", len(scene) // 2)
     some = check(obj, scene, near, far, nerf_only=False)
     assert len(some.reason) == len(some.scene) == len(scene) and set(some.scene.fields) == set(FIELDS)
     assert (some.reason == whole.reason).mean() > 0.97 and (some.added == whole.added).mean() > 0.97
@@ -117,9 +118,11 @@ def test_what_no_photo_confirms_is_told_apart_and_added_only_on_demand(near, far
     scene = concatenate([sheet(-0.5, 0.0, 0.06), sheet(BLANK + 0.4, BLANK + 0.5, 0.06)])
     found = check(obj, scene, near, far, nerf_only=False)
     last = slice(-len(blank), None)
-    assert (found.obj.fields["evidence"][last] == NERF_ONLY).all() and not found.added[last].any()
+    assert (found.obj.fields["evidence"][last] == Evidence.NERF_ONLY).all() and not found.added[last].any()
     beyond = scene.points[:, 0] > BLANK
-    assert (found.scene.fields["evidence"][beyond] == STEREO_ONLY).all() and (found.reason[beyond] == KEPT).all()
+    assert (found.scene.fields["evidence"][beyond] == Evidence.STEREO_ONLY).all() and (
+        found.reason[beyond] == Reason.KEPT
+    ).all()
     assert check(obj, scene, near, far, nerf_only=True).added[last].mean() > 0.8
 
 
@@ -174,11 +177,9 @@ def test_one_wrong_camera_changes_little(near, far):
 
 def test_the_pose_adds_along_the_normal_what_it_may_be_off():
     cloud = Cloud(np.array([[2.0, 0, 0], [0, 0, 1]]), np.array([[0, 0, 1], [0, 0, 1]], np.float32))
-    cloud = replace(cloud, fields={"deviation": np.array([0.3, 0.3], np.float32)})
     turn_y, shift_z, scale = (np.diag(sd) for sd in np.eye(7)[[1, 5, 6]] * [[0.2], [0.4], [0.5]])
-    for deviation, expected in ((turn_y, [0.5, 0.3]), (shift_z, [0.5, 0.5]), (scale, [0.3, np.hypot(0.3, 0.5)])):
-        found = with_pose_uncertainty(cloud, deviation**2, np.zeros(3)).fields["world_deviation"]
-        np.testing.assert_allclose(found, expected, rtol=1e-6)
+    for deviation, expected in ((turn_y, [0.4, 0.0]), (shift_z, [0.4, 0.4]), (scale, [0.0, 0.5])):
+        np.testing.assert_allclose(deviations_of_pose(cloud, deviation**2, np.zeros(3)), expected, atol=1e-9)
 
 
 def test_what_moved_between_flight_and_close_ups_takes_nothing_from_the_scene_and_is_said(near, far):
@@ -200,7 +201,9 @@ def test_a_side_without_photos_is_judged_by_the_other(near, far, without):
         assert len(fused.added) == len(fused.removed) == 0 and any("nothing is added" in note for note in notes)
     else:
         assert any(f"photos of the {without} see it" in note for note in notes)
-        assert (fused.added.points[:, 0] > 0.3).sum() > 500 and (fused.added.fields["evidence"] == MEASURED).all()
+        assert (fused.added.points[:, 0] > 0.3).sum() > 500 and (
+            fused.added.fields["evidence"] == Evidence.MEASURED
+        ).all()
 
 
 def test_clouds_without_normals_or_colors_and_a_scene_far_away(near, far):
@@ -214,7 +217,10 @@ def test_clouds_without_normals_or_colors_and_a_scene_far_away(near, far):
 
 def test_every_point_says_what_is_known_of_it(near, far):
     obj, scene = sheet(-0.8, 0.8, 0.03), concatenate([sheet(-0.8, 0.2, 0.06), sheet(8, 9, 0.06)])
-    fused, checked = fuse_by_evidence(obj, scene, near, far, FusionSettings())
+    up_and_down = np.diag([0, 0, 0, 0, 0, 0.1**2, 0])
+    fused, checked = fuse_by_evidence(obj, scene, near, far, FusionSettings(), on_world=up_and_down)
+    of_both = np.hypot(fused.added.fields["deviation"], 0.1)
+    np.testing.assert_allclose(fused.added.fields["world_deviation"], of_both, rtol=1e-2)
     assert set(FIELDS) == set(fused.added.fields) == set(fused.scene.fields)
     assert (fused.added.fields["photos"] >= 3).all() and (fused.added.fields["deviation"] < 0.02).all()
     beyond = fused.scene.points[:, 0] > 5
@@ -239,8 +245,8 @@ def test_a_pot_before_a_wall_stays_where_photos_confirm_it():
     # The object is the wall and a sill as high as the pot, so that the pot lies in its box.
     obj = concatenate([sheet(-0.8, 0.8, 0.03), sheet(0.7, 0.8, 0.03, z=0.32)])
     found = check(obj, scene, photos, flight, nerf_only=False)
-    assert (found.scene.fields["evidence"][-len(pot) :] == MEASURED).mean() > 0.95
-    assert (found.reason[-len(pot) :] == KEPT).mean() > 0.95
+    assert (found.scene.fields["evidence"][-len(pot) :] == Evidence.MEASURED).mean() > 0.95
+    assert (found.reason[-len(pot) :] == Reason.KEPT).mean() > 0.95
 
 
 def test_the_objects_points_give_way_to_better_ones_within_a_spacing_only(near):
@@ -258,7 +264,7 @@ def test_of_equals_the_denser_side_stays(near, far):
         found = check(obj, scene, near, near, nerf_only=False)
         middle, around = (np.abs(cloud.points[:, :2]).max(1) < 0.6 for cloud in (obj, scene))
         assert (found.added[middle].mean() > 0.95) == added
-        assert ((found.reason[around] == KEPT).mean() < 0.05) == added
+        assert ((found.reason[around] == Reason.KEPT).mean() < 0.05) == added
 
 
 def test_in_a_hole_of_a_denser_scene_the_objects_points_are_added(near, far):
@@ -278,7 +284,7 @@ def test_doubles_do_not_make_a_scene_dense(near):
 def test_a_scene_of_which_nothing_is_measured_gives_way(near, far):
     obj, floating = sheet(-0.8, 0.4, 0.03), sheet(-0.2, 0.2, 0.06, z=0.3)
     found = check(obj, floating, near, far, nerf_only=False)
-    assert found.added.mean() > 0.9 and (found.reason != KEPT).mean() > 0.9
+    assert found.added.mean() > 0.9 and (found.reason != Reason.KEPT).mean() > 0.9
 
 
 @pytest.mark.parametrize(("inexact", "stay"), [(0.02, True), (0.004, False)])

@@ -9,8 +9,8 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, spacing, write_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.fuse_object import FusionInputs, FusionOutputs, fuse_object
-from scenefuse.fuse.modes import FusionSettings, feathered, fuse_by_distance, match_colors
-from scenefuse.fuse.write import read_changes
+from scenefuse.fuse.modes import FusionSettings, fuse_by_distance
+from scenefuse.fuse.write import feathered, match_colors, read_changes
 
 SETTINGS = FusionSettings(mode="fill", density=1.0)
 

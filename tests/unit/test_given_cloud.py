@@ -17,12 +17,12 @@ from scenefuse.cloud.clouds import Cloud, read_cloud, write_cloud
 from scenefuse.cloud.write_las import write_laz
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import fit_sim3
+from scenefuse.fuse.write import frame_ledger
 from scenefuse.georef.georeference import camera_poses, georegister
 from scenefuse.georef.given_cloud import import_posed_cloud
 from scenefuse.georef.placement import GeoreferenceSettings
 from scenefuse.photos.geodesy import scene_frame
 from scenefuse.photos.workspace import read_views
-from scenefuse.register.frame_ledger import frame_ledger
 
 FLIGHT = fly()
 SCALE = 2.5

@@ -18,8 +18,8 @@ from scenefuse.core.transforms import Sim3
 from scenefuse.crop.crop_scene import points_in
 from scenefuse.fuse.fuse_object import possible
 from scenefuse.fuse.modes import FusionSettings
+from scenefuse.fuse.write import frame_ledger
 from scenefuse.photos.geodesy import scene_frame
-from scenefuse.register.frame_ledger import frame_ledger
 
 
 @pytest.fixture

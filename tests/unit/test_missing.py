@@ -14,7 +14,7 @@ from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.fuse.find_missing import COLUMNS, MissingInputs, MissingOutputs, find_missing, photo_rows
-from scenefuse.fuse.missing import CONTRADICTED, NEVER_SEEN, UNTEXTURED, find_missing_surface
+from scenefuse.fuse.missing import Lack, find_missing_surface
 from scenefuse.fuse.next_photos import Plan, plan_stations
 from scenefuse.geometry.photo_check import pack
 from scenefuse.photos.geodesy import LocalFrame
@@ -66,13 +66,16 @@ def test_a_sphere_photographed_from_all_sides_lacks_nothing_but_its_foot():
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     assert missing.covered_cells > 1000
     assert (missing.cells.points[:, 2] < CENTER[2] - 0.6 * RADIUS).all()
-    assert missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.002
+    assert missing.share(Lack.UNTEXTURED) + missing.share(Lack.CONTRADICTED) < 0.002
 
 
 def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(half):
     photos, masks, cloud = half
     missing = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
-    assert missing.share(NEVER_SEEN) > 0.1 and missing.share(UNTEXTURED) + missing.share(CONTRADICTED) < 0.02
+    assert (
+        missing.share(Lack.NEVER_SEEN) > 0.1
+        and missing.share(Lack.UNTEXTURED) + missing.share(Lack.CONTRADICTED) < 0.02
+    )
     plan = plan_stations(missing, cloud, cloud, photos.views, UP)
     # The photos are from y > 0.
     assert all(station.photos[1].centre[1] < CENTER[1] for station in plan.stations)
@@ -87,7 +90,7 @@ def test_the_side_without_photos_was_never_seen_and_stations_stand_before_it(hal
     assert after < 0.5 * before
 
 
-@pytest.mark.parametrize(("waves", "kind"), [(0.0, UNTEXTURED), (30.0, CONTRADICTED)])
+@pytest.mark.parametrize(("waves", "kind"), [(0.0, Lack.UNTEXTURED), (30.0, Lack.CONTRADICTED)])
 def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
     photos, masks = photographed(2 * np.pi, waves=waves)
     obj = shown(ball(), photos.views)
@@ -96,7 +99,7 @@ def test_points_that_no_photo_confirms_are_told_apart_by_texture(waves, kind):
     top = missing.cells[missing.cells.points[:, 2] > CENTER[2]]
     assert len(top) > 100 and (top.fields["missing"] == kind).mean() > 0.9
     stations = plan_stations(missing, obj, obj, photos.views, UP).stations
-    assert (len(stations) > 0 and stations[0].photos[1].centre[2] > CENTER[2]) == (kind == CONTRADICTED)
+    assert (len(stations) > 0 and stations[0].photos[1].centre[2] > CENTER[2]) == (kind == Lack.CONTRADICTED)
 
 
 def test_what_photos_see_through_is_not_missing(half):
@@ -104,7 +107,7 @@ def test_what_photos_see_through_is_not_missing(half):
     floating = Cloud(CENTER + [0, RADIUS + 0.4, 0] + 0.2 * (ball(500).points - CENTER), ball(500).normals)
     alone = find_missing_surface(cloud, cloud, (photos, NOBODY), masks)
     both = find_missing_surface(concatenate([cloud, floating]), cloud, (photos, NOBODY), masks)
-    assert both.seen_through > 200 and abs(both.share(NEVER_SEEN) - alone.share(NEVER_SEEN)) < 0.05
+    assert both.seen_through > 200 and abs(both.share(Lack.NEVER_SEEN) - alone.share(Lack.NEVER_SEEN)) < 0.05
     assert not (both.cells.points[:, 1] > CENTER[1] + RADIUS).any()
 
 

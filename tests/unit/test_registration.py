@@ -12,6 +12,7 @@ from support.planted import errors, plant
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, value, write_json
 from scenefuse.core.transforms import Sim3
+from scenefuse.fuse.write import frame_ledger, round_trip
 from scenefuse.geometry.depth_test import read_free_space
 from scenefuse.geometry.icp import ScaleRange, refine_planes, refine_points
 from scenefuse.geometry.surface import pair, prepare
@@ -27,7 +28,6 @@ from scenefuse.register.coarse import (
 )
 from scenefuse.register.decision import FineSettings
 from scenefuse.register.fine import register_finely, scale_ledger
-from scenefuse.register.frame_ledger import frame_ledger, round_trip
 from scenefuse.register.problem import Alignment, Constraints, Inputs, Problem, ScaleSettings, estimates, prior
 from scenefuse.register.refinement import refine_hypotheses
 from scenefuse.register.score import color_agreement, score

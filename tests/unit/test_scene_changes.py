@@ -7,7 +7,7 @@ from support.changed_scene import write_changes
 from scenefuse.cloud import tiled_cloud
 from scenefuse.cloud.clouds import Cloud, concatenate, write_cloud
 from scenefuse.cloud.tiled_cloud import open_cloud
-from scenefuse.fuse.measure import MEASURED, STEREO_ONLY
+from scenefuse.fuse.measure import Evidence
 from scenefuse.fuse.write import added_by, after_fusion, merged, read_changes
 
 
@@ -24,11 +24,11 @@ def changes(folder, scene, rows, removed, evidence):
 
 
 def test_what_is_left_of_parts_is_what_is_left_of_all(tmp_path, scene):
-    found = changes(tmp_path / "a", scene, [3, 300, 301, 990], [300, 990], MEASURED)
+    found = changes(tmp_path / "a", scene, [3, 300, 301, 990], [300, 990], Evidence.MEASURED)
     rows = np.arange(1000)
     whole = found.left_of(rows, scene)
     assert np.array_equal(whole.points[:, 0], np.setdiff1d(rows, [300, 990]))
-    assert whole.points[whole.fields["evidence"] == MEASURED, 0].tolist() == [3, 301]
+    assert whole.points[whole.fields["evidence"] == Evidence.MEASURED, 0].tolist() == [3, 301]
     parts = concatenate([found.left_of(part, scene[part]) for part in np.split(rows, [0, 4, 300, 301, 700])])
     assert np.array_equal(parts.points, whole.points)
     assert np.array_equal(parts.fields["evidence"], whole.fields["evidence"])
@@ -36,12 +36,12 @@ def test_what_is_left_of_parts_is_what_is_left_of_all(tmp_path, scene):
 
 
 def test_a_point_goes_if_any_object_takes_it_away_and_what_one_measured_stays_known(tmp_path, scene):
-    one = changes(tmp_path / "one", scene, [1, 2, 3, 4], [2], MEASURED)
-    two = changes(tmp_path / "two", scene, [2, 3, 4, 5], [4], STEREO_ONLY)
+    one = changes(tmp_path / "one", scene, [1, 2, 3, 4], [2], Evidence.MEASURED)
+    two = changes(tmp_path / "two", scene, [2, 3, 4, 5], [4], Evidence.STEREO_ONLY)
     for order in ([one, two], [two, one]):
         both = merged(order)
         assert both.rows.tolist() == [1, 2, 3, 4, 5] and both.rows[both.removed].tolist() == [2, 4]
-        assert both.fields["evidence"].tolist() == [MEASURED] * 4 + [STEREO_ONLY]
+        assert both.fields["evidence"].tolist() == [Evidence.MEASURED] * 4 + [Evidence.STEREO_ONLY]
     assert len(merged([]).left_of(np.arange(1000), scene)) == 1000
 
 

@@ -15,7 +15,7 @@ from completed_scene import bad_object, perfect_scene, read_case, scores
 from rules import Rule
 
 from scenefuse.cloud.clouds import Cloud, read_cloud
-from scenefuse.fuse import evidence, measure
+from scenefuse.fuse import measure, modes
 from scenefuse.fuse.modes import FusionSettings
 from scenefuse.fuse.write import together
 from scenefuse.geometry import photo_check, photo_kernel
@@ -32,7 +32,7 @@ def constant(value: Any) -> Any:
     return lambda before: value
 
 
-COMPARE, MEASURE, EVIDENCE = (f"scenefuse.fuse.{name}" for name in ("compare", "measure", "evidence"))
+COMPARE, MEASURE, SETTLE = (f"scenefuse.fuse.{name}" for name in ("compare", "measure", "settle"))
 CHECK, KERNEL = "scenefuse.geometry.photo_check", "scenefuse.geometry.photo_kernel"
 RULES = [
     Rule("what photos see through goes", f"{COMPARE}.THROUGH_PHOTOS", constant(10**9)),
@@ -52,9 +52,9 @@ RULES = [
     Rule("something is left beside it", f"{COMPARE}._alone", lambda f: lambda a, b, reach: np.zeros(len(a), bool)),
     Rule("most neighbours are measured", f"{MEASURE}.SUPPORT", constant(0.0)),
     Rule("neighbours by the diagonal, not eight", f"{MEASURE}.MAX_NEIGHBOURS", constant(8)),
-    Rule("settling", f"{EVIDENCE}.settle", lambda f: lambda *_: None),
-    Rule("the more certain one of both poses", f"{EVIDENCE}.MIN_MISPLACED", constant(0.0)),
-    Rule("the scale settles where it is certain", f"{EVIDENCE}.MAX_SPREAD", constant(0.0)),
+    Rule("settling", "scenefuse.fuse.modes.settle", lambda f: lambda *_: None),
+    Rule("the more certain one of both poses", f"{SETTLE}.MIN_MISPLACED", constant(0.0)),
+    Rule("the scale settles where it is certain", f"{SETTLE}.MAX_SPREAD", constant(0.0)),
     Rule("photos of half the size", f"{CHECK}.HALVINGS", constant(0)),
     Rule("a deviation of 1.2 pixels at most", f"{CHECK}.MAX_DEVIATION_PX", constant(np.inf)),
     Rule("no other offset is better", f"{CHECK}.MAX_DROP", constant(9.0)),
@@ -99,7 +99,7 @@ def evaluate(trial: int, rule: Rule | None) -> dict[str, Any]:
     _compile(photo_kernel.REFERENCES, photo_kernel.GREY_FALL)
     measure.match_in = photo_check.match_in if changes_matching else _matched
     case, placed, own, theirs = _case(trial)
-    fused, _ = evidence.fuse_by_evidence(placed, case.scene, own, theirs, FusionSettings(), case.uncertainty)
+    fused, _ = modes.fuse_by_evidence(placed, case.scene, own, theirs, FusionSettings(), case.uncertainty)
     found = scores(case, together(fused.kept, fused.added))
     return {
         "kind": case.name + (", spoilt" if trial >= len(OBJECTS) else ""),
