@@ -1,17 +1,16 @@
 """The page to click in, served as for a person, and what a person does with it in a real browser."""
 
+import multiprocessing
 import os
 import re
-import subprocess
-import sys
 import time
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from scenefuse.marks.clicks import read_points
 from scenefuse.pick.photo_tiles import Picture
+from scenefuse.pick.pick import pick
 
-ROOT = Path(__file__).resolve().parents[2]
 # The page comes from this machine, and from nowhere else.
 LOCAL = "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE 127.0.0.1"
 PATIENCE_S = 60
@@ -20,30 +19,37 @@ MASK = "img.leaflet-image-layer"
 
 @contextmanager
 def served(folder, name="shed", config="mine.yaml"):
-    """The address of a page of an object of the project in a folder, and the server's process."""
-    # NiceGUI would take the server for one of its own tests.
-    env = {name: text for name, text in os.environ.items() if not name.startswith("PYTEST")}
-    command = [
-        sys.executable,
-        ROOT / "scripts/pick.py",
-        "--object",
-        name,
-        "--configfile",
-        config,
-        "--no-browser",
-    ]
-    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=env)
-    assert server.stdout is not None
+    """The address of a page of an object of the project in a folder, and the server's process.
+
+    The process is a copy of one that has imported the page's code.
+    """
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["scenefuse.pick.pick"])
+    printed, child = context.Pipe(duplex=False)
+    server = context.Process(target=_serve, args=(folder, name, config, child))
+    server.start()
+    child.close()
     try:
-        printed = ""
-        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", printed)):
-            line = server.stdout.readline()
-            assert line, printed
-            printed += line
+        text = ""
+        while not (found := re.search(r"http://127\.0\.0\.1:\d+/\?token=\S+", text)):
+            part = os.read(printed.fileno(), 4096).decode()
+            assert part, text
+            text += part
         yield found[0], server
     finally:
         server.terminate()
-        server.communicate(timeout=PATIENCE_S)
+        server.join(PATIENCE_S)
+
+
+def _serve(folder, name, config, output):
+    for stream in (1, 2):
+        os.dup2(output.fileno(), stream)
+    # NiceGUI serves in a main process alone, and takes one that knows of pytest for one of its own tests.
+    multiprocessing.current_process().name = "MainProcess"
+    for variable in [variable for variable in os.environ if variable.startswith("PYTEST")]:
+        del os.environ[variable]
+    os.chdir(folder)
+    pick(object=name, configfile=(Path(config),), no_browser=1)
 
 
 class Page:
