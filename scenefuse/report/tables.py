@@ -4,6 +4,8 @@ A run may be partial: a value that does not exist is empty, an object without re
 """
 
 import itertools
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,8 @@ from scenefuse.metrics.scores import SCORES, THRESHOLDS
 from scenefuse.report.run_summary import ObjectSummary, RunSummary, SceneSummary, why_missing
 from scenefuse.report.values import Fields, find, number
 
+# Of the jobs of a rule: by the clock, of the processor, and as they were forecast.
+SECONDS = ("seconds", "processor_seconds", "forecast_seconds")
 # What stands beside the value of a completion metric.
 BESIDE = ("null", "before", "after")
 # Columns of the tables, and where each value stands: the first that is there.
@@ -101,26 +105,33 @@ def completion_table(run: RunSummary) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=["object", "measure", "unit", "value", *BESIDE])
 
 
-def runtime_table(benchmarks: Path) -> pd.DataFrame:
-    """One row a rule and a last row `total`: jobs, seconds summed over its jobs, the longest, the largest memory."""
+def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFrame:
+    """One row a rule and a last row `total`: jobs, seconds by the clock, of the processor and forecast, largest memory.
+
+    Args:
+        benchmarks: folder of Snakemake's benchmarks.
+        forecast: processor seconds by a benchmark's file.
+    """
     rows = []
     for path in sorted(benchmarks.rglob("*.tsv")) if benchmarks.is_dir() else []:
         try:
             table = pd.read_csv(path, sep="\t", na_values=["-", "NA"])
-            seconds, memory = table["s"].astype(float).sum(), table["max_rss"].astype(float).max()
+            clock, processor = table["s"].astype(float).sum(), table["cpu_time"].astype(float).sum()
+            memory = table["max_rss"].astype(float).max()
         except (OSError, ValueError, KeyError, pd.errors.ParserError):
             continue
-        rows.append((path.relative_to(benchmarks).parts[0].removesuffix(".tsv"), seconds, memory))
-    jobs = pd.DataFrame(rows, columns=["rule", "seconds", "max_rss_mb"])
+        rule = path.relative_to(benchmarks).parts[0].removesuffix(".tsv")
+        rows.append((rule, clock, processor, forecast.get(str(path), math.nan), memory))
+    jobs = pd.DataFrame(rows, columns=["rule", *SECONDS, "max_rss_mb"])
     table = jobs.groupby("rule", sort=True).agg(
         jobs=("seconds", "size"),
-        seconds=("seconds", "sum"),
+        **{name: (name, "sum") for name in SECONDS},
         longest_seconds=("seconds", "max"),
         max_rss_mb=("max_rss_mb", "max"),
     )
     table = table.sort_values("seconds", ascending=False).reset_index()
-    total = [len(jobs), jobs["seconds"].sum(), jobs["seconds"].max(), jobs["max_rss_mb"].max()]
-    table.loc[len(table)] = ["total", *total]
+    sums = [jobs[name].sum() for name in SECONDS]
+    table.loc[len(table)] = ["total", len(jobs), *sums, jobs["seconds"].max(), jobs["max_rss_mb"].max()]
     return table
 
 

@@ -16,6 +16,7 @@ from scenefuse.core.version import VERSION
 from scenefuse.fuse.missing import Lack
 from scenefuse.report.diagnosis import diagnose
 from scenefuse.report.disk import disk_line, disk_table
+from scenefuse.report.forecast import FORECAST, read_forecast
 from scenefuse.report.run_summary import (
     ALONE,
     ObjectSummary,
@@ -66,7 +67,7 @@ def write_summary(*, run: RunInputs, summary: Path) -> None:
     tables = {
         "registration": registration_table(found),
         "completion": completion_table(found),
-        "runtime": runtime_table(run.jobs.benchmarks),
+        "runtime": runtime_table(run.jobs.benchmarks, read_forecast(summary / FORECAST)),
         "scenes": scenes_table(found.scenes),
         "objects": objects_table(found.objects),
         "disk": disk_table([*run.scenes, *run.objects]),

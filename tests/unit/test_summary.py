@@ -169,10 +169,10 @@ def test_runtime_sums_over_jobs_and_totals(results):
 
 
 def test_runtime_of_no_benchmarks_and_of_damaged_ones(tmp_path):
-    assert len(runtime_table(tmp_path / "none")) == 1
+    assert len(runtime_table(tmp_path / "none", {})) == 1
     (tmp_path / "rule").mkdir()
     (tmp_path / "rule/job.tsv").write_text("garbage\n1\n")
-    assert runtime_table(tmp_path)["jobs"].tolist() == [0]
+    assert runtime_table(tmp_path, {})["jobs"].tolist() == [0]
 
 
 def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results):

@@ -117,6 +117,43 @@ def record_failures():
             workflow.persistence._unmark_incomplete(str(output))
 
 
+def forecast_run():
+    """What this run will take, in sentences; its jobs' seconds are left for the summary to compare."""
+    from scenefuse.report import forecast
+
+    rows = {("scene", name): row for name, row in SCENES.items()}
+    rows |= {("object", name): row for name, row in OBJECTS.items()}
+    taken = {
+        key: forecast.job_seconds(key[0], row, PROJECT.of(*key))
+        for key, row in rows.items()
+    }
+    seconds, by_rule, memory = {}, {}, {}
+    for job in workflow.dag.needrun_jobs():
+        name, of = job.rule.name, dict(job.wildcards.items())
+        kind = "object" if "object" in of else "scene"
+        cost = taken.get((kind, of.get(kind)), {}).get(name, forecast.JOB_S)
+        by_rule[name] = by_rule.get(name, 0) + cost
+        memory[name] = max(memory.get(name, 0), int(job.resources.get("mem_mb", 0)))
+        if job.benchmark:
+            seconds[str(job.benchmark)] = cost
+    if not by_rule:
+        return []
+    forecast.write_forecast(Path("results/summary", forecast.FORECAST), seconds)
+    needed = {
+        Path(f"results/{kind}s/{name}"): forecast.disk_bytes(
+            kind, row, PROJECT.of(kind, name)
+        )
+        for (kind, name), row in rows.items()
+    }
+    cores = workflow.resource_settings.cores or 1
+    try:
+        return forecast.forecast_lines(
+            by_rule, cores, memory, memory_mb(), needed, config["keep_maps"]
+        )
+    except StageError as error:
+        raise WorkflowError(str(error)) from None
+
+
 def held_up(rule):
     """The jobs of a rule that have not run, because of what failed before them. An object that fails holds up those that
     wait for all objects; they run at the end without it."""

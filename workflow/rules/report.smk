@@ -237,21 +237,9 @@ rule write_report:
 
 
 onstart:
+    for line in forecast_run():
+        print(line, file=sys.stderr)
     mark_as_unfinished()
-    from scenefuse.report.disk import forecast, forecast_note
-
-    note = forecast_note(
-        {
-            Path(f"results/{kind}s/{name}"): forecast(
-                kind, row, PROJECT.of(kind, name)
-            )
-            for kind, rows in (("scene", SCENES), ("object", OBJECTS))
-            for name, row in rows.items()
-        },
-        config["keep_maps"],
-    )
-    if note:
-        print(note, file=sys.stderr)
 
 
 onerror:
