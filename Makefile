@@ -3,7 +3,7 @@ CORES ?= 2
 PYTHON ?= python3
 export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
-.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale mutants docs clean
+.PHONY: demo check test lint report bench bench-registration bench-nerf bench-scale mutants audit docs clean
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
@@ -51,6 +51,11 @@ bench-nerf: .venv/ready
 # One object in scenes of 1, 10 and 100 million points: crop, registration, fusion, completed scene. 9 GB of disk.
 bench-scale: .venv/ready
 	PYTHONPATH=tests python tests/benchmarks/scale.py --work results/bench/scale --table results/bench/scale.csv
+
+# Known vulnerabilities of the installed packages, by their published advisories.
+audit: .venv/ready
+	pip install --quiet --disable-pip-version-check pip-audit==2.10.1
+	pip-audit --skip-editable
 
 # Writes what follows from the code: workflow/schemas/config.schema.yaml, the tables of config/README.md, the numbers in documents.
 docs: .venv/ready

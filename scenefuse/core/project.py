@@ -93,7 +93,11 @@ def _checked_table(name: str, kind: str) -> dict[str, Row]:
         wrong = problem(row, schema_of(f"{kind}s"))
         if wrong:
             raise StageError(f"{name}, row {number}, {wrong}")
-    return rows
+    # A path that begins like an option must not be taken for one.
+    return {
+        of: {key: f"./{cell}" if cell.startswith("-") else cell for key, cell in row.items()}
+        for of, row in rows.items()
+    }
 
 
 def _cloud_problem(kind: str, row: Row) -> str:

@@ -100,6 +100,10 @@ def project(tmp_path, monkeypatch):
     return read
 
 
+def test_a_folder_whose_name_begins_like_an_option_stays_a_folder(project):
+    assert project("yard\t-flight").scenes["yard"]["photos"] == "./-flight"
+
+
 def test_as_shipped_only_the_registration_that_is_fused_runs_and_the_demo_adds_what_it_is_compared_with(project):
     assert set(project().variants) == {"full"}
     demo = yaml.safe_load((ROOT / "config/demo.yaml").read_text())
