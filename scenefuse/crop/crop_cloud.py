@@ -25,7 +25,7 @@ MIN_LEFT = 0.05
 LINK_FRACTION = 0.03
 # Parts with a smaller share of the points are left out.
 MIN_PART_SHARE = 0.01
-# The lowest and highest share of the marks does not count: strays among the votes of masks.
+# The outermost share of points on each side marks nothing: strays, among the votes of masks for instance.
 STRAY_SHARE = MIN_PART_SHARE
 # Only what lies in or below the lowest tenth of the fiducials' height may be ground.
 FOOT_SHARE = 0.1
@@ -250,6 +250,14 @@ def on_ground(points: Array, marks: Array, ground: Ground, in_box: NDArray[np.bo
         continued = np.bincount(part_of, around, len(counts)) >= MIN_PART_SHARE * around.sum()
         found[rows] = continued[part_of]
     return found & in_box
+
+
+def without_strays(points: Array) -> Array:
+    """Points (N, 3) without the outermost along each axis."""
+    if not len(points):
+        return points
+    low, high = np.percentile(points, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
+    return points[((points >= low) & (points <= high)).all(1)]
 
 
 def _foot(marks: Array) -> tuple[Array, float]:

@@ -12,8 +12,8 @@ from scenefuse.cloud.crs import to_wgs84
 from scenefuse.cloud.tiled_cloud import TiledCloud, open_cloud
 from scenefuse.core.stage import StageError, quantity, read_json, threads, value, write_json
 from scenefuse.core.transforms import Array, Sim3
-from scenefuse.crop.crop_cloud import MIN_PART_SHARE, Crop, CropSettings, crop_cloud, parts, whole
-from scenefuse.crop.one_photo import MAX_GROWTH, STRAY_SHARE, SceneClicks, crop_grown, locate_clicks
+from scenefuse.crop.crop_cloud import MIN_PART_SHARE, Crop, CropSettings, crop_cloud, parts, whole, without_strays
+from scenefuse.crop.one_photo import MAX_GROWTH, SceneClicks, crop_grown, locate_clicks
 from scenefuse.crop.vote import Masked, Votes, read_masked_views, vote
 from scenefuse.marks.clicks import Clicks, ScenePoints, read_points
 from scenefuse.marks.triangulation import locate
@@ -119,7 +119,7 @@ def _cut(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple
         return near, cut, Marks("none", np.zeros((0, 3)))
     if settings.mode == "masks" and alignment is not None:
         if found or inputs.fiducials is None:
-            return (crop_by_masks if inputs.cloud is None else crop_by_cloud)(scene, inputs, settings)
+            return crop_linked(scene, inputs, settings)
         near, cut, marks = crop_by_file(scene, inputs, settings)
         note = (
             f"marked by {inputs.fiducials}: shared features give no alignment of the object with the scene"
@@ -199,51 +199,37 @@ def points_in(fiducials: Path, georeference_json: Path | None) -> tuple[list[str
     return marked.points, marked.positions - origin
 
 
-def crop_by_masks(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
-    """`crop_cloud` around the scene points that the object's masks vote for, and its SfM points (C3), and the part of
-    the scene that was read; checked by the fiducials or clicks where there are some.
+def crop_linked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
+    """The crop around what the object's photos or its own cloud mark through the alignment, and the part of the scene
+    that was read; checked by the fiducials or clicks where there are some.
+
+    Marks are the scene points that the object's masks vote for, and its SfM points (C3); or points of its own cloud.
 
     Raises:
         StageError: a file is missing, the alignment has no pose, the masks mark nothing, or the fiducials mark
             something else.
     """
-    if inputs.alignment_json is None or inputs.workspace is None or inputs.masks is None:
-        raise StageError(
-            "cropping by masks needs --alignment-json, --workspace and --masks; give them, or mode fiducials"
-        )
-    pose = _alignment(inputs.alignment_json)
-    masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
-    low, high = around_marks(pose.apply(masked.own), settings)
-    sight = masked.sight(pose)
-    near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
-    votes = votes_of(near, masked, pose, settings, len(scene))
-    cut = crop_cloud(near, np.concatenate([near.points[votes.object], votes.own]), UP, settings, votes.other)
-    notes = [f"marked by the votes of {inputs.masks} through the alignment from shared features, not by fiducials"]
+    assert inputs.alignment_json is not None
+    pose, voted, other = _alignment(inputs.alignment_json), 0, None
+    if inputs.cloud is not None:
+        mode, source, by = "cloud", inputs.cloud, "the object's own cloud"
+        own = without_strays(read_cloud(inputs.cloud).points)
+        marks = pose.apply(own[:: max(1, len(own) // MAX_OWN_POINTS)])
+        near = scene.near(*around_marks(marks, settings))[1]
+    else:
+        assert inputs.workspace is not None and inputs.masks is not None
+        mode, source, by = "masks", inputs.masks, f"the votes of {inputs.masks}"
+        masked = read_masked_views(inputs.workspace, inputs.masks, settings.min_votes)
+        (low, high), sight = around_marks(pose.apply(masked.own), settings), masked.sight(pose)
+        near = scene.near(np.minimum(low, sight.min(0)), np.maximum(high, sight.max(0)))[1]
+        votes = votes_of(near, masked, pose, settings, len(scene))
+        marks, other = np.concatenate([near.points[votes.object], votes.own]), votes.other
+        voted = int(votes.object.sum())
+    cut = crop_cloud(near, marks, UP, settings, other)
     points, clicked = _checked(scene, inputs, settings, cut)
-    cut = replace(cut, notes=notes + clicked + cut.notes)
-    _announce(cut, str(inputs.masks))
-    return near, cut, Marks("masks", points, int(votes.object.sum()))
-
-
-def crop_by_cloud(scene: TiledCloud, inputs: CropInputs, settings: CropSettings) -> tuple[Cloud, Crop, Marks]:
-    """`crop_cloud` around the object's own cloud where the alignment puts it, and the part of the scene that was read;
-    checked by the fiducials or clicks where there are some.
-
-    Raises:
-        StageError: a file is missing, or the fiducials mark something else.
-    """
-    assert inputs.cloud is not None and inputs.alignment_json is not None
-    own = read_cloud(inputs.cloud).points
-    low, high = np.percentile(own, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
-    own = own[((own >= low) & (own <= high)).all(1)]
-    marks = _alignment(inputs.alignment_json).apply(own[:: max(1, len(own) // MAX_OWN_POINTS)])
-    near = scene.near(*around_marks(marks, settings))[1]
-    cut = crop_cloud(near, marks, UP, settings)
-    notes = ["marked by the object's own cloud through the alignment from shared features: it has no masks"]
-    points, clicked = _checked(scene, inputs, settings, cut)
-    cut = replace(cut, notes=notes + clicked + cut.notes)
-    _announce(cut, str(inputs.cloud))
-    return near, cut, Marks("cloud", points)
+    cut = replace(cut, notes=[f"marked by {by} through the alignment from shared features", *clicked, *cut.notes])
+    _announce(cut, str(source))
+    return near, cut, Marks(mode, points, voted)
 
 
 def _checked(scene: TiledCloud, inputs: CropInputs, settings: CropSettings, cut: Crop) -> tuple[Array, list[str]]:

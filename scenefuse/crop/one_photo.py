@@ -11,7 +11,7 @@ from scenefuse.cloud.clouds import Cloud
 from scenefuse.cloud.tiled_cloud import Rows, TiledCloud
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array
-from scenefuse.crop.crop_cloud import LINK_FRACTION, MIN_PART_SHARE, Crop, CropSettings, crop_cloud
+from scenefuse.crop.crop_cloud import LINK_FRACTION, MIN_PART_SHARE, Crop, CropSettings, crop_cloud, without_strays
 from scenefuse.marks.clicks import Clicks
 from scenefuse.marks.photo_clicks import PhotoClicks, clicks_per_photo
 from scenefuse.photos.workspace import View, read_views
@@ -30,8 +30,6 @@ MAX_ROUNDS = 25
 # The object reaches at most so much farther than its clicks, as a ratio of diagonals: clicks are spread over the side
 # that the photo shows. What is larger is connected with something else.
 MAX_GROWTH = 3.0
-# The outermost share of the kept points on each side marks nothing.
-STRAY_SHARE = 0.005
 
 
 @dataclass(frozen=True)
@@ -169,13 +167,12 @@ def crop_grown(scene: Cloud, inside: Array, up: Array, settings: CropSettings, o
     first = cut = crop_cloud(scene, inside, up, settings, other)
     most = MAX_GROWTH * float(np.linalg.norm(np.ptp(inside, axis=0)))
     for _ in range(MAX_ROUNDS):
-        own = scene.points[cut.keep]
+        own = without_strays(scene.points[cut.keep])
         if not len(own):
             return cut
-        low, high = np.percentile(own, [100 * STRAY_SHARE, 100 * (1 - STRAY_SHARE)], axis=0)
-        if np.linalg.norm(high - low) > most:
+        if np.linalg.norm(np.ptp(own, axis=0)) > most:
             break
-        marks = np.concatenate([inside, own[((own >= low) & (own <= high)).all(1)]])
+        marks = np.concatenate([inside, own])
         grown = crop_cloud(scene, marks, up, settings, other)
         if grown.keep.sum() <= (1 + MIN_PART_SHARE) * cut.keep.sum():
             return grown

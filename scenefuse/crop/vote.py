@@ -11,8 +11,10 @@ from scipy.spatial import cKDTree
 from scenefuse.cloud.clouds import spacing
 from scenefuse.core.stage import StageError, threads
 from scenefuse.core.transforms import Array, Sim3
+from scenefuse.crop.crop_cloud import without_strays
 from scenefuse.geometry.depth_test import Where, depth_buffer, depth_test
 from scenefuse.geometry.visual_hull import least_framing
+from scenefuse.mvs.sparse_depths import CONFIRMING_PHOTOS
 from scenefuse.photos.workspace import View, read_workspace, with_mask
 
 # Photos used at most, spread evenly: more show the same sides again.
@@ -21,8 +23,6 @@ MAX_PHOTOS = 60
 MASK_GROWTH = 0.005
 # A point is hidden by one of its cell, this many spacings wide, that is more than this many cells nearer.
 CELL_SPACINGS, HIDDEN_CELLS = 4, 2
-# Photos that must show a point.
-MIN_SHOWN = 3
 # Where the photos stand farther from the object than so many of its extents, what hides it there is not looked for.
 MAX_DISTANCE_EXTENTS = 4.0
 # How near one of the object's own SfM points must be, as a share of their extent; how many of these are needed.
@@ -82,7 +82,7 @@ def vote(points: Array, masked: Masked, scene_from_object: Sim3, min_share: floa
     in_object = scene_from_object.inverse().apply(points)
     least = least_framing(views, own)
     framed, shown, inside = count(in_object, views, least)
-    decided = shown >= MIN_SHOWN
+    decided = shown >= CONFIRMING_PHOTOS
     is_object = decided & (framed >= least) & (inside >= min_share * shown)
     rows = np.flatnonzero(is_object)
     reach = MAX_OWN_DISTANCE * float(np.linalg.norm(np.ptp(own, axis=0)))
@@ -94,7 +94,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
     """At most 60 of an object's photos, spread evenly, with their masks, and the SfM points on the object.
 
     An SfM point is on the object when it is inside the mask in `min_share` of the photos that observe it, three or
-    more; the outermost 1 % on each side are left out.
+    more; strays are left out.
 
     Args:
         workspace: undistorted COLMAP workspace of the object.
@@ -107,7 +107,7 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
     read = read_workspace(workspace)
     files = [(masks / f"{Path(view.name).stem}.png", view, seen) for view, seen in zip(read.views, read.seen)]
     files = [file for file in files if file[0].is_file()]
-    if len(files) < MIN_SHOWN:
+    if len(files) < CONFIRMING_PHOTOS:
         raise StageError(
             f"{len(files)} photos of {workspace} have a mask in {masks}, three are needed; rerun the masks"
         )
@@ -121,14 +121,13 @@ def read_masked_views(workspace: Path, masks: Path, min_share: float) -> Masked:
         rows, pixels, _ = one.visible(read.points[observed])
         observing[observed[rows]] += 1
         inside[observed[rows]] += one.pixels[pixels[:, 1], pixels[:, 0]]
-    own = read.points[(observing >= MIN_SHOWN) & (inside >= min_share * observing)]
+    own = read.points[(observing >= CONFIRMING_PHOTOS) & (inside >= min_share * observing)]
     if len(own) < MIN_OWN:
         raise StageError(
             f"only {len(own)} SfM points of {workspace} lie inside the masks of {masks}, {MIN_OWN} are needed; look at"
             " the masks, and take sharper photos of the object"
         )
-    low, high = np.percentile(own, 1, axis=0, method="lower"), np.percentile(own, 99, axis=0, method="higher")
-    return Masked(found, own[((own >= low) & (own <= high)).all(1)])
+    return Masked(found, without_strays(own))
 
 
 def _with_grown_mask(view: View, path: Path) -> View:
