@@ -2,7 +2,7 @@
 
 import shutil
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, setting, threads
-from scenefuse.photos.photo_files import VIDEO_SUFFIXES, frame_name, thin_out
+from scenefuse.photos.photo_files import VIDEO_SUFFIXES, frame_name, thin_out, upright_size
 from scenefuse.photos.photos import (
+    Photo,
     below_folder,
+    bits_to_stretch,
     each_photo,
     inspect_photo,
     photo_names,
@@ -61,8 +63,12 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
         )
     with atomic_directory(frames) as temporary:
         kind = "video" if source.is_file() else "photos"
-        origin = (_from_video if source.is_file() else _from_folder)(source, temporary, settings)
-        listed = [inspect_photo(temporary, name) for name in sorted(origin)]
+        bits = 0
+        if source.is_file():
+            origin = _from_video(source, temporary, settings)
+            listed = [inspect_photo(temporary, name) for name in sorted(origin)]
+        else:
+            listed, origin, bits = _from_folder(source, temporary, settings)
     if len(listed) < 3:
         shutil.rmtree(frames)
         advice = "lower object.frames.frame_step" if kind == "video" else "take more photos around the object"
@@ -70,7 +76,7 @@ def extract_frames(*, source: Path, frames: Path, photos: Path, settings: FrameS
     print(f"{len(listed)} frames from {source}", flush=True)
     turned = {name: entry["orientation"] for name, entry in origin.items() if entry.get("orientation", 1) != 1}
     more = {"origin": quantity(origin, ""), "turned": quantity(turned, "")}
-    notes = photo_notes(listed)
+    notes = photo_notes(listed, bits)
     if kind == "photos":
         distinct, copies = without_copies(source, photo_names(source))
         if len(listed) < len(distinct):
@@ -95,7 +101,10 @@ def sharpness(frame: NDArray[Any]) -> float:
     return float(cv2.Laplacian(small, cv2.CV_64F).var())
 
 
-def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:
+def _from_folder(
+    source: Path, output: Path, settings: FrameSettings
+) -> tuple[list[Photo], dict[str, dict[str, Any]], int]:
+    """The frames, what each was made of, and by how many bits their pixels were shifted."""
     names, _ = without_copies(source, photo_names(source))
     flat: dict[str, str] = {}
     for name in (names[i] for i in thin_out(len(names), settings.frame_step, settings.max_frames)):
@@ -103,18 +112,23 @@ def _from_folder(source: Path, output: Path, settings: FrameSettings) -> dict[st
         if stem in flat:
             raise StageError(f"{flat[stem]} and {name} in {source} would share the mask {stem}.png; rename one of them")
         flat[stem] = name
+    photos = each_photo(lambda name: inspect_photo(source, name), flat.values())
+    bits = bits_to_stretch(photos)
 
-    def copy(name: str) -> tuple[str, dict[str, Any]]:
-        photo = inspect_photo(source, name)
-        target = output / frame_name(name)
-        width, height = photo.width, photo.height
-        if photo.orientation == 1 and width <= settings.max_width_px:
-            shutil.copyfile(source / name, target)
+    def copy(photo: Photo) -> Photo:
+        target = output / frame_name(photo.name)
+        if photo.orientation == 1 and photo.width <= settings.max_width_px and not bits:
+            shutil.copyfile(source / photo.name, target)
         else:
-            width, height = save_upright(source / name, target, settings.max_width_px)
-        return target.name, {"source": name, "width": width, "height": height, "orientation": photo.orientation}
+            photo = save_upright(source, photo, target, bits, settings.max_width_px)
+        return replace(photo, name=target.name)
 
-    return dict(each_photo(copy, flat.values()))
+    frames = each_photo(copy, photos)
+    origin = {}
+    for photo, frame in zip(photos, frames):
+        width, height = upright_size(source / photo.name)
+        origin[frame.name] = {"source": photo.name, "width": width, "height": height, "orientation": photo.orientation}
+    return sorted(frames, key=lambda frame: frame.name), origin, bits
 
 
 def _from_video(source: Path, output: Path, settings: FrameSettings) -> dict[str, dict[str, Any]]:

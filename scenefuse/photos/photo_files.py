@@ -1,14 +1,22 @@
 """Which files of a folder are photos, which of these become frames, and which hold cameras. Standard library only: the
 workflow lists them often."""
 
+from __future__ import annotations
+
 import os
+import struct
 import unicodedata
 from collections import Counter, defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from itertools import takewhile
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from scenefuse.core.stage import StageError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
 
 # Positions of the photos beside it, as OpenDroneMap names the file.
 GEO_FILE = "geo.txt"
@@ -19,6 +27,14 @@ UNREADABLE = frozenset(
     (".heic", ".heif", ".avif", ".jxl", ".webp", ".dng", ".raw", ".3fr", ".arw", ".cr2", ".cr3", ".crw")
 )
 UNREADABLE |= frozenset((".gpr", ".iiq", ".nef", ".nrw", ".orf", ".pef", ".raf", ".rw2", ".srw", ".x3f"))
+
+# Phones' photos have 200 million pixels. A small file that claims more would fill the memory.
+MAX_PIXELS = 250_000_000
+# What decoding a damaged picture ends with.
+UNDECODABLE = (
+    *(OSError, ValueError, LookupError, TypeError, AttributeError, ArithmeticError, RuntimeError),
+    *(SyntaxError, MemoryError, struct.error),
+)
 
 # Where in a folder other programs keep cameras, and under which names.
 CAMERA_FILES = ["transforms.json", "transforms_train.json", "transforms_test.json"]
@@ -200,35 +216,44 @@ def in_folders(names: list[str]) -> str:
     return f"{len(names)} photos" + (f", {where}{more}" if below else "")
 
 
-def upright_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photo as people see it; only its header is read.
+@contextmanager
+def open_picture(path: Path) -> Iterator[Image]:
+    """A picture whose header was read, by Pillow.
 
     Raises:
-        StageError: it is no readable picture.
+        StageError: it is none that can be read, or claims more pixels than any camera takes.
     """
     from PIL import Image
-    from PIL.TiffImagePlugin import TiffImageFile
 
+    Image.MAX_IMAGE_PIXELS = MAX_PIXELS
+    # Opened by handle: by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
     try:
         with open(path, "rb") as file, Image.open(file) as image:
-            turned = image.getexif().get(0x0112, 1) in (5, 6, 7, 8)
-            # Pillow 13 gives the size of a TIFF as it will be when turned; its tags have it as stored.
-            tags = image.tag_v2 if isinstance(image, TiffImageFile) else None
-            width, height = image.size if tags is None else (int(tags[256]), int(tags[257]))
-            return (height, width) if turned else (width, height)
-    except (OSError, ValueError, Image.DecompressionBombError) as error:
-        raise StageError(f"{path} cannot be read as a picture ({error}); replace it, or take it away") from None
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels are more than any camera takes")
+            yield image
+    except (*UNDECODABLE, Image.DecompressionBombError) as error:
+        why = (
+            "it is no picture"
+            if isinstance(error, Image.UnidentifiedImageError)
+            else str(error) or type(error).__name__
+        )
+        raise StageError(f"{path} cannot be decoded ({why}); replace it, or remove it from its folder") from None
+
+
+def upright_size(path: Path) -> tuple[int, int]:
+    """Width and height of a photo as people see it; only its header is read. Errors as of `open_picture`."""
+    width, height = stored_size(path)
+    with open_picture(path) as image:
+        return (height, width) if image.getexif().get(0x0112, 1) in (5, 6, 7, 8) else (width, height)
 
 
 def stored_size(path: Path) -> tuple[int, int]:
-    """Width and height of a photo as it is stored; errors as of `upright_size`."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as picture:
-            return picture.size
-    except OSError:
-        raise StageError(f"{path} is not a readable picture; export it again") from None
+    """Width and height of a photo as it is stored; errors as of `open_picture`."""
+    with open_picture(path) as image:
+        # Pillow 13 gives the size of a TIFF as it will be when turned; its tags have it as stored.
+        tags = getattr(image, "tag_v2", None)
+        return image.size if tags is None else (int(tags[256]), int(tags[257]))
 
 
 def frame_name(photo: str) -> str:

@@ -9,26 +9,22 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
-from PIL.ExifTags import GPS, IFD, Base
+from PIL import Image, ImageOps
+from PIL.ExifTags import IFD, Base
 
 from scenefuse.core.stage import StageError, atomic_directory, quantity, read_json, sha256, threads, value, write_json
-from scenefuse.photos.photo_files import GEO_FILE, in_folders, photo_files
-from scenefuse.photos.pictures import JPEG_QUALITY
-from scenefuse.photos.positions import positions_of, read_geo, rtk_accuracy
+from scenefuse.photos.photo_files import GEO_FILE, in_folders, open_picture, photo_files
+from scenefuse.photos.pictures import JPEG_QUALITY, read_raw, stretched
+from scenefuse.photos.positions import exif_number, exif_text, positions_of, read_geo, stated_position
 
-# Pillow warns of pictures with more pixels, and refuses those with twice as many: by itself, phones' of 200 megapixels.
-Image.MAX_IMAGE_PIXELS = 250_000_000
 # Photos and cameras differ in shape by no more than what rounding to whole pixels does.
 SHAPE_TOLERANCE = 0.01
-# What the reconstruction reads. Other tags say how the old file's pixels were stored, or point into it.
-KEPT_EXIF = {
-    IFD.Exif: (Base.FocalLength, Base.FocalLengthIn35mmFilm, Base.DateTimeOriginal),
-    IFD.GPSInfo: (GPS.GPSLatitudeRef, GPS.GPSLatitude, GPS.GPSLongitudeRef, GPS.GPSLongitude)
-    + (GPS.GPSAltitudeRef, GPS.GPSAltitude),
-}
+# SIFT finds next to nothing in photos that use so much fewer bits than their files have: 12 of 16, or the dark 6 of 8.
+MIN_UNUSED_BITS = 2
+# Share of the pixels that may be brighter than what counts as the photo's brightest: hot ones, lamps.
+HOT_SHARE = 0.001
 
-
+Item = TypeVar("Item")
 Result = TypeVar("Result")
 
 
@@ -50,6 +46,8 @@ class Photo:
         horizontal_sd_m: standard deviation of the position, east and north, from XMP or geo.txt, or None.
         vertical_sd_m: of the altitude, likewise.
         focal_mm: EXIF's focal length as it is, or None.
+        position_note: why there is no position though EXIF or XMP give one, or what was assumed of it, or "".
+        unused_bits: leading bits of its pixel values, of 8 or 16, that are 0 throughout.
     """
 
     name: str
@@ -65,6 +63,8 @@ class Photo:
     horizontal_sd_m: float | None = None
     vertical_sd_m: float | None = None
     focal_mm: float | None = None
+    position_note: str = ""
+    unused_bits: int = 0
 
     @property
     def has_gps(self) -> bool:
@@ -88,13 +88,16 @@ def list_photos(*, folder: Path, upright: Path, photos: Path) -> None:
     """
     names, copies = without_copies(folder, photo_names(folder))
     positions = read_geo(folder / GEO_FILE) if (folder / GEO_FILE).is_file() else None
+    stored = each_photo(lambda name: inspect_photo(folder, name), names)
+    bits = bits_to_stretch(stored)
     with atomic_directory(upright) as temporary:
-        stood = each_photo(lambda name: _stood_upright(folder, name, temporary), names)
-    turned = {p.name: orientation for p, orientation in stood if orientation != 1}
-    listed = [p for p, _ in stood]
-    notes = copies + below_folder(names) + photo_notes(listed)
+        listed = each_photo(lambda photo: _stood_upright(folder, photo, temporary, bits), stored)
+    turned = {p.name: p.orientation for p in stored if p.orientation != 1}
     if positions is not None:
-        listed = [replace(p, **place) for p, place in zip(listed, positions_of(names, positions, folder / GEO_FILE))]
+        places = positions_of(names, positions, folder / GEO_FILE)
+        listed = [replace(p, position_note="", **place) for p, place in zip(listed, places)]
+    notes = copies + below_folder(names) + photo_notes(listed, bits)
+    if positions is not None:
         notes.append(
             f"{GEO_FILE} gives {sum(p.has_gps for p in listed)} of {len(listed)} positions; EXIF's are not used"
         )
@@ -147,42 +150,62 @@ def orientations_in(content: Mapping[str, Any]) -> dict[str, int]:
     return turned
 
 
-def _stood_upright(folder: Path, name: str, output: Path) -> tuple[Photo, int]:
-    """Link or turn one photo into `output`; what is listed is the result, and the EXIF orientation that it had."""
-    photo, target = inspect_photo(folder, name), output / name
+def bits_to_stretch(photos: list[Photo]) -> int:
+    """By how many bits the pixels of all photos are shifted to the left, so that the brightest has all of its bits."""
+    unused = min((photo.unused_bits for photo in photos), default=0)
+    return unused if unused >= MIN_UNUSED_BITS else 0
+
+
+def _stood_upright(folder: Path, photo: Photo, output: Path, bits: int) -> Photo:
+    """Link or write one photo into `output`; what is listed is the result."""
+    target = output / photo.name
     target.parent.mkdir(parents=True, exist_ok=True)
-    if photo.orientation == 1:
-        target.symlink_to(os.path.relpath(os.path.realpath(folder / name), os.path.realpath(target.parent)))
-        return photo, 1
-    save_upright(folder / name, target)
-    turned = inspect_photo(output, name)
-    stated = replace(turned, horizontal_sd_m=photo.horizontal_sd_m, vertical_sd_m=photo.vertical_sd_m)
-    return stated, photo.orientation
+    if photo.orientation == 1 and not bits:
+        target.symlink_to(os.path.relpath(os.path.realpath(folder / photo.name), os.path.realpath(target.parent)))
+        return photo
+    return save_upright(folder, photo, target, bits)
 
 
-def save_upright(source: Path, target: Path, max_width_px: int | None = None) -> tuple[int, int]:
-    """Write a photo as people see it, at most `max_width_px` wide; position, camera and focal length in EXIF stay.
-
-    Returns:
-        Width and height of the upright photo before it was scaled.
-    """
-    with open(source, "rb") as file, Image.open(file) as image:
-        before = image.getexif()
+def save_upright(folder: Path, photo: Photo, target: Path, bits: int = 0, max_width_px: int | None = None) -> Photo:
+    """Write a photo as people see it, its pixels shifted by some bits, at most `max_width_px` wide; as it is then."""
+    path = folder / photo.name
+    with open_picture(path) as image:
         exif = Image.Exif()
-        exif.update({tag: before[tag] for tag in (Base.Make, Base.Model) if tag in before})
-        for block, wanted in KEPT_EXIF.items():
-            if tags := {tag: entry for tag, entry in before.get_ifd(block).items() if tag in wanted}:
-                exif[block] = tags
-        upright = ImageOps.exif_transpose(image)
-        size = upright.size
-        if max_width_px is not None and upright.width > max_width_px:
-            height = round(upright.height * max_width_px / upright.width)
-            upright = upright.resize((max_width_px, height), Image.Resampling.LANCZOS, reducing_gap=3.0)
+        exif.update({tag: text for tag in (Base.Make, Base.Model) if (text := exif_text(image.getexif().get(tag)))})
+        equivalent_mm = 36.0 * (photo.focal_px or 0.0) / max(photo.width, photo.height)
+        focal = {Base.FocalLength: photo.focal_mm, Base.FocalLengthIn35mmFilm: min(round(equivalent_mm), 65535)}
+        exif[IFD.Exif] = {tag: number for tag, number in focal.items() if number}
+        upright: Image.Image = image
+        if bits:
+            upright = Image.fromarray(stretched(_pixels(image, path), bits))
+            upright.getexif()[Base.Orientation] = image.getexif().get(Base.Orientation, 1)
+        upright = ImageOps.exif_transpose(upright)
+        width, height = upright.size
+        if max_width_px is not None and width > max_width_px:
+            size = max_width_px, max(round(height * max_width_px / width), 1)
+            upright = upright.resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
         coded: dict[str, Any] = (
             {"quality": JPEG_QUALITY, "subsampling": 0} if target.suffix.lower() in (".jpg", ".jpeg") else {}
         )
         upright.save(target, exif=exif.tobytes(), **coded)
-    return size
+    focal_px = photo.focal_px and photo.focal_px * max(upright.size) / max(width, height)
+    seen: dict[str, Any] = {"width": upright.width, "height": upright.height, "sha256": sha256(target)}
+    return replace(photo, **seen, focal_px=focal_px, orientation=1, unused_bits=photo.unused_bits - bits)
+
+
+def has_16_bits(path: Path) -> bool:
+    """Whether a picture's pixels are of 16 bits; Pillow drops half of those of colours."""
+    with open_picture(path) as image:
+        return image.mode.startswith("I;16") or ";16" in str(getattr(image, "tile", ""))
+
+
+def _pixels(image: Image.Image, path: Path) -> NDArray[Any]:
+    """(H, W) or (H, W, 3) RGB pixels of a picture, opened by Pillow, as stored: of 8 or 16 bits."""
+    if image.mode.startswith("I;16"):
+        return np.asarray(image)
+    if has_16_bits(path):
+        return np.ascontiguousarray(read_raw(path)[..., 2::-1])
+    return np.asarray(image if image.mode in ("L", "RGB") else image.convert("RGB"))
 
 
 def check_unchanged(folder: Path, photos: Iterable[Photo]) -> None:
@@ -210,57 +233,55 @@ def check_unchanged(folder: Path, photos: Iterable[Photo]) -> None:
 
 def inspect_photo(folder: Path, name: str) -> Photo:
     """Decode one photo completely and read its EXIF; StageError names a photo that cannot be decoded."""
-    path = folder / name
-    try:
-        # Opened by handle: by name, Pillow 13 scrambles rotated TIFF files that are not RGB.
-        with open(path, "rb") as file, Image.open(file) as image:
-            exif = image.getexif()
-            # Decoding a TIFF turns it upright and forgets the tag.
-            orientation = int(exif.get(Base.Orientation, 1) or 1)
-            camera = f"{_text(exif.get(Base.Make))} {_text(exif.get(Base.Model))}".strip()
-            latitude, longitude, altitude = _position(exif.get_ifd(IFD.GPSInfo))
-            xmp = image.info.get("xmp", b"")
-            horizontal, vertical = rtk_accuracy(xmp if isinstance(xmp, bytes) else str(xmp).encode())
-            taken = exif.get_ifd(IFD.Exif)
-            equivalent_mm, focal_mm = (
-                _number(taken.get(tag)) or None for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
-            )
-            if image.mode == "F":
-                raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
-            image.load()
-            width, height = image.size
-    except Exception as error:
-        raise StageError(
-            f"the photo {path} cannot be decoded ({_why(error)}); replace it or remove it from the folder"
-        ) from None
-    # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
-    focal_px = equivalent_mm / 36.0 * max(width, height) if equivalent_mm else None
-    digest = sha256(path)
-    place = (latitude, longitude, altitude)
-    return Photo(name, width, height, digest, *place, focal_px, camera, orientation, horizontal, vertical, focal_mm)
+    with open_picture(folder / name) as image:
+        exif = image.getexif()
+        # Decoding a TIFF turns it upright and forgets the tag.
+        orientation = exif_number(exif.get(Base.Orientation)) or 1
+        xmp = image.info.get("xmp", b"")
+        xmp = xmp if isinstance(xmp, bytes) else str(xmp).encode()
+        position, note = stated_position(exif.get_ifd(IFD.GPSInfo), xmp)
+        taken = exif.get_ifd(IFD.Exif)
+        equivalent_mm, focal_mm = (
+            max(exif_number(taken.get(tag)) or 0.0, 0.0) for tag in (Base.FocalLengthIn35mmFilm, Base.FocalLength)
+        )
+        if image.mode == "F":
+            raise ValueError("its pixels are 32-bit measurements, as a thermal camera's, and no picture")
+        sample = _pixels(image, folder / name)[::4, ::4]
+        brightest = int(np.quantile(sample, 1 - HOT_SHARE, method="lower"))
+        width, height = image.size
+        return Photo(
+            name,
+            width,
+            height,
+            sha256(folder / name),
+            # A 35 mm frame is 36 mm wide; COLMAP takes its prior from the longer side in the same way.
+            focal_px=equivalent_mm / 36.0 * max(width, height) or None,
+            camera=f"{exif_text(exif.get(Base.Make))} {exif_text(exif.get(Base.Model))}".strip(),
+            orientation=int(orientation) if orientation in range(1, 9) else 1,
+            focal_mm=focal_mm or None,
+            position_note=note,
+            unused_bits=8 * sample.itemsize - max(brightest.bit_length(), 1),
+            **asdict(position),
+        )
 
 
-def _why(error: Exception) -> str:
-    """Why a photo cannot be decoded, in a user's words."""
-    return "it is no picture" if isinstance(error, UnidentifiedImageError) else str(error) or type(error).__name__
-
-
-def each_photo(function: Callable[[str], Result], names: Iterable[str]) -> list[Result]:
-    """What a function gives for each photo, in parallel.
+def each_photo(function: Callable[[Item], Result], photos: Iterable[Item]) -> list[Result]:
+    """What a function gives for each photo or name, in parallel.
 
     Raises:
         StageError: of the first photo that it fails for, which names the others.
     """
 
-    def tried(name: str) -> Result | StageError:
+    def tried(photo: Item) -> Result | StageError:
         try:
-            return function(name)
+            return function(photo)
         except StageError as error:
             return error
 
-    names = list(names)
+    photos = list(photos)
     with ThreadPoolExecutor(threads()) as pool:
-        found = list(pool.map(tried, names))
+        found = list(pool.map(tried, photos))
+    names = [photo.name if isinstance(photo, Photo) else str(photo) for photo in photos]
     bad = [(name, error) for name, error in zip(names, found) if isinstance(error, StageError)]
     if bad:
         more = f"; nor can {', '.join(name for name, _ in bad[1:6])}" if len(bad) > 1 else ""
@@ -273,10 +294,20 @@ def below_folder(names: list[str]) -> list[str]:
     return [f"{in_folders(names)}"] if any("/" in name for name in names) else []
 
 
-def photo_notes(photos: list[Photo]) -> list[str]:
-    """What a person should know about a list of photos: odd sizes."""
+def photo_notes(photos: list[Photo], bits: int) -> list[str]:
+    """What a person should know about photos: odd sizes, odd positions, and pixels that were shifted by some bits."""
     sizes = {(p.width, p.height) for p in photos}
-    return [f"the photos have {len(sizes)} different sizes"] if len(sizes) > 1 else []
+    notes = [f"the photos have {len(sizes)} different sizes"] if len(sizes) > 1 else []
+    odd = [p for p in photos if p.position_note]
+    if odd:
+        notes.append(f"the GPS positions of {len(odd)} photos: {odd[0].position_note} (of {odd[0].name}, for one)")
+    return notes + stretch_notes(bits)
+
+
+def stretch_notes(bits: int) -> list[str]:
+    """A note on pixels that were shifted by some bits."""
+    why = f"the photos are dark, or have fewer bits than their files: pixels are {2**bits} times as bright here"
+    return [why] if bits else []
 
 
 def write_photos(
@@ -316,45 +347,3 @@ def gps_accuracies(photos: list[Photo], otherwise_m: float) -> NDArray[np.float6
     """(N, 2) standard deviations in metres, horizontal and vertical, of the photos that have a position."""
     known = [(p.horizontal_sd_m, p.vertical_sd_m) for p in photos if p.has_gps]
     return np.array([[h or otherwise_m, v or h or otherwise_m] for h, v in known]).reshape(-1, 2)
-
-
-def _position(gps: dict[int, Any]) -> tuple[float | None, float | None, float | None]:
-    """Latitude and longitude in degrees, altitude in metres, from EXIF's GPS block."""
-    latitude, longitude = _degrees(gps.get(2)), _degrees(gps.get(4))
-    valid = latitude is not None and longitude is not None and (latitude, longitude) != (0.0, 0.0)
-    if not valid or latitude is None or longitude is None or abs(latitude) > 90 or abs(longitude) > 180:
-        return None, None, None
-    if _text(gps.get(1)).upper().startswith("S"):
-        latitude = -latitude
-    if _text(gps.get(3)).upper().startswith("W"):
-        longitude = -longitude
-    altitude = _number(gps.get(6))
-    if altitude is not None and gps.get(5) in (1, b"\x01"):
-        altitude = -altitude
-    return latitude, longitude, altitude
-
-
-def _degrees(value: Any) -> float | None:
-    """Degrees from EXIF's (degrees, minutes, seconds)."""
-    try:
-        parts = [float(v) for v in value]
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    degrees = sum(part / 60.0**power for power, part in enumerate(parts[:3]))
-    return degrees if len(parts) >= 1 and np.isfinite(degrees) else None
-
-
-def _number(value: Any) -> float | None:
-    """A finite float, or None."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
-        return None
-    return number if np.isfinite(number) else None
-
-
-def _text(value: Any) -> str:
-    """EXIF text without the zero bytes that some cameras pad it with."""
-    if isinstance(value, bytes):
-        value = value.decode("latin-1")
-    return str(value or "").split("\x00")[0].strip()

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.core.stage import StageError
+from scenefuse.photos.photo_files import stored_size
 
 # Loses nothing that SIFT or a mask would notice.
 JPEG_QUALITY = 97
@@ -45,6 +46,12 @@ def matte_of(picture: NDArray[Any]) -> NDArray[np.bool_]:
     return channel > max(1, channel.max()) / 2
 
 
+def stretched(pixels: NDArray[Any], bits: int) -> NDArray[np.uint8]:
+    """Pixels of 8 or 16 bits, shifted to the left by some bits, as uint8; what is brighter than white is white."""
+    shifted = pixels.astype(np.uint32) << bits >> 8 * (pixels.itemsize - 1)
+    return np.minimum(shifted, 255).astype(np.uint8)
+
+
 def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
     """Write (H, W) grey or (H, W, 3) RGB pixels in the format of the path's suffix.
 
@@ -62,10 +69,12 @@ def write_picture(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def _read(path: Path, flags: int) -> NDArray[Any]:
+    if not Path(path).is_file():
+        raise StageError(f"{path} does not exist; rerun the stage that writes it")
+    stored_size(path)
     pixels = cv2.imread(str(path), flags)
     if pixels is None:
-        what = "is no readable picture" if Path(path).is_file() else "does not exist"
-        raise StageError(f"{path} {what}; rerun the stage that writes it")
+        raise StageError(f"{path} is no readable picture; rerun the stage that writes it")
     return pixels
 
 

@@ -1,6 +1,7 @@
-"""Positions of photos and their accuracy: RTK and PPK values in XMP, and OpenDroneMap's geo.txt beside the photos."""
+"""Positions of photos and their accuracy: by EXIF, by XMP (RTK and PPK), and by OpenDroneMap's geo.txt beside them."""
 
 import re
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,25 @@ from scenefuse.core.transforms import Array
 from scenefuse.photos.photo_files import photos_by_name
 
 LAYOUT = "photo x y [z [yaw pitch roll [horizontal sd [vertical sd]]]]"
-# XMP names of standard deviations in metres, as attributes or elements: DJI's, then Pix4D's (Parrot, senseFly, ...).
-EAST, NORTH, UP = (
-    re.compile(rb"drone-dji:RtkStd%s\s*(?:=\s*[\"']|>)\s*([-+\d.eE]+)" % n) for n in (b"Lon", b"Lat", b"Hgt")
-)
-HORIZONTAL, VERTICAL = (
-    re.compile(rb"Camera:GPS%sAccuracy\s*(?:=\s*[\"']|>)\s*([-+\d.eE]+)" % n) for n in (b"XY", b"Z")
-)
+
+
+def _xmp(names: str, value: str) -> re.Pattern[bytes]:
+    """XMP properties, as attributes or elements."""
+    return re.compile(rf"(?:{names})\s*(?:=\s*[\"']|>)\s*({value})".encode())
+
+
+# Standard deviations in metres: DJI's, then Pix4D's (Parrot, senseFly, ...).
+EAST, NORTH, UP = (_xmp(f"drone-dji:RtkStd{name}", r"[-+\d.eE]+") for name in ("Lon", "Lat", "Hgt"))
+HORIZONTAL, VERTICAL = (_xmp(f"Camera:GPS{name}Accuracy", r"[-+\d.eE]+") for name in ("XY", "Z"))
+# Positions; DJI spells longitude in two ways.
+LATITUDE = _xmp("drone-dji:(?:Gps)?Latitude|exif:GPSLatitude", "[^\"'<]{1,60}")
+LONGITUDE = _xmp("drone-dji:(?:Gps)?Longt?itude|exif:GPSLongitude", "[^\"'<]{1,60}")
+ALTITUDE = _xmp("drone-dji:AbsoluteAltitude|exif:GPSAltitude", "[^\"'<]{1,60}")
+BELOW = _xmp("exif:GPSAltitudeRef", r"\d")
+# References of an altitude that lies below its zero, an ellipsoid's or the sea's (EXIF 3.0).
+BELOW_ZERO = (1, 3)
+# A number in text, perhaps a fraction.
+NUMBER = re.compile(r"([-+]?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)(?:\s*/\s*(\d+(?:\.\d*)?))?")
 
 
 @dataclass(frozen=True)
@@ -40,22 +53,110 @@ class Position:
     vertical_sd_m: float | None = None
 
 
+def stated_position(gps: Mapping[int, Any], xmp: bytes) -> tuple[Position, str]:
+    """Where a photo was taken by EXIF's GPS block, or by XMP where that has none; and why there is no position, or what
+    was assumed of it, "" for nothing.
+
+    Degrees may be three numbers, fewer, one with decimals, or text; signed, with a reference, or both, which then count
+    once; zero denominators are numbers that are missing.
+    """
+    latitude, longitude, altitude, below = (_first(pattern, xmp) for pattern in (LATITUDE, LONGITUDE, ALTITUDE, BELOW))
+    by_exif = (gps.get(2), gps.get(1, ""), gps.get(4), gps.get(3, ""))
+    heights = (_altitude(gps.get(6), gps.get(5)), _altitude(altitude, below))
+    height = next((metres for metres in heights if metres is not None), None)
+    problems = []
+    for north, north_of, east, east_of in (by_exif, (latitude, None, longitude, None)):
+        if north is not None or east is not None:
+            place, problem = _place(north, north_of, east, east_of)
+            if place is not None:
+                return Position(*place, height, *rtk_accuracy(xmp)), problem
+            problems.append(problem)
+    return Position(), problems[0] if problems else ""
+
+
+def _place(north: Any, north_of: Any, east: Any, east_of: Any) -> tuple[tuple[float, float] | None, str]:
+    """Latitude and longitude in degrees, None where they are useless; and why, or what was assumed.
+
+    References of None are those that a format does not have.
+    """
+    latitude, longitude = _degrees(north, north_of, "S"), _degrees(east, east_of, "W")
+    if latitude is None or longitude is None:
+        return None, f"its {'latitude' if latitude is None else 'longitude'} is missing or no number"
+    longitude -= 360.0 * (180.0 < longitude <= 360.0)
+    if abs(latitude) > 90 or abs(longitude) > 180:
+        return None, f"{latitude:g}, {longitude:g} degrees lie nowhere on earth"
+    if (latitude, longitude) == (0.0, 0.0):
+        return None, "0, 0 degrees are what a receiver without a fix writes"
+    unsure = [
+        word
+        for value, of, word in ((latitude, north_of, "north"), (longitude, east_of, "east"))
+        if value > 0 and of == ""
+    ]
+    return (latitude, longitude), f"its hemisphere is not stated, {' and '.join(unsure)} is assumed" if unsure else ""
+
+
+def _degrees(value: Any, reference: Any, negative: str) -> float | None:
+    """Signed degrees from degrees, minutes and seconds, or as many of them as there are; None without degrees."""
+    parts, text = _parts(value), exif_text(value) if isinstance(value, str | bytes) else ""
+    if not parts or parts[0] is None:
+        return None
+    size = sum(abs(part or 0.0) / 60.0**power for power, part in enumerate(parts[:3]))
+    signed = text.startswith("-") or any(part is not None and part < 0 for part in parts)
+    return -size if signed or (exif_text(reference) or text[-1:]).upper().startswith(negative) else size
+
+
+def _altitude(value: Any, reference: Any) -> float | None:
+    """Metres, negative where value or reference say so; None where there are none."""
+    if isinstance(reference, bytes) and reference[:1] < b"0":
+        reference = tuple(reference)
+    (altitude, *_), (code, *_) = _parts(value) or [None], _parts(reference) or [None]
+    return altitude if altitude is None or code not in BELOW_ZERO else -abs(altitude)
+
+
+def _parts(value: Any) -> list[float | None]:
+    """The numbers of a value of EXIF or XMP, None for those that are none."""
+    if isinstance(value, str | bytes):
+        return [
+            exif_number(float(a) / float(b or 1)) if float(b or 1) else None
+            for a, b in NUMBER.findall(exif_text(value))
+        ]
+    return [exif_number(part) for part in (value if isinstance(value, tuple | list) else [value])]
+
+
+def exif_number(value: Any) -> float | None:
+    """A finite float, or None. Signed fractions that were written as EXIF's unsigned ones have wrapped numerators."""
+    try:
+        top = int(getattr(value, "numerator", 0))
+        number = (top - 2**32) / value.denominator if 2**31 <= top < 2**32 else float(value)
+    except (TypeError, ValueError, ArithmeticError, AttributeError):
+        return None
+    return number if np.isfinite(number) else None
+
+
+def exif_text(value: Any) -> str:
+    """EXIF text without the zero bytes that some cameras pad it with."""
+    text = value.decode("latin-1") if isinstance(value, bytes) else str(value or "")
+    return text.split("\x00")[0].strip()
+
+
 def rtk_accuracy(xmp: bytes) -> tuple[float | None, float | None]:
     """Standard deviations (m) of a photo's position, horizontal (of one axis) and vertical, that its XMP states."""
-    east, north, up = (_first(pattern, xmp) for pattern in (EAST, NORTH, UP))
+    east, north, up = (_positive(pattern, xmp) for pattern in (EAST, NORTH, UP))
     if east is not None and north is not None:
         return float(np.sqrt((east**2 + north**2) / 2)), up
-    return _first(HORIZONTAL, xmp), _first(VERTICAL, xmp)
+    return _positive(HORIZONTAL, xmp), _positive(VERTICAL, xmp)
 
 
-def _first(pattern: re.Pattern[bytes], xmp: bytes) -> float | None:
-    """A positive number in XMP, or None."""
+def _first(pattern: re.Pattern[bytes], xmp: bytes) -> bytes | None:
+    """What XMP states first of a property, or None."""
     found = pattern.search(xmp)
-    try:
-        number = float(found[1]) if found else 0.0
-    except ValueError:
-        return None
-    return number if np.isfinite(number) and number > 0 else None
+    return None if found is None else found[1]
+
+
+def _positive(pattern: re.Pattern[bytes], xmp: bytes) -> float | None:
+    """A positive number in XMP, or None."""
+    number = exif_number((_first(pattern, xmp) or b"").decode("latin-1"))
+    return number if number is not None and number > 0 else None
 
 
 def read_geo(path: Path) -> dict[str, Position]:

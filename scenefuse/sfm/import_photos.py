@@ -19,8 +19,15 @@ from scenefuse.photos.cameras.posed_photo import PosedPhoto, at_size
 from scenefuse.photos.cameras.read_cameras import read_posed_photos
 from scenefuse.photos.cameras.transforms import PERSPECTIVE
 from scenefuse.photos.photo_files import frame_name, masks_by_name, pictures_below, stored_size
-from scenefuse.photos.photos import SHAPE_TOLERANCE
-from scenefuse.photos.pictures import matte_of, write_picture
+from scenefuse.photos.photos import (
+    SHAPE_TOLERANCE,
+    bits_to_stretch,
+    each_photo,
+    has_16_bits,
+    inspect_photo,
+    stretch_notes,
+)
+from scenefuse.photos.pictures import matte_of, read_raw, stretched, write_picture
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.sfm.gravity import estimate_up
 from scenefuse.sfm.undistort import UndistortSettings, undistort_picture
@@ -63,6 +70,9 @@ def import_photos(
     if masks is not None and not masks.is_dir():
         raise StageError(f"--masks {masks} is no folder; give the folder of the masks")
     photos, kind, notes = read_posed_photos(data, images)
+    deep = [photo.file for photo in photos if has_16_bits(photo.file)]
+    bits = bits_to_stretch(each_photo(lambda file: inspect_photo(file.parent, file.name), deep))
+    notes += stretch_notes(bits)
     photos = _named(photos, Path(os.path.abspath(images or (data if data.is_dir() else data.parent) / "images")))
     files = {} if masks is None else masks_by_name([photo.name for photo in photos], masks)
     exact = masks is None and not any(photo.mask for photo in photos)
@@ -74,7 +84,7 @@ def import_photos(
         (output / "sparse").mkdir()
         for photo, lens in zip(photos, lenses):
             mask = photo.mask if masks is None else files.get(photo.name)
-            view = _write_photo(photo, lens, mask, exact, output / "images", folder)
+            view = _write_photo(photo, lens, mask, exact, bits, output / "images", folder)
             if view is not None:
                 kept.append(view)
                 held_out += [view.name] if photo.held_out else []
@@ -110,7 +120,7 @@ def _named(photos: list[PosedPhoto], folder: Path) -> list[PosedPhoto]:
 
 
 def _write_photo(
-    photo: PosedPhoto, lens: Lens, mask: Path | None, exact: bool, images: Path, mattes: Path
+    photo: PosedPhoto, lens: Lens, mask: Path | None, exact: bool, bits: int, images: Path, mattes: Path
 ) -> View | None:
     """Write one photo and its matte; returns its view by the name that it got, None for a photo without a mask.
 
@@ -118,15 +128,16 @@ def _write_photo(
         photo, lens: what to write, and its cameras.
         mask: its file; None where there is none, or where the alpha channel is the mask.
         exact: whether it is.
+        bits: that the photo's pixels are shifted by.
         images, mattes: folders.
     """
     camera, view = lens
-    picture, alpha = _read(photo.file)
+    picture, alpha = _read(photo.file, bits)
     matte = alpha if exact else _mask(mask, picture)
     if matte is None:
         return None
     stem, straight = Path(photo.name).stem, _straight(camera)
-    if straight and not exact:
+    if straight and not exact and not bits:
         name = photo.name
         shutil.copyfile(photo.file, images / name)
     else:
@@ -200,25 +211,24 @@ def _lenses(photos: list[PosedPhoto], settings: UndistortSettings) -> list[Lens]
     return [(c, replace(view, width=width, height=height)) for (c, view), (width, height) in zip(pairs, sizes)]
 
 
-def _read(file: Path) -> tuple[Picture, Picture | None]:
-    """A photo as stored, whatever its EXIF orientation: (H, W, 3) RGB, and (H, W) alpha where it varies."""
-    stored = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if stored is None or stored.dtype not in (np.uint8, np.uint16):
-        raise StageError(f"{file} is not a readable picture of 8 or 16 bits; export it again")
-    picture = np.asarray(stored // 257 if stored.dtype == np.uint16 else stored, dtype=np.uint8)
-    if picture.ndim == 2:
-        picture = np.repeat(picture[..., None], 3, axis=2)
-    alpha = picture[..., 3] if picture.shape[2] == 4 and picture[..., 3].min() < 255 else None
-    return np.ascontiguousarray(picture[..., 2::-1]), alpha
+def _read(file: Path, bits: int) -> tuple[Picture, Picture | None]:
+    """A photo as stored, whatever its EXIF orientation, its pixels shifted by some bits: (H, W, 3) RGB, and (H, W)
+    alpha where it varies."""
+    stored = read_raw(file)
+    if stored.dtype not in (np.uint8, np.uint16):
+        raise StageError(f"{file} is no picture of 8 or 16 bits; export it again")
+    picture = stretched(stored[..., :3], bits) if stored.ndim == 3 else stretched(stored, bits)[..., None]
+    alpha = stretched(stored[..., 3], 0) if stored.ndim == 3 and stored.shape[2] == 4 else None
+    return np.ascontiguousarray(np.broadcast_to(picture, (*picture.shape[:2], 3))[..., ::-1]), (
+        alpha if alpha is not None and alpha.min() < 255 else None
+    )
 
 
 def _mask(file: Path | None, picture: Picture) -> Picture | None:
     """A mask file at the photo's size, 0 or 255 but where it was resampled; None without a file."""
     if file is None:
         return None
-    matte = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
-    if matte is None:
-        raise StageError(f"the mask {file} is not a readable picture; export it again as PNG")
+    matte = read_raw(file)
     height, width = picture.shape[:2]
     if abs(matte.shape[1] / matte.shape[0] * height / width - 1) > SHAPE_TOLERANCE:
         raise StageError(

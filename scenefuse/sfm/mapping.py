@@ -42,6 +42,15 @@ from scenefuse.sfm.lens import DISTORTED, HELD, KNOWN, Choice, choose_lens, desc
 
 # A second mapping that explains this share of the matches that the first explains is the better one: less is chance.
 MIN_EXPLAINED_AGAIN = 0.999
+# What to do about photos without a camera, where cameras were given and where they were not.
+GIVEN_ADVICE = (
+    "Export the cameras of all photos, take the photos that have none out of the folder, or lower min_registered_share"
+)
+MAPPING_ADVICE = (
+    "Likely reasons: too little overlap between neighbouring photos, a camera that did not move, blur, surfaces without"
+    " texture, or pairs that were not compared. Add photos from places between them, set pairs to exhaustive, raise"
+    " max_features, or lower min_registered_share"
+)
 # Mappings are tried with so many seeds while photos seem to stand in wrong places.
 ATTEMPTS = 3
 
@@ -242,7 +251,7 @@ def _taken(
     work, place = sparse.with_name(f"{sparse.name}-given"), place_of(cameras)
     options = _mapper_options(len(names), True, seed)
     model, turned = triangulated(cameras, folder, orientations, database, work, options)
-    _check_registered([model], names, settings.min_registered_share)
+    _check_registered([model], names, settings.min_registered_share, given=cameras)
     drop_outliers(model)
     summary = _describe(model, names) | describe_lens(Choice(KNOWN, None, []), model)
     print(f"{summary['registered']['value']} of {len(names)} photos have a camera in {cameras}", flush=True)
@@ -325,20 +334,22 @@ def _mapper_options(
     return options
 
 
-def _check_registered(models: list[pycolmap.Reconstruction], names: list[str], share: float) -> None:
-    """StageError when the largest model holds too few of the photos."""
+def _check_registered(
+    models: list[pycolmap.Reconstruction], names: list[str], share: float, given: Path | None = None
+) -> None:
+    """StageError when the largest model, or that of the given cameras, holds too few of the photos."""
     count = models[0].num_reg_images() if models else 0
     if count >= MIN_PHOTOS and count >= share * len(names):
         return
     others = f" (and {len(models) - 1} separate smaller models)" if len(models) > 1 else ""
     missing = sorted(set(names) - (_registered_names(models[0]) if models else set()))
     some = f"{', '.join(missing[:5])}{', ...' if len(missing) > 5 else ''}"
+    what = f"only {count} of {len(names)} photos " + (
+        f"have a camera in {given}" if given else f"were registered{others}"
+    )
     raise StageError(
-        f"only {count} of {len(names)} photos were registered{others}, fewer than the share of {share:g} that"
-        f" min_registered_share requires; not registered: {some}."
-        " Likely reasons: too little overlap between neighbouring photos, a camera that did not move, blur, surfaces"
-        " without texture, or pairs that were not compared. Add photos from places between them, set pairs to"
-        " exhaustive, raise max_features, or lower min_registered_share"
+        f"{what}, fewer than the share of {share:g} that min_registered_share requires; without one: {some}. "
+        + (GIVEN_ADVICE if given else MAPPING_ADVICE)
     )
 
 

@@ -24,6 +24,7 @@ from scenefuse.core.stage import StageError, atomic_file, quantity, read_json, s
 from scenefuse.photos.geodesy import local_frame
 from scenefuse.photos.photos import Photo, gps_positions, read_photos
 from scenefuse.sfm.colmap import cancellable
+from scenefuse.sfm.features import FEW_FEATURES
 
 Pair = tuple[str, str]
 
@@ -35,6 +36,8 @@ MIN_GPS_SPREAD_M = 15.0
 POSITION_STEP_M = 0.1
 # Share of the photos that may stand at one position with more photos than each is compared with.
 MAX_REPEATED_SHARE = 0.1
+# Why photos have next to no features: those that are dark as a whole are brightened before (photos.photos).
+DULL = "blur, fog, darkness with a few lamps, or surfaces without texture; look at them"
 # Largest descriptor distance of a match (the paper's).
 MAX_DISTANCE = 0.7
 
@@ -97,12 +100,13 @@ def match_features(
             )
         with pycolmap.Database.open(temporary) as opened:
             _, per_pair = opened.read_two_view_geometry_num_inliers()
+            median = int(np.median([opened.num_keypoints_for_image(i.image_id) for i in opened.read_all_images()]))
         verified, inliers = int(np.count_nonzero(per_pair)), int(np.sum(per_pair))
         if verified == 0:
-            raise StageError(
-                f"none of the {len(pairs)} pairs of photos of {photos} show the same thing; "
-                f"check that the photos overlap, are sharp and textured"
-            )
+            advice = "check that the photos overlap, are sharp and textured"
+            if median < FEW_FEATURES:
+                advice = f"they have {median} features in the median, too few to match: {DULL}"
+            raise StageError(f"none of the {len(pairs)} pairs of photos of {photos} show the same thing; {advice}")
     print(f"{verified} of {len(pairs)} pairs verified, {inliers} matches", flush=True)
     content: dict[str, Any] = {
         "pairs_choice": quantity(choice, ""),

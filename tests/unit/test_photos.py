@@ -1,13 +1,19 @@
 import hashlib
 import os
+import struct
+import zlib
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, TiffImagePlugin
 
+import scenefuse.photos.photo_files
 from scenefuse.core.stage import StageError, read_json, value
-from scenefuse.photos.photo_files import photo_files
-from scenefuse.photos.photos import check_unchanged, gps_positions, inspect_photo, list_photos, read_photos
+from scenefuse.photos.photo_files import photo_files, stored_size, upright_size
+from scenefuse.photos.photos import check_unchanged, inspect_photo, list_photos, read_photos
+from scenefuse.photos.pictures import read_gray, read_raw
+from scenefuse.photos.positions import stated_position
 
 
 def save(path, size=(40, 30), gps=None, shade=100, focal_35mm=None, orientation=None):
@@ -42,30 +48,6 @@ def test_sizes_hashes_positions_and_subfolders(tmp_path):
     assert first.focal_px == pytest.approx(20.0)  # 18 mm of a 36 mm wide frame is half of 40 columns
     assert (second.name, second.width, second.height, second.has_gps) == ("sub/b.png", 20, 50, False)
     assert value(read_json(tmp_path / "photos.json"), "with_gps") == 1
-
-
-@pytest.mark.parametrize(
-    "gps",
-    [
-        {1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)},
-        {1: "N", 3: "E"},
-        {1: "N", 2: (99.0, 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)},
-    ],
-)
-def test_a_useless_position_is_no_position(tmp_path, gps):
-    save(tmp_path / "p" / "a.jpg", gps=gps)
-    listed(tmp_path, tmp_path / "p")
-    assert not read_photos(tmp_path / "photos.json")[0].has_gps
-
-
-def test_depth_below_sea_level_and_missing_altitude(tmp_path):
-    north_east = {1: "N", 2: (31.0, 0.0, 0.0), 3: "E", 4: (35.0, 0.0, 0.0)}
-    save(tmp_path / "p" / "a.jpg", gps=north_east | {5: b"\x01", 6: 400.0}, shade=1)
-    save(tmp_path / "p" / "b.jpg", gps=north_east, shade=2)
-    listed(tmp_path, tmp_path / "p")
-    names, positions = gps_positions(read_photos(tmp_path / "photos.json"))
-    assert names == ["a.jpg", "b.jpg"]
-    np.testing.assert_allclose(positions, [[31, 35, -400], [31, 35, np.nan]])
 
 
 def test_all_bad_photos_are_named_at_once(tmp_path):
@@ -113,11 +95,11 @@ def test_rotated_photos_are_stood_upright_and_the_others_linked(tmp_path):
 def test_a_photo_that_was_replaced_or_removed_since_it_was_listed_is_named(tmp_path):
     folder = tmp_path / "p"
     for index in range(3):
-        save(folder / f"{index}.png", shade=index)
+        save(folder / f"{index}.png", shade=200 + index)
     photos = listed(tmp_path, folder)
     check_unchanged(tmp_path / "upright", photos)
     before = (folder / "1.png").stat()
-    save(folder / "1.png", shade=200)
+    save(folder / "1.png", shade=100)
     os.utime(folder / "1.png", (before.st_atime, before.st_mtime - 1000))
     with pytest.raises(StageError, match=r"1\.png is not the photo that was listed any more"):
         check_unchanged(tmp_path / "upright", photos)
@@ -142,8 +124,8 @@ def test_a_photo_of_200_megapixels_is_read_and_one_that_no_camera_takes_is_refus
     (tmp_path / "p").mkdir()
     Image.new("1", (20_000, 10_000)).save(tmp_path / "p" / "phone.png")
     assert inspect_photo(tmp_path / "p", "phone.png").width == 20_000
-    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", Image.MAX_IMAGE_PIXELS // 3)
-    with pytest.raises(StageError, match=r"phone\.png cannot be decoded .*exceeds limit"):
+    monkeypatch.setattr(scenefuse.photos.photo_files, "MAX_PIXELS", 199_999_999)
+    with pytest.raises(StageError, match=r"phone\.png cannot be decoded .*20000 x 10000 pixels are more than any"):
         inspect_photo(tmp_path / "p", "phone.png")
 
 
@@ -181,3 +163,140 @@ def test_photos_that_cannot_be_read_are_named(tmp_path, name):
     (tmp_path / "p" / name).write_bytes(b"x")
     with pytest.raises(StageError, match=f"{name} cannot be read.*convert to JPEG"):
         photo_files(tmp_path / "p")
+
+
+R = TiffImagePlugin.IFDRational
+NONE = R(0, 0)
+
+
+@pytest.mark.parametrize(
+    ("gps", "place", "note"),
+    [
+        ({1: "S", 2: (R(33), R(30), R(0)), 3: "W", 4: (R(70), R(15), R(0))}, (-33.5, -70.25), ""),
+        ({1: "S", 2: (R(-33), R(-30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
+        ({2: (R(-33), R(30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
+        ({2: (R(2**32 - 33), R(30), R(0)), 3: "E", 4: (R(70), R(15), R(0))}, (-33.5, 70.25), ""),
+        ({1: "s", 2: (33.5,), 3: "west", 4: 70.25}, (-33.5, -70.25), ""),
+        ({1: b"S\0", 2: (R(33), R(30)), 3: b"W\0", 4: (R(70), R(15))}, (-33.5, -70.25), ""),
+        ({1: "N", 2: (R(33), R(30), NONE), 3: "E", 4: (R(70), R(15), R(1, 0))}, (33.5, 70.25), ""),
+        ({1: "N", 2: "33,30,0", 3: "E", 4: "70 deg 15' 0.0\""}, (33.5, 70.25), ""),
+        ({2: "33.5 S", 4: b"70.25W\0"}, (-33.5, -70.25), ""),
+        ({1: "N", 2: "67/2", 3: "E", 4: "70/1 15/1 0/0"}, (33.5, 70.25), ""),
+        ({1: "N", 2: (33.5, 0, 0), 3: "E", 4: (289.75, 0, 0)}, (33.5, -70.25), ""),
+        ({2: (33.0, 30.0, 0.0), 4: (70.0, 15.0, 0.0)}, (33.5, 70.25), "hemisphere is not stated, north and east is"),
+        ({1: "N", 2: (NONE, NONE, NONE), 3: "E", 4: (70.0, 15.0, 0.0)}, None, "latitude is missing or no number"),
+        ({1: "N", 2: (33.0, 30.0, 0.0)}, None, "longitude is missing or no number"),
+        ({1: "N", 2: (99.0, 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)}, None, "99, 8 degrees lie nowhere on earth"),
+        ({1: "N", 2: (0.0, 0.0, 0.0), 3: "E", 4: (0.0, 0.0, 0.0)}, None, "a receiver without a fix"),
+        ({1: "N", 2: (float("nan"), 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)}, None, "latitude is missing"),
+        ({1: "N", 3: "E"}, None, ""),
+    ],
+)
+def test_a_position_is_read_however_exif_writes_it(gps, place, note):
+    position, said = stated_position(gps, b"")
+    found = None if position.latitude_deg is None else (position.latitude_deg, position.longitude_deg)
+    assert found == (place and pytest.approx(place)) and note in said and bool(note) == bool(said)
+
+
+@pytest.mark.parametrize(
+    ("altitude", "reference", "metres"),
+    [
+        (R(400), 0, 400),
+        (R(400), b"\0", 400),
+        (R(400), b"\1", -400),
+        (R(400), 1, -400),
+        (R(400), (1,), -400),
+        (R(400), "1", -400),
+        (R(400), b"1", -400),
+        (R(-400), 1, -400),
+        (R(-400), 0, -400),
+        (R(2**32 - 400), None, -400),
+        (R(400), b"\2", 400),
+        (R(400), b"\3", -400),
+        (R(400), None, 400),
+        ("400.5 m", None, 400.5),
+        (R(0, 0), 0, None),
+        (float("inf"), 0, None),
+        (None, 1, None),
+    ],
+)
+def test_an_altitude_lies_below_zero_where_value_or_reference_say_so(altitude, reference, metres):
+    gps = {1: "N", 2: (33.5,), 3: "E", 4: (70.25,), 5: reference, 6: altitude}
+    assert stated_position(gps, b"")[0].altitude_m == metres
+
+
+DJI = b'<a drone-dji:GpsLatitude="-33.5" drone-dji:GpsLongtitude="+70.25" drone-dji:AbsoluteAltitude="-12.5"/>'
+XMP = b"<exif:GPSLatitude>33,30.0S</exif:GPSLatitude><exif:GPSLongitude>70,15,0E</exif:GPSLongitude>"
+XMP += b"<exif:GPSAltitude>125/10</exif:GPSAltitude><exif:GPSAltitudeRef>1</exif:GPSAltitudeRef>"
+
+
+@pytest.mark.parametrize("xmp", [DJI, XMP])
+def test_where_exif_has_no_position_xmp_has(xmp):
+    for gps in ({}, {2: (NONE,), 4: (NONE,)}):
+        position, note = stated_position(gps, xmp)
+        assert (position.latitude_deg, position.longitude_deg, position.altitude_m) == (
+            -33.5,
+            70.25,
+            -12.5,
+        ) and not note
+    own = {1: "N", 2: (40.0,), 3: "W", 4: (3.0,)}
+    position, _ = stated_position(own, xmp)
+    assert (position.latitude_deg, position.longitude_deg, position.altitude_m) == (40.0, -3.0, -12.5)
+
+
+def test_why_a_photo_has_no_position_is_said(tmp_path):
+    save(tmp_path / "p" / "a.jpg", gps={1: "N", 2: (99.0, 0.0, 0.0), 3: "E", 4: (8.0, 0.0, 0.0)})
+    listed(tmp_path, tmp_path / "p")
+    said = "the GPS positions of 1 photos: 99, 8 degrees lie nowhere on earth (of a.jpg, for one)"
+    assert value(read_json(tmp_path / "photos.json"), "notes") == [said]
+
+
+@pytest.mark.parametrize("form", ["grey tif", "colour png", "dark jpg"])
+def test_photos_of_12_bits_and_dark_ones_are_stretched_and_that_is_said(tmp_path, form):
+    folder, rng = tmp_path / "p", np.random.default_rng(0)
+    folder.mkdir()
+    for k in range(2):
+        if form == "dark jpg":
+            pixels = rng.integers(4, 12, (40, 60, 1)).astype(np.uint8).repeat(8, 0).repeat(8, 1).repeat(3, 2)
+            Image.fromarray(pixels).save(folder / f"{k}.jpg", quality=98)
+            expected = pixels.astype(np.float64) * 16
+        else:
+            pixels = rng.integers(50, 4096 >> k, (64, 96, 3)[: 2 if "grey" in form else 3]).astype(np.uint16)
+            cv2.imwrite(str(folder / f"{k}.{form[-3:]}"), pixels[..., ::-1] if pixels.ndim == 3 else pixels)
+            expected = pixels / 16
+    photos = listed(tmp_path, folder)
+    assert "pixels are 16 times as bright here" in value(read_json(tmp_path / "photos.json"), "notes")[-1]
+    with Image.open(tmp_path / "upright" / photos[1].name) as seen:
+        assert np.abs(np.asarray(seen) - expected.astype(np.float64)).mean() < 2
+    check_unchanged(tmp_path / "upright", photos)
+
+
+def test_a_photo_whose_exif_is_odd_keeps_its_place_when_it_is_turned(tmp_path):
+    exif = Image.Exif()
+    exif[0x0112], exif[0x8769] = 6, {0xA405: 24}
+    exif[0x8825] = {1: "N", 2: (33.5,), 3: "e", 4: (70.0, 15.0)}
+    (tmp_path / "p").mkdir()
+    Image.new("RGB", (72, 36), (99, 99, 99)).save(tmp_path / "p" / "--help.jpg", exif=exif)
+    (photo,) = listed(tmp_path, tmp_path / "p")
+    assert (photo.width, photo.height, photo.latitude_deg, photo.longitude_deg) == (36, 72, 33.5, 70.25)
+    assert photo.focal_px == pytest.approx(48.0) and photo.focal_mm is None
+    with Image.open(tmp_path / "upright/--help.jpg") as upright:
+        assert upright.getexif().get_ifd(0x8769)[0xA405] == 24
+
+
+def bomb(path):
+    """A PNG that claims 10^9 pixels."""
+    size = struct.pack(">IIBBBBB", 50_000, 20_000, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", size), (b"IDAT", zlib.compress(b"\0" * 100)), (b"IEND", b"")]
+    path.write_bytes(b"\x89PNG\r\n\x1a\n")
+    with path.open("ab") as file:
+        for kind, data in chunks:
+            file.write(struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)))
+
+
+def test_a_picture_that_claims_a_billion_pixels_is_refused_before_it_is_decoded(tmp_path):
+    (tmp_path / "p").mkdir()
+    bomb(tmp_path / "p" / "bomb.png")
+    for read in (upright_size, stored_size, read_gray, read_raw, lambda path: inspect_photo(path.parent, path.name)):
+        with pytest.raises(StageError, match="bomb.png .*pixels"):
+            read(tmp_path / "p" / "bomb.png")
