@@ -13,8 +13,8 @@ from scenefuse.marks.triangulation import triangulate_consistent
 from scenefuse.photos.workspace import posed_images, ray_through, read_model
 from scenefuse.pick.edits import Sizes
 
-# A ray's ends, as shares of the depths of the nearest and the farthest sparse point that the photo sees.
-NEAR, FAR = 0.3, 4.0
+# A ray reaches so many times nearer and farther than the sparse points that the photo sees.
+RAY_REACH = 4
 RAY_SAMPLES = 200
 
 
@@ -94,7 +94,7 @@ class Cameras:
         pose = image.cam_from_world().matrix()
         seen = np.array([self._model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
         depth = seen @ pose[2, :3] + pose[2, 3] if len(seen) else np.ones(1)
-        steps = np.geomspace(NEAR * max(depth.min(), 1e-6), FAR * depth.max(), RAY_SAMPLES)
+        steps = np.geomspace(max(depth.min(), 1e-6) / RAY_REACH, RAY_REACH * depth.max(), RAY_SAMPLES)
         return self._seen((ray * steps[:, None] - pose[:, 3]) @ pose[:, :3], photo)
 
     def _seen(self, points: Array, photo: str) -> Array:

@@ -1,19 +1,17 @@
 """The page: photos at the left, one of them large, and beside it what is marked and what comes next."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 from nicegui import ui
 
 from scenefuse.core.stage import StageError
-from scenefuse.pick.document import Document, FileChanged
-from scenefuse.pick.editor import Editor
+from scenefuse.pick.document import Document
 from scenefuse.pick.panels import PhotoStrip, SidePanel
 from scenefuse.pick.photo_map import MaskLayers, PhotoMap
 from scenefuse.pick.photo_tiles import BACKGROUND, Picture
 from scenefuse.pick.session import Session
-from scenefuse.pick.tables import Table
+from scenefuse.pick.tables import Editor
 
 STYLE = """
 body { overflow: hidden; background: GREY; }
@@ -47,9 +45,7 @@ KEYS = {
     "n, p": "next, previous photo",
     "+ − 0": "zoom in, out, whole photo (or the wheel)",
     "m": "show or hide masks",
-    "a": "accept the workflow's mask, next one",
     "t": "next table",
-    "s": "save",
 }
 POLL_S = 1.0
 
@@ -67,7 +63,6 @@ class Page:
         self._editor: Editor | None = None
         self._shows_masks = True
         self._seen: Any = None
-        self._dialog: Any = None
         ui.add_css(STYLE)
         ui.colors(primary="#1565c0")
         ui.query(".nicegui-content").classes("p-0 gap-0")
@@ -88,8 +83,7 @@ class Page:
             self._tabs.props("no-caps dense unelevated padding='2px 12px'").set_visibility(len(titles) > 1)
             self._title = ui.label().classes("text-sm text-gray-700 ellipsis")
             ui.space()
-            self._state = ui.label()
-            ui.button("Save", icon="save", on_click=self._save).props("dense no-caps padding='2px 12px'")
+            self._state = ui.label().classes("text-sm text-gray-600")
             ui.button(icon="help_outline", on_click=lambda: self._help.open()).props("dense flat round")
         with ui.row().classes("w-full no-wrap gap-0").style("height: calc(100vh - 44px)"):
             self._strip = PhotoStrip(session, self._open_photo)
@@ -99,7 +93,7 @@ class Page:
                     lambda x, y: self._act(lambda: self._open.remove(x, y, self._map.reach_px())),
                     lambda corners: self._act(lambda: self._open.draw_box(corners)),
                 )
-            self._panel = SidePanel(session, self._act, self._open_photo, self._accept)
+            self._panel = SidePanel(session, self._act, self._open_photo)
         self._layers = MaskLayers(session, self._map, lambda: self._panel.show_note(self._layers))
         with ui.dialog() as self._help, ui.card():
             ui.label("Keys and mouse").classes("text-base font-bold")
@@ -118,6 +112,8 @@ class Page:
     def _open_table(self, number: int) -> None:
         """Go over to another table."""
         table = self._session.tables[number]
+        if table.document.changed_on_disk():
+            table.document.read()
         self._strip.open(number)
         clicked = {row.photo for row in table.document.rows}
         first = next((p for p in self._strip.order if p.name in clicked), self._strip.order[0])
@@ -158,8 +154,8 @@ class Page:
             name = {"z": "y" if event.modifiers.shift else "z", "y": "y"}.get(name, "")
         tools = {"i": "inside", "o": "outside", "b": "box", "escape": "inside"}
         steps = {"n": 0, "arrowright": 0, "arrowdown": 0, "p": -1, "arrowleft": -1, "arrowup": -1}
-        actions: dict[str, Callable[[], Any]] = {"s": self._save, "a": self._accept, "m": self._toggle_masks}
-        actions |= {"0": self._map.fit, "?": self._help.open, "t": self._open_next_table}
+        actions: dict[str, Callable[[], Any]] = {"m": self._toggle_masks, "0": self._map.fit}
+        actions |= {"?": self._help.open, "t": self._open_next_table}
         actions |= dict.fromkeys("+=", lambda: self._map.zoom(1)) | dict.fromkeys("-_", lambda: self._map.zoom(-1))
         actions |= {"z": lambda: self._act(self._open.undo), "y": lambda: self._act(lambda: self._open.undo(True))}
         if name in tools:
@@ -177,63 +173,15 @@ class Page:
         self._shows_masks = not self._shows_masks
         self._refresh()
 
-    def _accept(self) -> None:
-        """The workflow's mask of this photo is right; go to the next that nobody has accepted."""
-        masks, picture = self._session.masks, self._open.picture
-        if self._open.table.column != "prompts" or not masks.has_mask(picture.name):
-            return
-        masks.accept(picture.name)
-        following = self._strip.following(picture)
-        left = [p for p in following if masks.has_mask(p.name) and not masks.is_accepted(p.name)]
-        if left:
-            self._open_photo(left[0])
-        else:
-            _notify("All masks are accepted.", "positive")
-            self._refresh()
-
-    def _save(self) -> None:
-        """Save the table that is clicked now, and all others that have unsaved clicks."""
-        for document in (table.document for table in self._session.tables):
-            if document is self._open.table.document or document.unsaved:
-                try:
-                    self._act(partial(_save, document))
-                except FileChanged as error:
-                    self._ask_whose_clicks(document, str(error))
-
-    def _ask_whose_clicks(self, document: Document, message: str) -> None:
-        """The file is not what was read: whose clicks count?"""
-        if self._dialog is not None and self._dialog.value:
-            return
-        choices: dict[str, Callable[[], str | None]] = {
-            "Take both": document.merge,
-            "Take the file's": document.read,
-            "Keep mine (the file's is set aside)": document.keep_mine,
-        }
-
-        def decide(choice: Callable[[], str | None]) -> None:
-            self._dialog.close()
-            self._act(lambda: _notify(choice() or "The file's clicks are shown.", "positive"))
-
-        with ui.dialog().props("persistent") as self._dialog, ui.card():
-            ui.label("The file has changed").classes("text-base font-bold")
-            ui.label(message).classes("text-sm")
-            with ui.row():
-                for text, choice in choices.items():
-                    button = ui.button(text, on_click=lambda choice=choice: decide(choice))
-                    button.props("no-caps dense padding='2px 10px'")
-        self._dialog.open()
-
     # What is shown
 
     def _poll(self) -> None:
-        """Take up what another page, an editor, the workflow and the background have done, and keep drafts."""
-        self._session.keep_drafts()
+        """Take up what another page, an editor, the workflow and the background have done."""
         self._session.read_results()
         if self._editor is None:
             return
         document = self._open.table.document
-        # Where there are unsaved clicks, too, saving asks.
-        if document.changed_on_disk() and not document.unsaved:
+        if document.changed_on_disk():
             document.read()
             _notify(f"{document.path} was changed by someone else: it was read again.")
         if self._seen != self._state_of(document):
@@ -258,18 +206,13 @@ class Page:
         visible = self._shows_masks and labels and editor.table.column == "prompts"
         self._layers.update(editor.picture, editor.here, visible)
         self._strip.update(document.rows)
-        _show_state(self._state, document, self._session.tables)
+        self._state.set_text(f"saved in {document.path}" if document.path.exists() else "no clicks yet")
         self._panel.fill(editor, self._layers)
 
 
-def _notify(text: str, kind: str = "warning") -> None:
+def _notify(text: str) -> None:
     """A notice at the lower edge."""
-    ui.notify(text, type=kind, position="bottom", multi_line=True, timeout=6000)  # type: ignore[arg-type]
-
-
-def _save(document: Document) -> None:
-    """Save a table, and say so."""
-    _notify(document.save(), "positive")
+    ui.notify(text, type="warning", position="bottom", multi_line=True, timeout=6000)
 
 
 def _draw_points(photo_map: PhotoMap, editor: Editor) -> None:
@@ -283,14 +226,3 @@ def _draw_points(photo_map: PhotoMap, editor: Editor) -> None:
         expected = cameras.expected(own, photo) if cameras else None
         if expected is not None and (label == editor.point or (here is None and expected.from_photos > 1)):
             photo_map.draw_expected(expected.pixels)
-
-
-def _show_state(shown: ui.label, document: Document, tables: list[Table]) -> None:
-    """Say which tables have unsaved clicks."""
-    unsaved = [table.title for table in tables if table.document.unsaved]
-    if unsaved:
-        text = "● not saved" + (f": {', '.join(unsaved)}" if len(tables) > 1 else "")
-    else:
-        text = "saved" if document.path.exists() else "no file yet"
-    shown.set_text(text)
-    shown.classes(replace="text-sm " + ("text-red-700" if unsaved else "text-gray-600"))

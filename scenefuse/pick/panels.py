@@ -1,22 +1,19 @@
 """What stands beside the photo: the strip of thumbnails, and the panel of tools, points, masks and what comes next."""
 
-import asyncio
 from collections import Counter
 from collections.abc import Callable
 
 from nicegui import ui
 
 from scenefuse.marks.clicks import label_name
-from scenefuse.pick.editor import Editor
 from scenefuse.pick.edits import Rows
 from scenefuse.pick.photo_map import MaskLayers
 from scenefuse.pick.photo_tiles import Picture
-from scenefuse.pick.session import Session
-from scenefuse.pick.workflow import as_text, command, dry_run
+from scenefuse.pick.session import Session, next_command
+from scenefuse.pick.tables import Editor
 
 Act = Callable[[Callable[[], None]], None]
 TOGGLE = "no-caps dense unelevated spread padding='3px 8px'"
-BUTTON = "dense outline padding='2px 10px'"
 
 
 class PhotoStrip:
@@ -62,7 +59,7 @@ class PhotoStrip:
         self._thumbs[picture.name] = thumb
 
     def update(self, rows: Rows) -> None:
-        """Show how many clicks each photo has, which have no camera, how masks agree, and which are accepted."""
+        """Show how many clicks each photo has, which have no camera, and how masks agree."""
         # The two corners of a box are one mark.
         marks = {(row.photo, "box" if row.label == "box" else k) for k, row in enumerate(rows)}
         clicks = Counter(photo for photo, _ in marks)
@@ -106,21 +103,18 @@ class PhotoStrip:
 class SidePanel:
     """What is beside the photo; filled anew after every change."""
 
-    def __init__(
-        self, session: Session, act: Act, on_open: Callable[[Picture], None], on_accept: Callable[[], None]
-    ) -> None:
+    def __init__(self, session: Session, act: Act, on_open: Callable[[Picture], None]) -> None:
         """Build the panel inside the current element, empty.
 
         Args:
             session: the object.
             act: does what a person wants, and shows what changed or why it cannot be done.
             on_open: shows a photo.
-            on_accept: accepts the workflow's mask of the photo.
         """
-        self._session, self._act, self._on_open, self._on_accept = session, act, on_open, on_accept
+        self._session, self._act, self._on_open = session, act, on_open
         self._column = ui.column().classes("side h-full no-wrap")
         with self._column:
-            self._note = self._answer = ui.label()
+            self._note = ui.label()
 
     def fill(self, editor: Editor, layers: MaskLayers) -> None:
         """Show what there is now."""
@@ -128,7 +122,7 @@ class SidePanel:
         self._column.clear()
         with self._column:
             ui.label(table.advice).classes("text-sm text-gray-700")
-            for text in filter(None, (document.trouble, document.fixed, *table.notes[:3])):
+            for text in filter(None, (document.trouble, *table.notes[:3])):
                 ui.label(text).classes("text-xs text-red-700")
             if table.column == "fiducials" and not document.rows:
                 kinds = {"labels": "In one photo", "points": "Named points"}
@@ -159,20 +153,13 @@ class SidePanel:
         self.show_note(layers)
         if self._session.segmenter.trouble:
             ui.label(self._session.segmenter.trouble).classes("text-xs text-orange-900")
-        if masks.agreement:
-            accepted = sum(map(masks.is_accepted, masks.agreement))
-            ui.separator()
-            text = f"The workflow's masks (orange): {accepted} of {len(masks.agreement)} accepted"
-            ui.label(text).classes("text-sm")
         for text in masks.notes[:4]:
             ui.label(text).classes("text-xs text-orange-900")
         if photo in masks.dropped:
             ui.label(f"Left out: {masks.dropped[photo]}. Add clicks here.").classes("text-xs text-red-700")
         elif photo in masks.agreement:
-            text = f"Agreement with the others here: {masks.agreement[photo]:.2f}"
-            ui.label(text + (" · accepted" if masks.is_accepted(photo) else "")).classes("text-xs")
-        if masks.agreement:
-            ui.button("Accept, next (a)", icon="check", on_click=self._on_accept).props(BUTTON)
+            text = f"The workflow's mask (orange) agrees with the others: {masks.agreement[photo]:.2f}"
+            ui.label(text).classes("text-xs")
 
     def _fill_points(self, editor: Editor) -> None:
         table, document = editor.table, editor.table.document
@@ -210,13 +197,4 @@ class SidePanel:
         if document.rows and not table.listed:
             text = f"Write {document.path} into the column {table.column} of the table of {table.of}."
             ui.label(text).classes("text-xs text-orange-900")
-        words = command(self._session.configfiles, str(table.result))
-        ui.label(as_text(words)).classes("code w-full").mark("command")
-        ui.button("What will run?", icon="playlist_play", on_click=lambda: self._plan(words)).props(BUTTON)
-        self._answer = ui.label().classes("text-xs")
-
-    async def _plan(self, words: list[str]) -> None:
-        """Say which rules a command will run. The panel may be filled anew meanwhile."""
-        self._answer.set_text("Planning; some seconds ...")
-        text = await asyncio.to_thread(dry_run, words)
-        self._answer.set_text(text)
+        ui.label(next_command(self._session.configfiles, table.result)).classes("code w-full").mark("command")

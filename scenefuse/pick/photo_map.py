@@ -18,7 +18,7 @@ from scenefuse.core.stage import StageError
 from scenefuse.core.transforms import Array
 from scenefuse.marks.clicks import Click
 from scenefuse.pick.edits import Corners, Rows
-from scenefuse.pick.photo_tiles import MASK_PX, Picture
+from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.session import Session
 
 # Zoom steps beyond the photo's own pixels.
@@ -27,8 +27,6 @@ COLOURS = {"inside": "#00c853", "outside": "#ff1744", "box": "#2979ff"}
 POINT, ACTIVE, EXPECTED = "#2979ff", "#ffd600", "#ff9100"
 # A pointer means a click this near to it, on the screen.
 POINTER_PX = 14
-# Opacity of a mask's inside, of 255, and width of its outline where its longer side has MASK_PX.
-TINT, OUTLINE_PX = 70, 3
 
 Handler = Callable[[float, float], None]
 
@@ -267,8 +265,7 @@ def overlay(mask: NDArray[np.bool_], colour: str) -> str:
     blue_green_red = tuple(bytes.fromhex(colour[1:]))[::-1]
     pixels = np.zeros((*mask.shape, 4), dtype=np.uint8)
     pixels[..., :3] = blue_green_red
-    pixels[mask, 3] = TINT
-    width = max(2, round(OUTLINE_PX * max(mask.shape) / MASK_PX))
+    pixels[mask, 3] = 70
     lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    cv2.drawContours(pixels, lines, -1, (*blue_green_red, 255), width)
+    cv2.drawContours(pixels, lines, -1, (*blue_green_red, 255), 2)
     return "data:image/png;base64," + base64.b64encode(cv2.imencode(".png", pixels)[1].tobytes()).decode()

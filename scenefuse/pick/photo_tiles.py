@@ -3,7 +3,7 @@
 import hashlib
 import math
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,10 +21,8 @@ TILE_PX = 256
 THUMBNAIL_PX = 320
 # Longer side of the photos that masks are made and shown in; SAM 2 sees no more.
 MASK_PX = 1024
-# Tiles of levels no larger than this are cut from a copy that a JPEG gives ten times as fast as itself.
-COARSE_PX = 1280
-# Photos kept decoded, 200 MB each at 50 megapixels, and coarse copies, 5 MB each.
-FINE_PYRAMIDS, COARSE_PYRAMIDS = 2, 30
+# Photos kept decoded, 200 MB each at 50 megapixels.
+KEPT_PYRAMIDS = 3
 # Beyond the photo's edges.
 BACKGROUND = "#202020"
 
@@ -105,7 +103,7 @@ class Tiles:
     """Tiles of photos, cut from pyramids of those that were looked at last."""
 
     def __init__(self) -> None:
-        self._fine, self._coarse = _cached(FINE_PYRAMIDS), _cached(COARSE_PYRAMIDS)
+        self._read, self._lock = lru_cache(KEPT_PYRAMIDS)(_pyramid), threading.Lock()
 
     def tile(self, picture: Picture, zoom: int, column: int, row: int) -> bytes:
         """A tile of 256 x 256 pixels, as JPEG; grey beyond the photo's right and lower edge.
@@ -120,23 +118,16 @@ class Tiles:
         width, height = picture.size_at(level)
         if column * TILE_PX >= width or row * TILE_PX >= height:
             raise IndexError
-        first = next(k for k in range(picture.depth + 1) if max(picture.size_at(k)) <= COARSE_PX or k == picture.depth)
-        pixels = self._coarse(picture, first)[level - first] if level >= first > 0 else self._fine(picture, 0)[level]
+        # A JPEG gives a small copy of itself ten times as fast.
+        coarse = next(k for k in range(picture.depth + 1) if max(picture.size_at(k)) <= MASK_PX or k == picture.depth)
+        first = coarse if level >= coarse else 0
+        # Each photo is read once, however many threads want it.
+        with self._lock:
+            pixels = self._read(picture, first)[level - first]
         part = pixels[row * TILE_PX : (row + 1) * TILE_PX, column * TILE_PX : (column + 1) * TILE_PX]
         full = np.full((TILE_PX, TILE_PX, 3), tuple(bytes.fromhex(BACKGROUND[1:])), dtype=np.uint8)
         full[: part.shape[0], : part.shape[1]] = part
         return jpeg(full)
-
-
-def _cached(count: int) -> Callable[[Picture, int], list[Pixels]]:
-    """`_pyramid` of the photos that were looked at last; each is read once, however many threads want it."""
-    read, lock = lru_cache(count)(_pyramid), threading.Lock()
-
-    def pyramid(picture: Picture, first: int) -> list[Pixels]:
-        with lock:
-            return read(picture, first)
-
-    return pyramid
 
 
 def _pyramid(picture: Picture, first: int) -> list[Pixels]:

@@ -59,7 +59,7 @@ def pick(
 
     app.on_startup(session.start)
     app.on_startup(announce)
-    app.on_shutdown(lambda: [print(sentence, flush=True) for sentence in session.close()])
+    app.on_shutdown(session.close)
     try:
         ui.run(
             host=HOST,

@@ -1,20 +1,29 @@
-"""All that open pages of one object share: its tables, photos, masks and the work in the background."""
+"""All that open pages of one object share: its tables, photos, the workflow's masks, the work in the background."""
 
 import os
 import secrets
+import shlex
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
 
 from scenefuse.core.project import read_project
 from scenefuse.core.settings import read_settings
-from scenefuse.core.stage import StageError
-from scenefuse.pick.photo_tiles import Picture, Thumbnails, Tiles
+from scenefuse.core.stage import StageError, read_json
+from scenefuse.photos.pictures import read_mask
+from scenefuse.photos.workspace import read_cameras
+from scenefuse.pick.photo_tiles import MASK_PX, Picture, Thumbnails, Tiles
 from scenefuse.pick.segmenter import Segmenter
 from scenefuse.pick.tables import tables_of
-from scenefuse.pick.workflow import WorkflowMasks
+
+Mask = NDArray[np.bool_]
+OWN_SETTINGS = Path("config/config.yaml")
 
 
 class Session:
@@ -62,7 +71,7 @@ class Session:
         if self.results_state:
             for table in self.tables:
                 table.read_cameras()
-        self.masks = WorkflowMasks(results, Path("results/pick") / f"{self.name}.json")
+        self.masks = WorkflowMasks(results)
         self.results_state = state
 
     def standing(self, table: int, photo: str) -> tuple[str, bool]:
@@ -76,7 +85,7 @@ class Session:
         if photo in masks.dropped:
             return "left out", True
         score = masks.agreement.get(photo)
-        return ("", False) if score is None else (f"{score:.2f}" + " ✓" * masks.is_accepted(photo), False)
+        return ("", False) if score is None else (f"{score:.2f}", False)
 
     def start(self) -> None:
         """Begin the work in the background: thumbnails, and features of the photos that come next."""
@@ -93,23 +102,10 @@ class Session:
             sys.stderr.flush()
             os._exit(status)
 
-    def close(self) -> Iterator[str]:
-        """End the background's work and keep what is not saved; a sentence for each table that is not."""
+    def close(self) -> None:
+        """End the work in the background."""
         self._closed = True
         self.segmenter.close()
-        for table in self.tables:
-            draft = table.document.keep_draft()
-            if draft is not None:
-                yield f"clicks that were not saved are kept in {draft}; the page takes them up again"
-
-    def keep_drafts(self) -> None:
-        """Keep what is not saved, in case that this process does not end by itself."""
-        for table in self.tables:
-            try:
-                table.document.keep_draft()
-            except StageError as error:
-                if str(error) not in table.notes:
-                    table.notes.append(str(error))
 
     def photo(self, table: int, number: int) -> Picture:
         """A photo by its place in the table's photos; IndexError where there is none."""
@@ -133,3 +129,62 @@ class Session:
     def thumbnails_left(self, table: int) -> int:
         """Photos of a table whose sharpness is not known yet."""
         return sum(self.thumbnails.is_missing(picture) for picture in self.tables[table].pictures.values())
+
+
+class WorkflowMasks:
+    """What the masks' stage left in an object's results.
+
+    Attributes:
+        agreement: IoU with the visual hull's outline, by photo.
+        dropped: why a photo was left out, by photo.
+        notes: which clicks were left out and why, and what else the stage noted, a sentence each.
+    """
+
+    def __init__(self, results: Path) -> None:
+        """Read the report of the masks, which need not be there; a note says where it cannot be read."""
+        self._results = results
+        self.agreement: dict[str, float] = {}
+        self.dropped: dict[str, str] = {}
+        self.notes: list[str] = []
+        self._cameras: tuple[dict, dict] | None = None
+        report = results / "masks.json"
+        if not report.is_file():
+            return
+        try:
+            content = read_json(report)
+            said = (content[key]["value"] for key in ("clicks_left_out", "notes") if key in content)
+            self.notes = list(chain.from_iterable(said))
+            self.dropped = content["dropped"]
+            self.agreement = {name: entry["agreement"] for name, entry in content["per_photo"].items()}
+        except (StageError, KeyError) as error:
+            self.notes = [f"the workflow's masks cannot be read: {error}"]
+
+    def mask(self, picture: Picture) -> Mask | None:
+        """(H, W) mask of a photo at overlay size, bent as its lens bends; None where there is none.
+
+        Raises:
+            StageError: a file of the results cannot be read.
+        """
+        path = self._results / "masks" / f"{Path(picture.name).stem}.png"
+        if not path.is_file():
+            return None
+        if self._cameras is None:
+            self._cameras = read_cameras(self._results / "sparse"), read_cameras(self._results / "undistorted/sparse")
+        bent, straight = (cameras.get(picture.name) for cameras in self._cameras)
+        if bent is None or straight is None:
+            return None
+        scale = min(1.0, MASK_PX / max(bent.width, bent.height))
+        width, height = round(bent.width * scale), round(bent.height * scale)
+        grid = (np.mgrid[0:height, 0:width][::-1].reshape(2, -1).T + 0.5) * [bent.width / width, bent.height / height]
+        rays = np.asarray(bent.cam_from_img(grid))
+        k = straight.calibration_matrix()
+        maps = (rays * [k[0, 0], k[1, 1]] + k[:2, 2] - 0.5).astype(np.float32).reshape(height, width, 2)
+        mask = read_mask(path).astype(np.uint8) * 255
+        return np.asarray(cv2.remap(mask, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR)) > 127
+
+
+def next_command(configfiles: tuple[Path, ...], target: Path) -> str:
+    """The command line that makes a file of the results, as a person types it in the working directory."""
+    # `scenefuse run` reads the project's own settings by itself.
+    given = ["--configfile", *map(str, configfiles)] if configfiles not in ((), (OWN_SETTINGS,)) else []
+    return shlex.join(["scenefuse", "run", *given, "--cores", "2", str(target)])

@@ -1,6 +1,6 @@
-"""The tables of clicks of an object, and the photos to click in, by the settings and results of the workflow."""
+"""The tables of clicks of an object, the photos to click in, and what a person does to the table that is open."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
@@ -11,7 +11,18 @@ from scenefuse.marks.clicks import Kind
 from scenefuse.photos.photo_files import frame_name, thin_out, upright_size
 from scenefuse.photos.photos import photo_names, without_copies
 from scenefuse.pick.document import Document
-from scenefuse.pick.edits import Sizes, problems
+from scenefuse.pick.edits import (
+    Corners,
+    Rows,
+    Sizes,
+    point_name,
+    problems,
+    with_box,
+    with_label,
+    with_length,
+    with_point,
+    without_nearest,
+)
 from scenefuse.pick.expected_place import Cameras
 from scenefuse.pick.photo_tiles import Picture
 
@@ -72,7 +83,7 @@ class Table:
         self.listed = bool(row.get(column))
         path = Path(row[column] if self.listed else Path(project.settings[of]).parent / f"{name}_{column}.tsv")
         self.document = Document(path, "lengths" if column == "lengths" else "labels", pictures)
-        self.notes = list(self.document.notes)
+        self.notes: list[str] = []
         self.models = models
         self.read_cameras()
 
@@ -184,3 +195,97 @@ def _pictures(files: Iterable[tuple[str, Path]]) -> dict[str, Picture]:
 
     with ThreadPoolExecutor() as pool:
         return {found.name: found for found in pool.map(picture, files)}
+
+
+class Editor:
+    """A table, the photo that is clicked in, and the tool that is chosen.
+
+    An action that cannot be done raises StageError, with a sentence for the person.
+
+    Attributes:
+        table: that is clicked.
+        picture: the photo that is clicked in.
+        tool: inside, outside or box, for labels.
+        point: label of the point or end that a click marks; "" for none.
+        points: labels of the points or ends that a person has named, clicked or not.
+    """
+
+    def __init__(self, table: Table, picture: Picture) -> None:
+        self.table, self.picture = table, picture
+        self.tool = "inside"
+        self._named: tuple[str, ...] = ()
+        self.point = self.points[0] if self.points else ""
+
+    @property
+    def points(self) -> list[str]:
+        """Labels of all points or ends, in the order in which they came."""
+        if self.table.document.kind == "labels":
+            return []
+        return list(dict.fromkeys([*(row.label for row in self.table.document.rows), *self._named]))
+
+    @property
+    def here(self) -> Rows:
+        """The clicks in the photo."""
+        return tuple(row for row in self.table.document.rows if row.photo == self.picture.name)
+
+    def click(self, x: float, y: float) -> None:
+        """Click into the photo by the tool that is chosen."""
+        document, where = self.table.document, (self.picture.name, x, y, self.table.sizes)
+        if document.kind == "labels":
+            document.change(with_label(document.rows, "outside" if self.tool == "outside" else "inside", *where))
+        elif not self.point:
+            what = "Write a length" if document.kind == "lengths" else "Name a point"
+            raise StageError(f"{what} first, at the right; then click it.")
+        else:
+            document.change(with_point(document.rows, self.point, *where))
+            if document.kind == "lengths":
+                self._choose_other_end()
+
+    def remove(self, x: float, y: float, within_px: float) -> None:
+        """Remove the click that is nearest to a pixel."""
+        self._change(lambda rows: without_nearest(rows, self.picture.name, x, y, within_px))
+
+    def draw_box(self, corners: Corners) -> None:
+        """Draw a box around the object."""
+        self.tool = "inside"
+        self._change(lambda rows: with_box(rows, self.picture.name, corners, self.table.sizes))
+
+    def remove_lost(self) -> None:
+        """Remove clicks in photos that are no longer there."""
+        self._change(lambda rows: tuple(row for row in rows if row.photo in self.table.pictures))
+
+    def undo(self, forward: bool = False) -> None:
+        """One change back, or forward again."""
+        if not self.table.document.undo(forward):
+            raise StageError("Nothing to redo." if forward else "Nothing to undo.")
+
+    def choose_tool(self, tool: str) -> None:
+        """Take another tool."""
+        self.tool = tool
+
+    def choose_kind(self, kind: Kind) -> None:
+        """Mark by labels or by named points."""
+        self.table.document.choose_kind(kind)
+
+    def name_point(self, text: str) -> None:
+        """Take a point, which may be new, or a length with its metres, as a person writes them."""
+        document = self.table.document
+        if document.kind == "lengths":
+            rows, self._named = with_length(document.rows, text)
+            document.change(rows)
+        else:
+            self._named = (point_name(text),)
+        self.point = self._named[0]
+
+    def choose_point(self, label: str) -> None:
+        """Take a point or an end that is listed."""
+        self.point = label
+
+    def _choose_other_end(self) -> None:
+        """After one end of a length comes the other, where the photo does not have it yet; then the first again."""
+        here = {row.label for row in self.here}
+        ends = [label for label in self.points if label.split("\t")[0] == self.point.split("\t")[0]]
+        self.point = next((end for end in ends if end not in here), ends[0])
+
+    def _change(self, edit: Callable[[Rows], Rows]) -> None:
+        self.table.document.change(edit(self.table.document.rows))

@@ -86,7 +86,6 @@ def test_a_correction_that_the_page_saves_reruns_the_masks_and_what_they_mark(pl
         (path / "prompts.tsv").write_text("label\tphoto\tx_px\ty_px\ninside\t0.jpg\t30\t20\n")
         document = Document(path / "prompts.tsv", "labels")
         document.change((*document.rows, Click("outside", "1.jpg", 3, 4)))
-        document.save()
 
     assert plan(correct) == {"make_masks", "crop_scene"}
 

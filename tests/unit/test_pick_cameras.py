@@ -11,7 +11,7 @@ from scenefuse.marks.clicks import Click
 from scenefuse.photos.workspace import View, write_model
 from scenefuse.pick.expected_place import Cameras
 from scenefuse.pick.photo_tiles import MASK_PX, Picture
-from scenefuse.pick.workflow import WorkflowMasks
+from scenefuse.pick.session import WorkflowMasks
 
 ROOF = np.array([0.3, -0.2, 0.1])
 SIZES = {f"{k}.jpg": (1280, 960) for k in (1, 2, 3)}  # twice the model's photos
@@ -101,7 +101,7 @@ def results(model, tmp_path):
 
 
 def test_a_mask_is_bent_as_the_lens_bends(model, results):
-    mask = WorkflowMasks(results, results / "accepted.json").mask(Picture("2.jpg", None, 1280, 960))
+    mask = WorkflowMasks(results).mask(Picture("2.jpg", None, 1280, 960))
     camera = model.cameras[1]
     corners = camera.img_from_cam(np.column_stack([(np.array([[520, 340], [600, 440]]) - [320, 240]) / 500, [1, 1]]))
     rows, columns = np.nonzero(mask)
@@ -112,18 +112,13 @@ def test_a_mask_is_bent_as_the_lens_bends(model, results):
 
 
 def test_photos_without_a_mask_have_no_overlay(results):
-    assert WorkflowMasks(results, results / "accepted.json").mask(Picture("1.jpg", None, 1280, 960)) is None
-    assert WorkflowMasks(results / "nowhere", results / "accepted.json").agreement == {}
+    assert WorkflowMasks(results).mask(Picture("1.jpg", None, 1280, 960)) is None
+    assert WorkflowMasks(results / "nowhere").agreement == {}
 
 
-def test_an_accepted_mask_is_so_until_it_changes(results):
-    masks = WorkflowMasks(results, results / "pick/accepted.json")
+def test_masks_that_were_left_out_and_how_the_others_agree_are_known(results):
+    masks = WorkflowMasks(results)
     assert masks.dropped == {"1.jpg": "disagrees"} and masks.agreement == {"2.jpg": 0.9}
-    masks.accept("2.jpg")
-    again = WorkflowMasks(results, results / "pick/accepted.json")
-    assert again.is_accepted("2.jpg") and not again.is_accepted("1.jpg")
-    cv2.imwrite(str(results / "masks/2.png"), np.zeros((480, 640), dtype=np.uint8))
-    assert not WorkflowMasks(results, results / "pick/accepted.json").is_accepted("2.jpg")
 
 
 def test_a_click_beyond_what_the_lens_s_model_reaches_says_nothing(model, tmp_path):

@@ -7,8 +7,8 @@ import pytest
 from scenefuse.core.stage import StageError
 from scenefuse.marks.clicks import Click
 from scenefuse.pick.document import Document
-from scenefuse.pick.editor import Editor
 from scenefuse.pick.photo_tiles import Picture
+from scenefuse.pick.tables import Editor
 
 PICTURES = {name: Picture(name, None, 100, 50) for name in ("a.jpg", "b.jpg")}
 

@@ -12,8 +12,7 @@ from scenefuse.geometry.visual_hull import mask_iou
 from scenefuse.marks.clicks import Click, label_name
 from scenefuse.pick.photo_tiles import Picture
 from scenefuse.pick.segmenter import Segmenter
-from scenefuse.pick.session import Session
-from scenefuse.pick.workflow import as_text, command
+from scenefuse.pick.session import Session, next_command
 
 GRABCUT = {"method": "grabcut", "max_click_residual_px": 4}
 
@@ -50,13 +49,11 @@ def test_masks_of_one_s_own_are_said_to_count_in_the_place_of_clicks(yard):
     assert any("the column masks is filled (my masks)" in note for note in opened(yard).tables[0].notes)
 
 
-def test_a_photo_without_a_mask_cannot_be_accepted_and_clicks_left_out_are_said(yard):
+def test_clicks_that_the_workflow_left_out_are_said(yard):
     report = {"dropped": {"0.jpg": "too small"}, "per_photo": {"0.jpg": {"area": 0.0, "agreement": 0.1}}}
     report |= {"clicks_left_out": {"value": ["the click inside is off"]}, "notes": {"value": []}}
     write_json(yard.path / "results/objects/shed/masks.json", report)
-    masks = opened(yard).masks
-    masks.accept("0.jpg")
-    assert not masks.is_accepted("0.jpg") and masks.notes == ["the click inside is off"]
+    assert opened(yard).masks.notes == ["the click inside is off"]
 
 
 def test_photos_say_what_the_workflow_makes_of_them(yard):
@@ -66,12 +63,9 @@ def test_photos_say_what_the_workflow_makes_of_them(yard):
     write_json(yard.path / "results/objects/shed/masks.json", report)
     session = opened(yard)
     assert [session.standing(0, f"{k}.jpg") for k in range(3)] == [("left out", True), ("0.93", False), ("", False)]
-    (yard.path / "results/objects/shed/masks").mkdir()
-    cv2.imwrite(str(yard.path / "results/objects/shed/masks/1.png"), np.zeros((48, 64), np.uint8))
-    session.masks.accept("1.jpg")
-    assert session.standing(0, "1.jpg") == ("0.93 ✓", False) and session.standing(1, "1.jpg") == ("", False)
+    assert session.standing(1, "1.jpg") == ("", False)
     session.tables[0].cameras = {"1.jpg"}
-    assert [session.standing(0, f"{k}.jpg")[0] for k in range(3)] == ["no camera", "0.93 ✓", "no camera"]
+    assert [session.standing(0, f"{k}.jpg")[0] for k in range(3)] == ["no camera", "0.93", "no camera"]
 
 
 def test_a_photo_that_cannot_be_read_does_not_keep_the_others_waiting(yard):
@@ -152,13 +146,6 @@ def test_an_object_without_photos_has_nothing_to_click_in(yard):
         opened(yard)
 
 
-def test_what_was_not_saved_is_kept_when_the_page_ends(yard):
-    session = opened(yard)
-    session.tables[0].document.change((Click("inside", "0.jpg", 1, 2),))
-    assert any("prompts.unsaved.tsv" in sentence for sentence in session.close())
-    assert opened(yard).tables[0].document.unsaved
-
-
 def test_results_are_noticed_when_they_come(yard):
     session = opened(yard)
     assert not session.masks.agreement
@@ -219,13 +206,9 @@ def test_weights_that_cannot_be_fetched_leave_nothing_behind_and_the_page_says_s
     assert not list((tmp_path / "results/weights").iterdir())
 
 
-def test_the_next_command_is_the_one_to_type(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    words = command((tmp_path / "my settings.yaml", Path("few.yaml")), "results/objects/shed/masks.png")
-    assert as_text(words).endswith("my settings.yaml' few.yaml --cores 2 results/objects/shed/masks.png")
-    monkeypatch.setattr("sys.argv", ["scenefuse pick"])
-    own = command((Path("config/config.yaml"),), "masks.png"), command((Path("few.yaml"),), "masks.png")
-    assert as_text(own[0]) == "scenefuse run --cores 2 masks.png"
-    assert as_text(own[1]) == "scenefuse run --configfile few.yaml --cores 2 masks.png"
-    (tmp_path / "Snakefile").touch()
-    assert "--snakefile" not in command((), "all")
+def test_the_next_command_is_the_one_to_type():
+    target = Path("results/objects/shed/masks.png")
+    for own in ((), (Path("config/config.yaml"),)):
+        assert next_command(own, target) == "scenefuse run --cores 2 results/objects/shed/masks.png"
+    given = next_command((Path("/a/my settings.yaml"), Path("few.yaml")), target)
+    assert given.startswith("scenefuse run --configfile '/a/my settings.yaml' few.yaml --cores 2 results/")
