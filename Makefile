@@ -7,7 +7,6 @@ export PATH := $(CURDIR)/.venv/bin:$(PATH)
 
 demo: .venv/ready
 	snakemake --configfile config/demo.yaml --cores $(CORES)
-	@cat results/summary/summary.txt
 
 # Unit tests that start no process; those of one package and what imports it: make check PART=masks.
 check: .venv/tests

@@ -25,7 +25,7 @@ README = """\
    and dense cloud of a finished project of another program.
 2. `config/objects.tsv` needs a row for each object: its scene and its close-up photos (a folder, a video), or a cloud.
    Without a scene, an object's photos become a cloud by themselves.
-   In both tables, cells are separated by tabs, and lines that begin with # say what belongs in the columns.
+   In both tables, cells are separated by tabs; their columns are explained below.
 3. Say what the object is:
    - for photos: `scenefuse pick --configfile config/config.yaml --object NAME` opens a page to click on it;
    - where the scene or the object is a cloud, and the scene shows much more than the object: name a text file in the
@@ -72,7 +72,7 @@ def init(
         "config/scenes.tsv": _table("scenes", SCENES, scenes),
         "config/objects.tsv": _table("objects", OBJECTS, rows),
         "config/config.yaml": SETTINGS.format(root=ROOT) + (ROOT / f"config/presets/{preset}.yaml").read_text(),
-        "README.md": README.format(name=folder.resolve().name),
+        "README.md": README.format(name=folder.resolve().name) + _columns("scenes") + _columns("objects"),
     }
     for path in (folder / name for name in texts):
         if path.exists() or (folder.exists() and not folder.is_dir()):
@@ -117,7 +117,12 @@ def _source(path: Path, folder: Path, *, video: bool) -> dict[str, str]:
 
 
 def _table(kind: str, columns: tuple[str, ...], rows: list[dict[str, str]]) -> str:
-    """A table with these columns and rows, below comments on all columns that it may have."""
-    about = [f"# {name}: {column['description']}" for name, column in schema_of(kind)["properties"].items()]
+    """A table with these columns and rows."""
     lines = ["\t".join(columns), *("\t".join(row.get(name, "") for name in columns) for row in rows)]
-    return "\n".join([*about, *lines]) + "\n"
+    return "\n".join(lines) + "\n"
+
+
+def _columns(kind: str) -> str:
+    """What belongs in the columns that a table may have, for the project's README."""
+    about = [f"- `{name}`: {column['description']}" for name, column in schema_of(kind)["properties"].items()]
+    return "\n".join([f"\n## Columns of {kind}.tsv\n", *about]) + "\n"

@@ -3,12 +3,13 @@
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from scenefuse.cloud.clouds import read_cloud
 from scenefuse.cloud.tiled_cloud import open_cloud
 from scenefuse.core.stage import quantity, read_json, value, write_json
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Array, Sim3, rotation_between
 from scenefuse.fuse.write import Source
 from scenefuse.metrics.completion import MetricSettings, completion_metrics, completion_of, variation_radius
 from scenefuse.register.agreement import registration_metrics
@@ -33,21 +34,29 @@ def compute_metrics(
         crop_json: JSON of the full variant's crop stage: its diagonal sets all thresholds, and the unit of lengths.
         fine_json: JSON of the fine registration of this variant.
         fused: the object's fused surroundings (PLY, with `source`); without it completion is left out.
-        report: output JSON with `registration` and `completion`.
+        report: output JSON with `registration`, `object` (its size in the scene: length, width and height; median
+            standard deviations of the added points) and `completion`.
         seed: of samples and of the random clouds that give the null values.
         settings: see MetricSettings.
     """
     obj, scene = read_cloud(object), read_cloud(crop)
     registration = read_json(fine_json)
     pose = Sim3.from_matrix(np.array(value(registration, "scene_from_object")))
-    extent = read_json(crop_json)["diagonal"]
-    diagonal, unit = float(extent["value"]), str(extent["unit"])
+    crop_about = read_json(crop_json)
+    diagonal, unit = float(value(crop_about, "diagonal")), str(crop_about["diagonal"]["unit"])
     tau = settings.agreement.tau_fraction * diagonal
     found = registration_metrics(obj, scene, pose, tau, diagonal, unit)
     found["status"] = quantity(value(registration, "status"), "")
-    content: dict[str, Any] = {"registration": found}
+    size = box_size(pose.apply(obj.points), np.array(crop_about.get("up_in_scene", {}).get("value", [0.0, 0.0, 1.0])))
+    content: dict[str, Any] = {"registration": found, "object": {"size": quantity(size, unit)}}
     if fused is not None:
-        part = completion_of(scene.points, read_cloud(fused), Source.OBJECT, diagonal)
+        after = read_cloud(fused)
+        added = after.fields["source"] == Source.OBJECT
+        for name in ("deviation", "world_deviation"):
+            known = after.fields[name][added] if name in after.fields else np.empty(0)
+            if np.isfinite(known).any():
+                content["object"][name] = quantity(float(np.nanmedian(known)), unit)
+        part = completion_of(scene.points, after, Source.OBJECT, diagonal)
         radius = {"surface_variation_radius": quantity(variation_radius(part, settings), unit)}
         content["completion"] = completion_metrics([part], settings, seed) | radius
     _write(report, content)
@@ -80,6 +89,20 @@ def compute_scene_metrics(
         parts.append(completion_of(before, around, numbers[folder.name], diagonal))
     found = completion_metrics(parts, settings, seed) | {"objects": quantity(len(parts), "objects")}
     _write(report, {"completion": found})
+
+
+def box_size(points: Array, up: Array) -> list[float]:
+    """Length, width and height of points (N, 3): of the smallest box that stands upright around nearly all of them.
+
+    Args:
+        points: in the scene's frame.
+        up: (3,) direction opposite to gravity.
+    """
+    level = points @ rotation_between(up, np.array([0.0, 0.0, 1.0])).T
+    low, high = np.percentile(level, [0.5, 99.5], axis=0)
+    inside = level[((level >= low) & (level <= high)).all(1)]
+    ground_plan = cv2.minAreaRect((inside[:, :2] - low[:2]).astype(np.float32))[1]
+    return [*sorted(map(float, ground_plan), reverse=True), float(high[2] - low[2])]
 
 
 def _write(report: Path, content: dict[str, dict[str, Any]]) -> None:

@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pandas as pd
 
-# Parts that the summary names.
-MAX_PARTS = 4
 TEMPORARY = ".tmp-"
 
 
@@ -20,14 +18,6 @@ def disk_table(folders: Iterable[Path]) -> pd.DataFrame:
         for part, size in sorted(parts_of(folder).items(), key=lambda item: (-item[1], item[0]))
     ]
     return pd.DataFrame(rows, columns=["name", "part", "megabytes"])
-
-
-def disk_line(table: pd.DataFrame, name: str) -> str:
-    """All of `scenes/{scene}` or `objects/{object}`, and its largest parts; "" where all are below a megabyte."""
-    own = table[table["name"] == name]
-    large = own[own["megabytes"] >= 1].head(MAX_PARTS)
-    parts = [f"{part} {size_text(1e6 * megabytes)}" for part, megabytes in zip(large["part"], large["megabytes"])]
-    return ": ".join([size_text(1e6 * own["megabytes"].sum()), ", ".join(parts)]) if parts else ""
 
 
 def parts_of(folder: Path) -> dict[str, int]:

@@ -1,48 +1,110 @@
-"""The figures of an object and of a scene: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
+"""The figures of an object: what was missing, what was added, how it fits (paper Figures 2, 3, 5)."""
 
+import csv
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.clouds import Cloud, concatenate, read_cloud, spacing
+from scenefuse.cloud.clouds import Cloud, read_cloud, spacing
 from scenefuse.cloud.tiled_cloud import open_cloud
-from scenefuse.core.stage import atomic_directory, read_json
-from scenefuse.core.transforms import Array, box_corners
-from scenefuse.fuse.measure import Evidence
+from scenefuse.core.stage import StageError, atomic_directory, read_json, value
+from scenefuse.core.transforms import Array, Sim3, box_around, rotation_between
+from scenefuse.fuse.fuse_object import is_placed
 from scenefuse.fuse.missing import Lack
+from scenefuse.fuse.write import after_fusion
 from scenefuse.photos.sheets import Image, Sheet, add_axes, draw_sheet, new_figure, save_png, to_image
-from scenefuse.photos.workspace import read_views
 from scenefuse.report.object_sheet import SIDES_DEG, cloud_sheet, inner, object_sheet, sides, upright
-from scenefuse.report.render import MAX_DRAWN, luminance, orbit_camera, point_radii, render
-from scenefuse.report.surroundings import FigureInputs, Surroundings, read_surroundings
-from scenefuse.report.view import REMOVED, View, merge, thin, within, write_view
+from scenefuse.report.render import luminance, orbit_camera, point_radii, render
+from scenefuse.report.values import load, unit_of
+from scenefuse.report.view import REMOVED, VIEW_POINTS, View, merge, thin, within, write_view
 
 COLORS = {
     "scene": (205, 208, 212),
-    "added": (240, 120, 25),
-    "unconfirmed": (150, 60, 170),
     "crop": (40, 95, 185),
     "object": (245, 170, 85),
     Lack.NEVER_SEEN: (214, 38, 31),
     Lack.UNTEXTURED: (52, 101, 196),
     Lack.CONTRADICTED: (150, 60, 170),
 }
-# Points of an object's 3D view: with three objects and a scene, the page stays well below 15 MB.
-VIEW_POINTS = 150_000
+# How far around the object, as shares of its diagonal: sideways enough to see what it stands on.
+REACH = (0.35, 0.35, 0.15)
 # Clouds and the radii of their points' discs.
 Discs = list[tuple[Cloud, NDArray[np.float32]]]
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The clouds of one object in the scene's frame, turned so that z points up.
+
+    Attributes:
+        before: the scene around the object.
+        after: the same part of the scene after fusion.
+        crop: the object's part of the scene, as registration saw it.
+        object_cloud: the object at its estimated pose, or None when there is no pose.
+        framed: (N, 3) points every picture has to show.
+        fused: whether the object was fused.
+        decision: status and reason.
+        unit: of the scene's lengths.
+        missing: cells of the object's surface that the completed scene lacks; None where they were not looked for.
+        stations: (S, 3) places to photograph these from, best first.
+    """
+
+    before: Cloud
+    after: Cloud
+    crop: Cloud
+    object_cloud: Cloud | None
+    framed: Array
+    fused: bool
+    decision: str
+    unit: str
+    missing: Cloud | None
+    stations: Array
+
+
+@dataclass(frozen=True)
+class FigureInputs:
+    """What the figures of one object show."""
+
+    name: str
+    """The object's name, for titles."""
+    scene: Path
+    """The scene's dense cloud, scene frame."""
+    fused: Path
+    """The object's surroundings after fusion, with the field `source` (0 scene, 1 object)."""
+    checked: Path
+    """What fusion changed in the scene."""
+    crop: Path
+    """The object's part of the scene, scene frame."""
+    crop_json: Path
+    """JSON of the crop; `up_in_scene` is the direction opposite to gravity, z when absent."""
+    object_cloud: Path
+    """The object's cloud in its own frame."""
+    fine_json: Path
+    """JSON of the fine registration: status, reason, scene_from_object."""
+    missing: Path
+    """Cells of the object's surface that are still missing (PLY, scene frame)."""
+    missing_json: Path
+    """JSON of the same."""
+    next_photos: Path
+    """CSV of the stations from where photos would show them."""
+    workspace: Path | None = None
+    """The object's undistorted COLMAP workspace (images/, sparse/); None where it has no photos."""
+    masks: Path | None = None
+    """Folder of the object's masks, {photo}.png, where it has some."""
+    stages: tuple[Path, ...] = ()
+    """Folders of stages 1 to 4, each with depth_maps/; the last with renders/ too; none where its cloud was given."""
 
 
 def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     """Draw the figures of one object (paper Figures 2, 3 and 5).
 
     Writes before_after.png (the surroundings before and after fusion from four sides and from below), before.png and
-    after.png (one large view of each, the side that changed most), provenance.png (scene grey, added points coloured),
-    missing.png (what is still missing, and from where photos would show it), registration.png (object over crop, with
-    the decision) and object.png (frames, masks, depth of the four stages, renders, the object's cloud, alone where it
-    was given); of a fused object view.ply and view.json too, for the 3D view of the report page.
+    after.png (one large view of each, the side that changed most), missing.png (what is still missing, and from where
+    photos would show it), registration.png (object over crop, with the decision) and object.png (frames, masks, depth
+    of the four stages, renders, the object's cloud, alone where it was given); of a fused object view.ply and view.json
+    too, for the 3D view of the report page.
 
     Args:
         inputs: see FigureInputs.
@@ -58,7 +120,6 @@ def draw_object(*, inputs: FigureInputs, figures: Path) -> None:
     azimuth_deg = _most_changed(clouds, join.framed)
     pictures = {
         "before_after": _before_after(inputs.name, join, clouds),
-        "provenance": _provenance(inputs.name, join, clouds[1][1]),
         "registration": _registration(inputs.name, join),
         **dict(zip(("before", "after"), _large(clouds, join.framed, azimuth_deg))),
     }
@@ -112,73 +173,6 @@ def draw_lone_object(
         write_view(folder, view)
 
 
-def draw_scene(
-    *,
-    name: str,
-    dense: Path,
-    georeferenced: Path | None = None,
-    objects: list[Path],
-    failed: tuple[str, ...] = (),
-    figure: Path,
-) -> None:
-    """Draw a scene from above and obliquely with its camera positions and the boxes of its objects.
-
-    Args:
-        name: the scene's name, for the title.
-        dense: the scene's dense cloud.
-        georeferenced: COLMAP model in the same frame; None where the scene was given as a cloud.
-        objects: result folders of the scene's objects; the bounding box of registration/full/crop.ply is drawn.
-        failed: names of the objects that failed; they get no box.
-        figure: output PNG, below 1 MB.
-
-    Raises:
-        StageError: an input is missing.
-    """
-    scene = open_cloud(dense)
-    every = max(1, -(-len(scene) // MAX_DRAWN))
-    cloud = concatenate([part for _, part in scene.parts(every)])
-    views = [] if georeferenced is None else read_views(georeferenced)
-    centres = np.array([view.centre for view in views]).reshape(-1, 3)
-    shown = [folder for folder in objects if folder.name not in failed]
-    crops = {f.name: read_cloud(f / "registration/full/crop.ply").points for f in shown}
-    boxes = {name: box_corners(crop.min(0), crop.max(0)) for name, crop in crops.items()}
-    cameras = "given as a cloud, no cameras" if georeferenced is None else f"cameras (red): {len(centres)}"
-    drawn = "" if every == 1 else f" (one in {every} is drawn)"
-    note = f"{len(scene):,} points{drawn}, {cameras}, objects (boxes): {len(boxes)}"
-    save_png(figure, _scene_sheet(name, note, cloud, centres, boxes))
-
-
-def _scene_sheet(name: str, note: str, cloud: Cloud, centres: Array, boxes: dict[str, Array]) -> Image:
-    """The scene from above and obliquely; cameras at `centres` (N, 3), boxes of 8 corners."""
-    radii = point_radii(cloud.points)
-    ground = box_corners(*np.percentile(cloud.points, [1, 99], axis=0))
-    views = {
-        "from above": orbit_camera(ground, -90.0, 90.0, (640, 520), orthographic=True),
-        "oblique": orbit_camera(np.concatenate([ground, centres]), -60.0, 30.0, (760, 520)),
-    }
-    size = (640 + 760 + 24, 520 + 66)
-    sheet = new_figure(size)
-    sheet.text(8 / size[0], 1 - 10 / size[1], f"Scene {name}", fontsize=12, fontweight="bold", va="top")
-    sheet.text(8 / size[0], 1 - 32 / size[1], note, fontsize=9.5, color="#444444", va="top")
-    left = 8
-    for title, camera in views.items():
-        axes = add_axes(sheet, (left, 60, camera.width_px, camera.height_px), size)
-        axes.imshow(render(cloud, camera, radii))
-        axes.set(xlim=(0, camera.width_px), ylim=(camera.height_px, 0))
-        axes.text(8, 20, title, fontsize=10, bbox={"facecolor": "white", "alpha": 0.8, "edgecolor": "none"})
-        x, y = camera.project(centres)[0].T
-        axes.scatter(x, y, s=14, c="#d6261f", edgecolors="white", linewidths=0.5, zorder=3)
-        for label, corners in boxes.items():
-            _draw_box(axes, camera.project(corners)[0], label)
-        left += camera.width_px + 8
-    return to_image(sheet)
-
-
-def _added(cloud: Cloud) -> NDArray[np.bool_]:
-    """(N,) True for the points that came from the object."""
-    return cloud.fields["source"] == 1 if "source" in cloud.fields else np.zeros(len(cloud), dtype=bool)
-
-
 def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     """The 3D view of an object: its surroundings before and after, thinned."""
     points, low, high = merge(join.before, join.after), join.framed.min(0), join.framed.max(0)
@@ -187,7 +181,7 @@ def _view(name: str, join: Surroundings, azimuth_deg: float) -> View:
     found = set(thinned.fields["source"].tolist()) - {0, REMOVED}
     sources = {0: "scene"} | {number: f"added from {name}" for number in found}
     counts = len(join.before), len(join.after)
-    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, *counts, join.brighter)
+    return View(thinned, sources, join.unit, low, high, azimuth_deg, 18.0, *counts)
 
 
 def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
@@ -203,23 +197,6 @@ def _before_after(name: str, join: Surroundings, clouds: Discs) -> Image:
     after = "after" if join.fused else "after (not fused)"
     columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG] + ["from below, surroundings cut away"]
     return draw_sheet(Sheet(f"{name}: before and after", join.decision, rows, ["before", after], columns, {}, tile))
-
-
-def _provenance(name: str, join: Surroundings, radii: NDArray[np.float32]) -> Image:
-    """Scene points grey, added points coloured, those of them that no photo confirms in another colour."""
-    tile, added = (430, 350), _added(join.after)
-    kinds = join.after.fields.get("evidence", np.zeros(len(added), np.uint8))
-    unconfirmed = added & (kinds == Evidence.NERF_ONLY)
-    shade = 0.6 + 0.4 * _brightness(join.after)[:, None]
-    colors = np.where(added[:, None], COLORS["added"], COLORS["scene"])
-    colors = (np.where(unconfirmed[:, None], COLORS["unconfirmed"], colors) * shade).astype(np.uint8)
-    images = sides(join.after, join.framed, radii, tile, 22.0, colors)
-    note = (
-        f"grey: {(~added).sum():,} points of the scene; orange: {(added & ~unconfirmed).sum():,} points added from the"
-        f" object; purple: {unconfirmed.sum():,} of its points that no photo confirms"
-    )
-    columns = [f"azimuth {a:.0f}°" for a in SIDES_DEG]
-    return draw_sheet(Sheet(f"{name}: where the points come from", note, [images], [], columns, {}, tile))
 
 
 def _missing(name: str, join: Surroundings, cells: Cloud, radii: NDArray[np.float32]) -> Image:
@@ -260,10 +237,10 @@ def _plan_view(join: Surroundings, cloud: Cloud, radii: Array, colors: Image, ti
     axes.imshow(render(cloud, camera, radii, colors))
     axes.set(xlim=(0, tile[0]), ylim=(tile[1], 0))
     middle = camera.project(join.framed.mean(0, keepdims=True))[0][0]
-    for number, (x, y) in enumerate(camera.project(join.stations)[0], 1):
+    for station, (x, y) in enumerate(camera.project(join.stations)[0], 1):
         axes.annotate("", middle, (x, y), arrowprops={"arrowstyle": "->", "color": "#888888", "shrinkB": 40})
         axes.scatter([x], [y], s=150, c="#d6261f", edgecolors="white", zorder=3)
-        axes.text(x, y, str(number), ha="center", va="center", fontsize=9, color="white", zorder=4)
+        axes.text(x, y, str(station), ha="center", va="center", fontsize=9, color="white", zorder=4)
     return to_image(sheet)
 
 
@@ -310,12 +287,52 @@ def _brightness(cloud: Cloud) -> Array:
     return np.ones(len(cloud)) if cloud.colors is None else luminance(cloud.colors) / 255
 
 
-def _draw_box(axes: Any, corners_px: Array, label: str) -> None:
-    """The twelve edges of a projected box, and its name above it."""
-    for a in range(8):
-        for bit in (1, 2, 4):
-            if not a & bit:
-                axes.plot(*corners_px[[a, a | bit]].T, color="#0b4ea2", linewidth=1.2, zorder=4)
-    x, y = corners_px[:, 0].mean(), corners_px[:, 1].min() - 6
-    box = {"facecolor": "white", "alpha": 0.8, "edgecolor": "none", "pad": 1.5}
-    axes.text(x, y, label, ha="center", va="bottom", fontsize=9.5, color="#0b4ea2", zorder=5, bbox=box)
+def read_surroundings(inputs: FigureInputs) -> Surroundings:
+    """Read the clouds and turn them upright; the surroundings are cut to a box around the object.
+
+    Raises:
+        StageError: a file is missing or damaged, or the scene has no points around the object.
+    """
+    fine = read_json(inputs.fine_json)
+    up = read_json(inputs.crop_json).get("up_in_scene", {}).get("value")
+    level = Sim3(1.0, rotation_between(np.array(up or [0.0, 0.0, 1.0]), np.array([0.0, 0.0, 1.0])), np.zeros(3))
+    crop = read_cloud(inputs.crop).transformed(level)
+    pose = fine.get("scene_from_object", {}).get("value")
+    placed = None
+    if pose is not None:
+        placed = read_cloud(inputs.object_cloud).transformed(level @ Sim3.from_matrix(np.array(pose)))
+    fused = is_placed(fine)
+    shown = placed if fused and placed is not None else crop
+    low, high = np.percentile(shown.points, [0.5, 99.5], axis=0)
+    reach = np.array(REACH) * float(np.linalg.norm(high - low))
+    scene, box = open_cloud(inputs.scene), box_around(low - reach, high + reach, level.inverse())
+    clouds = scene.near(*box)[1], after_fusion(scene, inputs.checked, inputs.fused, *box)
+    level_clouds = (cloud.transformed(level) for cloud in clouds)
+    before, after = (cloud[within(cloud.points, low - reach, high + reach, margin=0.0)] for cloud in level_clouds)
+    if not len(before):
+        raise StageError(
+            f"{inputs.scene} has no points around {inputs.name}; look at the crop and at the registration's log"
+        )
+    unit = unit_of(load(inputs.crop_json), "diagonal") or "scene units"
+    missing, reason = _missing_cells(inputs), fine.get("reason", {}).get("value")
+    decision = ": ".join(filter(None, [value(fine, "status"), reason]))
+    return Surroundings(
+        before, after, crop, placed, inner(shown.points), fused, decision, unit,
+        None if missing is None else missing.transformed(level), level.apply(read_stations(inputs.next_photos)),
+    )  # fmt: skip
+
+
+def _missing_cells(inputs: FigureInputs) -> Cloud | None:
+    """The cells; none where nothing is missing; None where the object has no pose or no photos."""
+    content = read_json(inputs.missing_json)
+    if "missing" not in content:
+        return None
+    share = value(content, "missing")
+    return read_cloud(inputs.missing) if share else Cloud(np.zeros((0, 3)))
+
+
+def read_stations(path: Path) -> Array:
+    """(S, 3) places of the stations in a table of photos, scene frame: the middle one of the photos of each."""
+    with open(path, newline="", encoding="utf-8") as file:
+        rows = [row for row in csv.DictReader(file) if row["photo"] == "2"]
+    return np.array([[float(row[axis]) for axis in "xyz"] for row in rows]).reshape(-1, 3)

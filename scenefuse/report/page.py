@@ -117,8 +117,7 @@ def _modes(view: View, deviations: list[float] | None) -> list[Mode]:
     modes: list[Mode] = []
     other = {"color": UNKNOWN_COLOR, "label": "unknown"}
     if view.cloud.colors is not None:
-        brighter = "" if view.brighter == 1 else f", {view.brighter:.1f} x as bright"
-        modes.append({"name": "photo", "button": "Colours", "label": f"The points' own colours{brighter}"})
+        modes.append({"name": "photo", "button": "Colours", "label": "The points' own colours"})
     codes = sorted(set(view.sources) - {REMOVED})
     sources = {code: (SOURCE_COLORS[k % len(SOURCE_COLORS)], view.sources[code]) for k, code in enumerate(codes)}
     sources[REMOVED] = (REMOVED_COLOR, "scene, removed by fusion")

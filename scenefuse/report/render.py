@@ -28,8 +28,6 @@ SUPERSAMPLING = 2
 MIN_COSINE = 0.65
 # Largest disc over those of its neighbours: closes a surface of random points, and keeps a stray point small.
 MAX_RADIUS_RATIO = 1.4
-# Points whose neighbours are found at once: bounds the memory.
-POINTS_AT_ONCE = 1_000_000
 # Power of the blending weight's fall: with more, single points show; with less, fine texture blurs.
 BLENDING_POWER = 3
 
@@ -120,15 +118,10 @@ def point_radii(
     """
     if len(points) <= neighbours:
         return np.full(len(points), max(float(np.ptp(points, axis=0).max()) * 0.01, 1e-9) if len(points) else 0.0, "f4")
-    tree, most = cKDTree(points), min(2 * neighbours, len(points) - 1)
-    reach, around = np.empty(len(points), dtype=np.float32), np.empty(len(points), dtype=np.float32)
-    nearest = np.empty((len(points), most), dtype=np.int32)
-    parts = [slice(start, start + POINTS_AT_ONCE) for start in range(0, len(points), POINTS_AT_ONCE)]
-    for part in parts:
-        distance, index = tree.query(points[part], k=most + 1, workers=threads())
-        reach[part], nearest[part] = distance[:, neighbours], index[:, 1:]
-    for part in parts:
-        around[part] = np.median(reach[nearest[part]], axis=1)
+    most = min(2 * neighbours, len(points) - 1)
+    distance, nearest = cKDTree(points).query(points, k=most + 1, workers=threads())
+    reach = distance[:, neighbours]
+    around = np.median(reach[nearest[:, 1:]], axis=1)
     middle = np.empty(len(points))
     of = np.zeros(len(points), np.uint8) if source is None else source
     for one in np.unique(of):

@@ -5,16 +5,19 @@ A run may be partial: a value that does not exist is empty, an object without re
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
+from scenefuse.fuse.missing import Lack
 from scenefuse.metrics.completion import MEASURES
 from scenefuse.metrics.scores import SCORES, THRESHOLDS
-from scenefuse.report.run_summary import ObjectSummary, RunSummary, SceneSummary, why_missing
-from scenefuse.report.values import Fields, find, number
+from scenefuse.report.diagnosis import diagnose
+from scenefuse.report.facts import ground_pixel, photographed
+from scenefuse.report.run_summary import RunSummary, SceneSummary, why_missing
+from scenefuse.report.values import Fields, find, number, unit_of
 
 # Of the jobs of a rule: by the clock, of the processor, and as they were forecast.
 SECONDS = ("seconds", "processor_seconds", "forecast_seconds")
@@ -45,12 +48,20 @@ SURVEYED = tuple(
 SCENE = {
     "photos": "sparse.total photos.count",
     **CAMERAS,
-    "length_unit": "georeference.length_unit",
-    **{name: f"georeference.{name}" for name in ("gps_residual_median_m", *SURVEYED)},
+    "latitude_deg": "georeference.origin_latitude_deg",
+    "longitude_deg": "georeference.origin_longitude_deg",
+    **{name: f"georeference.{name}" for name in ("crs", "length_unit", "gps_residual_median_m", *SURVEYED)},
+    **{f"gps_rms_{way}_m": f"georeference.gps_residual_{way}_rms_m" for way in ("horizontal", "vertical")},
     **{name: f"dense.{name}" for name in ("points", "spacing", "backend")},
     "completed_points": "completed.points",
 }
 OBJECT = {
+    **{name: f"fine.{name}" for name in ("decided_by", "scale_sd_log")},
+    **{f"surface_{name}": f"missing.{name}" for name in ("missing", *(lack.name.lower() for lack in Lack))},
+    **{name: f"fusion.{name}" for name in ("added_points", "removed_points")},
+    "measured_share": "evidence.object_measured_share",
+    **{name: f"metrics.object.{name}" for name in ("deviation", "world_deviation")},
+    **{name: f"missing.{name}" for name in ("stations", "stations_show")},
     "frames": "sparse.total photos.count",
     **CAMERAS,
     "masks": "masks.masks",
@@ -135,12 +146,19 @@ def runtime_table(benchmarks: Path, forecast: Mapping[str, float]) -> pd.DataFra
     return table
 
 
-def scenes_table(scenes: list[SceneSummary]) -> pd.DataFrame:
-    """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth."""
+def scenes_table(scenes: list[SceneSummary], folders: Sequence[Path]) -> pd.DataFrame:
+    """One row a scene: photos, cameras, georeference, cloud, metrics of the completed scene, errors against truth.
+
+    Args:
+        scenes: what the run has left of them.
+        folders: their results.
+    """
     rows = []
-    for scene in scenes:
+    for scene, folder in zip(scenes, folders):
         fields, added = scene.fields, find(scene.fields, "completed.added_points")
         row: dict[str, Any] = {"scene": scene.name} | _columns(fields, SCENE)
+        if "georeference.length_unit" in fields:
+            row |= {"photographed": photographed(folder), "ground_pixel": ground_pixel(folder / "georeferenced")}
         row["completed_by"] = None if added is None else ", ".join(added) or "none"
         for measure in (name for m in MEASURES for name in (m, *(f"{m}_{beside}" for beside in BESIDE))):
             if f"metrics.completion.{measure}" in fields:
@@ -152,12 +170,21 @@ def scenes_table(scenes: list[SceneSummary]) -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def objects_table(objects: list[ObjectSummary]) -> pd.DataFrame:
-    """One row an object: cameras, masks, the four stages, the cloud against truth."""
+def objects_table(run: RunSummary) -> pd.DataFrame:
+    """One row an object: the result, its size (in `unit`), what is missing, what to do; cameras, stages, truth."""
     rows = []
-    for item in objects:
-        state = {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
-        rows.append({"object": item.name} | _columns(item.stages, OBJECT) | state)
+    for item in run.objects:
+        variant = run.variants[0]
+        fields = item.variants[variant] | item.fusion | item.stages
+        unit, size = unit_of(fields, "metrics.object.size"), find(fields, "metrics.object.size") or [None] * 3
+        rows.append(
+            {"object": item.name, "status": item.status(variant), "reason": item.reason(variant)}
+            | dict(zip(("length", "width", "height"), size))
+            | _columns(fields, OBJECT)
+            | {"unit": unit or unit_of(fields, "crop.diagonal")}
+            | {"missing": item.missing or None, "error": why_missing(item.failed) if item.missing else None}
+            | {"advice": "; ".join(diagnose(item)) or None}
+        )
     return pd.DataFrame(rows)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import pandas as pd
+
 Fields = dict[str, dict[str, Any]]
 
 
@@ -28,6 +30,14 @@ def load(path: Path) -> Fields:
     except (OSError, ValueError):
         return {}
     return flatten(content) if isinstance(content, dict) else {}
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """A table of the summary, NaN where a cell holds nothing; without rows where there is no such table."""
+    try:
+        return pd.read_csv(path, sep="\t", na_values=["-"], keep_default_na=False, dtype={"object": str, "scene": str})
+    except (FileNotFoundError, pd.errors.EmptyDataError):
+        return pd.DataFrame()
 
 
 def find(fields: Fields, *names: str) -> Any:
@@ -63,3 +73,19 @@ def number(item: Any) -> str:
             return "-"
         return f"{item:.4g}" if abs(item) < 1e4 else f"{item:.0f}"
     return "-" if item is None or item == "" else str(item)
+
+
+def percent(share: float) -> str:
+    """A share of 1 in per cent, to two digits; next to all and next to nothing are never rounded to all and nothing."""
+    value = 100 * share
+    rest = min(value, 100 - value)
+    digits = 0 if rest >= 10 or rest <= 0 else 1 if rest >= 0.1 else 2
+    return f"{value:.{digits}f} %"
+
+
+def length(value: float, unit: str) -> str:
+    """A length with its unit: metres in millimetres or centimetres where that is shorter, three digits."""
+    if unit == "m" and abs(value) < 1:
+        value, unit = (1000 * value, "mm") if abs(value) < 0.1 else (100 * value, "cm")
+    digits = f"{value:#.3g}".rstrip(".") if abs(value) < 999.5 else f"{value:,.0f}"
+    return f"{digits} {unit}"

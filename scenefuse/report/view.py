@@ -43,6 +43,8 @@ class Shown(IntEnum):
 
 # `source` of a point that fusion took away; `evidence` of a point that the completed cloud does not hold.
 REMOVED = UNKNOWN = 255
+# Points of one view: with three objects and a scene, the page stays well below 15 MB.
+VIEW_POINTS = 175_000
 # How much farther apart points stand that are not near: a reader looks at the objects.
 SURROUNDINGS_SPACING = 2.0
 # Three axes of a position in one integer: two points in one cell, a twentieth of a millimetre on 100 m, are the same.
@@ -50,10 +52,8 @@ BITS_PER_AXIS = 21
 # Direction to the light that shades what is not in photo colours (high, from the left of the first picture), and the
 # shade of a surface that faces away from it.
 LIGHT, DARKEST_SHADE = np.array([-0.39, -0.55, 0.74]), 0.45
-# Points whose normals are averaged before they are lit: those of stereo are too noisy to be lit one by one.
-SMOOTHED_NORMALS = 12
-# Radius over spacing: less than in the figures, as these discs face the camera from every side.
-DISC_RADIUS = 0.8
+# Points of a local plane: the normals of stereo are too noisy to be lit one by one.
+PLANE_POINTS = 12
 # Steps of radii, shades and deviations: nobody sees more, and five bits compress better than eight.
 LEVELS = 31
 
@@ -69,7 +69,6 @@ class View:
         low, high: (3,) corners of the box that the first picture shows.
         azimuth_deg, elevation_deg: where it is seen from, counter-clockwise from x and above the horizontal.
         before_points, after_points: how many points there were before thinning.
-        brighter: factor by which the colours are brighter than measured.
     """
 
     cloud: Cloud
@@ -81,7 +80,6 @@ class View:
     elevation_deg: float
     before_points: int
     after_points: int
-    brighter: float = 1.0
 
 
 def merge(before: Cloud, after: Cloud) -> Cloud:
@@ -166,7 +164,7 @@ def _with_fields(cloud: Cloud, source: NDArray[np.generic], shown: Shown, after:
 def write_view(folder: Path, view: View) -> None:
     """Write view.ply and view.json into a folder."""
     write_cloud(folder / "view.ply", view.cloud)
-    units = {"low": view.unit, "high": view.unit, "azimuth_deg": "deg", "elevation_deg": "deg", "brighter": "1"}
+    units = {"low": view.unit, "high": view.unit, "azimuth_deg": "deg", "elevation_deg": "deg"}
     units |= dict.fromkeys(("before_points", "after_points"), "points")
     about = {name: item for name, item in vars(view).items() if name not in ("cloud", "unit")}
     about["sources"] = {str(number): name for number, name in view.sources.items()}
@@ -266,7 +264,7 @@ def _radii(cloud: Cloud) -> NDArray[np.float32]:
     for row, absent in zip(radii, (Shown.AFTER, Shown.BEFORE)):
         shown = cloud.fields["shown"] != absent
         part = cloud[shown]
-        row[shown] = point_radii(part.points, factor=DISC_RADIUS, source=part.fields.get("source"))
+        row[shown] = point_radii(part.points, source=part.fields.get("source"))
     return radii
 
 
@@ -278,19 +276,12 @@ def _log_levels(values: NDArray[np.floating], low: float, high: float) -> Bytes:
 
 
 def _shade(cloud: Cloud) -> Array:
-    """(N,) brightness from DARKEST_SHADE to 1: the mean of the light on the normals and of the colours' brightness.
-
-    Where there is neither, that of the light on local planes, from either side.
-    """
-    if len(cloud) < SMOOTHED_NORMALS:
+    """(N,) brightness from DARKEST_SHADE to 1: the mean of the light on local planes, from either side, and of the
+    colours' brightness."""
+    if len(cloud) < PLANE_POINTS:
         return np.ones(len(cloud))
-    parts, nearest = [], cKDTree(cloud.points).query(cloud.points, k=SMOOTHED_NORMALS, workers=threads())[1]
-    if cloud.normals is not None:
-        mean = cloud.normals[nearest].mean(1)
-        mean /= np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-6)
-        parts.append(np.clip(0.4 + 0.7 * (mean @ LIGHT), 0, 1))
+    nearest = cKDTree(cloud.points).query(cloud.points, k=PLANE_POINTS, workers=threads())[1]
+    parts = [np.abs(plane_normals(cloud.points, nearest) @ LIGHT)]
     if cloud.colors is not None:
         parts.append(luminance(cloud.colors) / 255)
-    if not parts:
-        parts = [np.clip(np.abs(plane_normals(cloud.points, nearest) @ LIGHT), 0, 1)]
     return DARKEST_SHADE + (1 - DARKEST_SHADE) * np.mean(parts, axis=0)

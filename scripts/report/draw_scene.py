@@ -1,7 +1,7 @@
 """Draw a scene with its cameras and objects."""
 
 from scenefuse.core.stage import run
-from scenefuse.report.figures import draw_scene
+from scenefuse.report.scene_figures import draw_scene
 
 if __name__ == "__main__":
     run(draw_scene)

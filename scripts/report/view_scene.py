@@ -1,7 +1,7 @@
 """Write the 3D view of a scene."""
 
 from scenefuse.core.stage import run
-from scenefuse.report.view_scene import view_scene
+from scenefuse.report.scene_figures import view_scene
 
 if __name__ == "__main__":
     run(view_scene)

@@ -269,6 +269,7 @@ def test_a_point_is_expected_where_the_other_photos_see_it(page, yard):
 
     page.until("return document.body.innerText.includes('In the scene');")
     page.key("t")
+    page.until_text("64 × 48")  # both tables have a photo 1.jpg
     show("1.jpg")
     page.button("top · 1 photo")
     page.until(count, 1)  # a dashed line along the ray, which runs level

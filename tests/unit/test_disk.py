@@ -2,7 +2,7 @@
 
 import os
 
-from scenefuse.report.disk import disk_line, disk_table, parts_of
+from scenefuse.report.disk import disk_table, parts_of
 
 
 def test_parts_are_counted_once_and_links_are_not(tmp_path):
@@ -21,5 +21,3 @@ def test_parts_are_counted_once_and_links_are_not(tmp_path):
         "part": ["stage2", "fused.ply"],
         "megabytes": [3.0, 1.0],
     }
-    assert disk_line(table, "objects/house") == "4 MB: stage2 3 MB, fused.ply 1 MB"
-    assert disk_line(table, "objects/none") == ""

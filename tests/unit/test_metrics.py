@@ -7,7 +7,7 @@ import pytest
 
 from scenefuse.cloud.clouds import Cloud, write_cloud
 from scenefuse.core.stage import quantity, read_json, write_json
-from scenefuse.core.transforms import Sim3
+from scenefuse.core.transforms import Sim3, rotation_between
 from scenefuse.metrics.completion import (
     Completion,
     MetricSettings,
@@ -17,7 +17,7 @@ from scenefuse.metrics.completion import (
     primitive_fitting_score,
     surface_variation,
 )
-from scenefuse.metrics.compute_metrics import compute_metrics, compute_scene_metrics
+from scenefuse.metrics.compute_metrics import box_size, compute_metrics, compute_scene_metrics
 from scenefuse.register.agreement import MAX_COMPARED_POINTS, registration_metrics, self_consistency
 
 SETTINGS = MetricSettings(
@@ -156,6 +156,7 @@ def test_stage_writes_completion_with_its_nulls(tmp_path):
         settings=SETTINGS,
     )
     content = read_json(tmp_path / "metrics.json")
+    assert content["object"]["size"]["unit"] == "m"
     completion = {name: item["value"] for name, item in content["completion"].items()}
     assert content["registration"]["fitness"]["value"] == 1.0
     assert content["registration"]["tau"]["unit"] == content["completion"]["surface_variation_radius"]["unit"] == "m"
@@ -259,3 +260,13 @@ def test_every_part_of_what_was_added_counts_in_the_surface_variation():
     ]
     first, second = (f["surface_variation"]["value"] for f in found)
     assert first == pytest.approx(second, rel=0.15) and first > 0.005
+
+
+def test_the_size_is_that_of_the_upright_box_however_the_object_stands_in_the_scene():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (20_000, 3)) * [4, 2, 3]
+    points[:5] *= 9  # stray points do not make it larger
+    turned, tipped = np.radians(30), np.array([0.0, 1.0, 0.0])
+    turn = np.array([[np.cos(turned), -np.sin(turned), 0], [np.sin(turned), np.cos(turned), 0], [0, 0, 1]])
+    for frame, up in ((turn, np.array([0.0, 0, 1])), (rotation_between(np.array([0.0, 0, 1]), tipped) @ turn, tipped)):
+        np.testing.assert_allclose(box_size(points @ frame.T + 100.0, up), [4, 2, 3], rtol=0.05)

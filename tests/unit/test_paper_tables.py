@@ -328,7 +328,7 @@ def test_the_page_shows_the_tables_with_definitions_reasons_and_figures(folder):
     compared(folder)
     page = page_of(folder, folder / OWN / "summary/paper.html")
     text = re.sub(r"<[^>]+>", " ", page)
-    assert '<a href="#paper">' in page and all(f"Table {number}: " in text for number in (2, 3, 4))
+    assert "<summary>The paper</summary>" in page and all(f"Table {number}: " in text for number in (2, 3, 4))
     assert "no &lt;volume&gt;" in page and "<volume>" not in page
     assert "fitness  (Fitness): share of the crop&#x27;s points" in text
     assert all(f"Figure {number}" in text for number in (2, 3, 5)) and "before_after.png" in text

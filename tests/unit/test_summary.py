@@ -6,14 +6,16 @@ import shutil
 
 import numpy as np
 import pandas as pd
+import pycolmap
 import pytest
 from PIL import Image
 
 from scenefuse.core.job_records import JobRecords, why_unfinished
 from scenefuse.core.stage import StageError, quantity, write_json
+from scenefuse.report.facts import closing_lines
 from scenefuse.report.run_summary import RunInputs
 from scenefuse.report.tables import runtime_table
-from scenefuse.report.values import find, flatten, load, number
+from scenefuse.report.values import find, flatten, length, load, number, percent
 from scenefuse.report.write_report import write_report
 from scenefuse.report.write_summary import write_summary
 
@@ -137,7 +139,7 @@ def test_scores_against_truth_stand_at_their_thresholds(results):
     summary = summarise(results)
     objects = read(summary, "objects").set_index("object")
     assert objects.loc["house", ["cloud_f_score_025pct", "cloud_f_score_2pct"]].tolist() == [0.71, 0.98]
-    text = " ".join((summary / "summary.txt").read_text().split())
+    text = " ".join((summary / "details.txt").read_text().split())
     assert "truth scene F-score at 1 % 0.4 -> 0.9, scale off 0.5 %" in text
 
 
@@ -176,14 +178,14 @@ def test_runtime_of_no_benchmarks_and_of_damaged_ones(tmp_path):
 
 
 def test_the_text_names_failures_fallbacks_and_truth_within_100_columns(results):
-    text = (summarise(results) / "summary.txt").read_text()
+    text = (summarise(results) / "details.txt").read_text()
     assert max(len(line) for line in text.splitlines()) <= 100
     assert "object house: registered" in text and "object balloon: unregistered" in text
-    assert "because       no <mask> matches a frame [masks/sculpture.log]" in text
+    assert "Result        Not finished: no <mask> matches a frame [masks/sculpture.log]" in text
     assert "dense.fallback: CPU used" in text
     assert "0.4 -> 0.9" in text
     words = " ".join(text.split())
-    assert "points added 30, of the object unconfirmed 7" in words
+    assert "30 added, 16 of the scene replaced" in words and "of the object unconfirmed 7" in words
     away = "photos see a surface behind it: 4 points, the object measured it better: 12 points"
     assert f"taken away {away}" in words
     assert "fusion.notes: judged by the scene's photos" in words and "evidence.notes" not in words
@@ -194,7 +196,7 @@ def test_an_object_in_no_scene_is_done_with_its_cloud(results):
     head = results / "objects/head"
     shutil.copytree(results / "objects/house", head)
     summary = summarise(results, lone=("head", "arm"))
-    text = " ".join((summary / "summary.txt").read_text().split())
+    text = " ".join((summary / "details.txt").read_text().split())
     assert "object head: by itself" in text and "1 of 3 objects registered and fused; in no scene: head, arm" in text
     assert "object arm: missing" in text
     # What an earlier run with a scene left is not its own.
@@ -202,22 +204,22 @@ def test_an_object_in_no_scene_is_done_with_its_cloud(results):
     assert "fusion" not in own and "registration" not in own and "cloud" in own
     assert read(summary, "objects").set_index("object").loc["head", "points"] > 0
     page = report(results, lone=("head",))
-    assert '<span class="badge ok">by itself</span>' in page and "It lies in no scene" in page
+    assert '<span class="badge ok">by itself</span>' in page and "it lies in no scene" in page
 
 
 def test_the_text_says_that_ground_was_left_in(results):
     note = "990 of the 1000 points in the box would be ground: nothing was removed as ground"
     crop = {"diagonal": quantity(15.0, "m"), "notes": quantity([note], "")}
     write_json(results / "objects/house/registration/full/crop.json", crop)
-    text = (summarise(results) / "summary.txt").read_text()
+    text = (summarise(results) / "details.txt").read_text()
     assert f"crop.notes: {note}" in " ".join(text.split())
 
 
 def test_the_text_says_what_psnr_was_measured_on_and_what_the_completed_scene_holds(results):
-    text = " ".join((summarise(results, ["house", "balloon"]) / "summary.txt").read_text().split())
+    text = " ".join((summarise(results, ["house", "balloon"]) / "details.txt").read_text().split())
     assert "PSNR 27.5 dB on training photos" in text and "held-out" not in text
-    assert "completed.ply, completed.copc.laz, points 5030, house adds 30, without balloon" in text
-    assert "completed.ply" not in (summarise(results) / "summary.txt").read_text()
+    assert "Completed with house; 5,030 points" in text and "completed.ply, completed.copc.laz" in text
+    assert "completed.copc" not in (summarise(results) / "details.txt").read_text()
 
 
 @pytest.mark.parametrize("gone", ["features.db", "depth/1.json", "dense.json"])
@@ -226,9 +228,9 @@ def test_what_stands_behind_a_failed_step_of_the_scene_is_not_shown(results, gon
     (results / "logs/scene_sparse").mkdir()
     (results / "logs/scene_sparse/demo.log").write_text("error: only 3 photos\n")
     summary = summarise(results)
-    text = (summary / "summary.txt").read_text()
-    assert "no dense cloud: only 3 photos [scene_sparse/demo.log]" in text and "5000" not in text
-    assert "completed.ply" not in text
+    text = (summary / "details.txt").read_text()
+    assert "No dense cloud: only 3 photos [scene_sparse/demo.log]" in text and "5000" not in text
+    assert "completed.copc" not in text
     table = read(summary, "registration").set_index(["object", "variant"])
     assert table.loc[("house", "full"), "status"] == "failed" and np.isnan(table.loc[("house", "full"), "scale"])
     assert f"missing       {gone} of the scene demo" in text and "0 of 3 objects registered" in text
@@ -242,7 +244,7 @@ def test_of_clouds_given_with_cameras_neither_depth_maps_nor_stages_are_missed(r
     given = {"points": quantity(5000, "1"), "source": quantity("own.laz", ""), "seen_share": quantity(1.0, "1")}
     for path in (results / "scenes/demo/dense.json", results / "objects/house/object.json"):
         write_json(path, given)
-    text = (summarise(results, posed_scenes=("demo",), posed_objects=("house",)) / "summary.txt").read_text()
+    text = (summarise(results, posed_scenes=("demo",), posed_objects=("house",)) / "details.txt").read_text()
     scene, house = (text[text.index(f"{name}\n") :][:400] for name in ("scene demo", "object house: registered"))
     for part in (scene, house):
         assert "given         the cloud own.laz, in the coordinates of the given cameras" in part
@@ -256,7 +258,7 @@ def test_the_text_says_what_the_scene_makes_of_an_object_s_known_lengths(results
         folder = results / f"objects/{name}/registration/full"
         fine = json.loads((folder / "fine.json").read_text())
         write_json(folder / "fine.json", fine | {"scale": quantity(1.02, "scene units per object unit")})
-    text = " ".join((summarise(results) / "summary.txt").read_text().split())
+    text = " ".join((summarise(results) / "details.txt").read_text().split())
     said = "in metres by known lengths; off one scale by bar +0.002 m, edge -0.001 m"
     assert f"{said}; in the scene's metres its size differs by +2 %" in text
     assert text.count(said) == 2 and text.count("its size differs") == 1  # the balloon is not registered
@@ -267,7 +269,7 @@ def test_the_text_says_where_shared_features_put_the_object(results):
     write_json(results / "objects/house/alignment.json", said | {"scale_sd_log": quantity(0.0123, "1")})
     not_found = {"found": quantity(False, ""), "reason": quantity("3 of 12 points agree", "")}
     write_json(results / "objects/balloon/alignment.json", not_found)
-    text = (summarise(results) / "summary.txt").read_text()
+    text = (summarise(results) / "details.txt").read_text()
     assert re.search(r"alignment +scale 2.5 \(standard deviation 1.23 %, bending apart\), 9 of 12", text)
     assert re.search(r"alignment +not found: 3 of 12", text)
     assert "alignment.reason" not in text
@@ -278,7 +280,7 @@ def test_what_stands_behind_a_failed_step_of_an_object_is_not_shown(results):
     summary = summarise(results)
     assert read(summary, "registration").set_index(["object", "variant"]).loc[("house", "full"), "status"] == "missing"
     assert np.isnan(read(summary, "objects").set_index("object").loc["house", "stage4_psnr_db"])
-    assert "0.4 -> 0.9" not in (summary / "summary.txt").read_text().split("object balloon")[0]
+    assert "0.4 -> 0.9" not in (summary / "details.txt").read_text().split("object balloon")[0]
 
 
 def test_a_failed_variant_leaves_the_decision_of_the_full_one(results):
@@ -298,8 +300,8 @@ def test_an_empty_run_is_a_summary_too(tmp_path):
         jobs=JobRecords(tmp_path / "logs", tmp_path / "benchmarks"),
     )
     write_summary(run=run, summary=tmp_path / "summary")
-    text = (tmp_path / "summary/summary.txt").read_text()
-    assert "it has not run yet" in text and "no benchmark files yet" in text
+    text = (tmp_path / "summary/details.txt").read_text()
+    assert "Not run yet" in text and "forecast" not in text
     assert len((tmp_path / "summary/completion.tsv").read_text().splitlines()) == 1
     with pytest.raises(StageError, match="no registration variant"):
         nothing = RunInputs(chunks=1, variants=[], jobs=JobRecords(tmp_path, tmp_path))
@@ -324,8 +326,8 @@ def test_a_killed_job_is_named_with_its_log(results):
     (results / "benchmarks/make_masks").mkdir()
     (results / "benchmarks/make_masks/barn.tsv").write_text(f"{HEADER}1\t0:01:00\t1\t1\t1\t1\t0\t0\t99\t1\n")
     summary = summarise(results, ["barn"])
-    text = " ".join((summary / "summary.txt").read_text().split())
-    assert "object barn: failed" in text and "it has not run yet" not in text
+    text = " ".join((summary / "details.txt").read_text().split())
+    assert "object barn: failed" in text and "Not run yet" not in text
     assert (
         "its job ended without a message: perhaps killed (out of memory?); see the log [train_depth/barn.log]" in text
     )
@@ -337,7 +339,7 @@ def test_a_pose_that_nothing_checked_is_shown_as_such(results):
     for name, variant in (("house", "paper"), ("balloon", "full")):
         write_json(results / f"objects/{name}/registration/{variant}/fine.json", fine)
     summary = summarise(results, ["house", "balloon"])
-    text = (summary / "summary.txt").read_text()
+    text = (summary / "details.txt").read_text()
     assert re.search(r"paper +ungated", text) and "object balloon: ungated" in text
     assert "1 of 2 objects registered and fused, 1 fused without a check of the pose" in text
     table = read(summary, "registration").set_index(["object", "variant"])
@@ -358,9 +360,9 @@ def test_each_failed_variant_has_its_own_reason(results):
 def test_a_completed_scene_without_a_failed_object_is_shown_and_one_from_before_it_failed_is_not(results):
     completed = {"points": quantity(5030, "points"), "added_points": quantity({"house": 30}, "points")}
     write_json(results / "scenes/demo/completed.json", completed | {"failed": quantity({"sculpture": "no mask"}, "")})
-    text = " ".join((summarise(results) / "summary.txt").read_text().split())
-    assert "completed.ply, completed.copc.laz, points 5030, house adds 30, without sculpture, which failed" in text
-    assert "completed.ply" not in (summarise(results, ["house"]) / "summary.txt").read_text()
+    text = " ".join((summarise(results) / "details.txt").read_text().split())
+    assert "Completed with house; 5,030 points" in text
+    assert "completed.copc" not in (summarise(results, ["house"]) / "details.txt").read_text()
 
 
 def test_values():
@@ -385,7 +387,7 @@ def test_a_damaged_json_counts_as_absent(tmp_path):
 def report(results, names=("house", "balloon", "sculpture"), lone=()):
     figures = results / "objects/house/figures"
     figures.mkdir(parents=True)
-    for name in ("before", "after", "provenance"):
+    for name in ("before", "after", "registration"):
         Image.fromarray(np.full((30, 40, 3), 90, dtype=np.uint8)).save(figures / f"{name}.png")
     page = results / "report.html"
     write_report(
@@ -404,17 +406,90 @@ def test_the_page_is_offline_and_escapes_text(results):
     assert "no &lt;mask&gt; matches a frame" in page and "<mask>" not in page
     assert not re.search(r"https?://|<link|src=\"(?!data:)|url\(", page)
     assert page.count("data:image/webp;base64,") == 3
-    assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<h2")[0]
+    assert 'class="slider"' in page and "its stages" not in page.split('id="house"')[1].split("<section")[0]
 
 
 def test_the_page_names_the_completed_scene_once_every_object_has_a_decision(results):
-    Image.fromarray(np.zeros((3, 4, 3), dtype=np.uint8)).save(results / "scenes/demo/scene.png")
     page = report(results, ["house", "balloon"])
-    assert "completed.ply" in page and "registered objects in it (house), 5030 points" in page
+    assert "completed.copc.laz" in page and "Completed with house; 5,030 points" in page
 
 
 def test_the_page_names_objects_without_figures(results):
-    assert "No 3D view and no figures: the object's stages did not finish." in report(results)
+    assert "There are neither figures nor a 3D view" in report(results)
+
+
+def test_a_client_finds_size_accuracy_and_what_is_missing_in_words(results):
+    """In summary.txt, on one screen, and in the object's card of the page; everything scientific is folded away."""
+    metrics = json.loads((results / "objects/house/metrics.json").read_text())
+    size = {"size": quantity([11.42, 9.96, 8.1], "m"), "deviation": quantity(0.0072, "m")}
+    metrics["object"] = size | {"world_deviation": quantity(0.0131, "m")}
+    write_json(results / "objects/house/metrics.json", metrics)
+    shares = {"missing": 0.018, "never_seen": 0.01, "untextured": 0.0, "contradicted": 0.008}
+    found = {name: quantity(share, "1") for name, share in shares.items()}
+    found |= {"stations": quantity(3, ""), "stations_show": quantity(0.77, "1")}
+    write_json(results / "objects/house/missing.json", found)
+    page = report(results)
+    text = (results / "summary/summary.txt").read_text()
+    assert len(text.splitlines()) < 45 and max(map(len, text.splitlines())) <= 100
+    card = page.split('id="house"')[1].split("<section")[0]
+    for sentence in (
+        "11.4 m × 9.96 m, 8.10 m high",
+        "98.2 % is there, 1.8 % is missing: 1.0 % seen by no photo, 0.8 % where photos disagree",
+        "Standard deviation of a point 7.20 mm on the object and 13.1 mm in the scene",
+        "Photograph it from 3 places (house/next_photos.csv): this would show 77 % of what photos can still show",
+    ):
+        assert sentence in " ".join(text.split()) and sentence in card, sentence
+    assert "Not added to the scene: weak. Perhaps it is not in this scene" in text
+    above, record = page.split('id="record"')
+    assert "<table" not in above and "surface_" in record and "<table" in record
+
+
+def test_the_scene_says_where_when_and_how_exactly_it_was_photographed(results):
+    scene = results / "scenes/demo"
+    (scene / "photos").mkdir()
+    exif = Image.Exif()
+    exif[0x0132] = "2024:06:01 09:30:00"
+    Image.new("RGB", (8, 6)).save(scene / "photos/a.jpg", exif=exif)
+    write_json(scene / "photos.json", {"photos": [{"name": "a.jpg"}]})
+    here = {"length_unit": quantity("m", ""), "crs": quantity("EPSG:32632", "")}
+    here |= {"origin_latitude_deg": quantity(47.49996, "deg"), "origin_longitude_deg": quantity(-8.5, "deg")}
+    here |= {"check_points": quantity(4, "1"), "check_rms_horizontal_m": quantity(0.02, "m")}
+    write_json(scene / "georeference.json", here | {"check_rms_vertical_m": quantity(0.04, "m")})
+    lens, pose = np.array([[1000.0, 0, 4], [0, 1000, 3], [0, 0, 1]]), np.eye(4)
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(camera_id=1, model="PINHOLE", width=8, height=6, params=lens[[0, 1, 0, 1], [0, 1, 2, 2]])
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name="a.jpg", camera_id=1, image_id=1)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pose[:3]))
+    model.images[1].points2D = pycolmap.Point2DList([pycolmap.Point2D(np.array([4.0, 3.0]))])
+    model.add_point3D(np.array([0, 0, 40.0]), pycolmap.Track([pycolmap.TrackElement(1, 0)]), np.zeros(3, np.uint8))
+    (scene / "georeferenced").mkdir()
+    model.write(scene / "georeferenced")
+    text = " ".join((summarise(results) / "details.txt").read_text().split())
+    assert "47.49996° N, 8.50000° W" in text and "2024-06-01, 59 of 60 photos used" in text
+    assert "Metres, WGS 84 / UTM zone 32N (EPSG:32632)" in text and "Ground pixel 40.0 mm" in text
+    # Of normal errors, 90 % stay below 1.517 RMS in the plane and 1.645 RMS upwards.
+    assert "Check points 20.0 mm horizontally, 40.0 mm vertically (RMS; CE90 30.3 mm, LE90 65.8 mm)" in text
+
+
+def test_a_run_ends_in_three_lines(results):
+    """The result, the report page, and what to do next: repair what failed, else photograph what is missing."""
+    report(results)
+    result, page, following = closing_lines(summarise(results)).splitlines()
+    assert result == "Result: 1 of 3 objects completed" and page.startswith("Report: ")
+    assert following.startswith("Next:   balloon: Not added to the scene: weak.")
+    write_json(results / "objects/house/missing.json", {"stations": quantity(1, "")})
+    result, page, following = closing_lines(summarise(results, ["house"])).splitlines()
+    assert result.startswith("Result: 1 of 1 objects completed; ") and result.endswith("scenes/demo/completed.ply")
+    assert following == "Next:   house: Photograph it from 1 place (house/next_photos.csv)"
+
+
+def test_shares_and_lengths_are_written_as_people_do():
+    assert [percent(share) for share in (0.0, 0.00021, 0.018, 0.5, 0.982, 0.9996, 1.0)] == [
+        *("0 %", "0.02 %", "1.8 %", "50 %", "98.2 %", "99.96 %", "100 %")
+    ]
+    lengths = [(0.0072, "m"), (0.256, "m"), (11.42, "m"), (0.5, "scene units"), (1234.5, "m")]
+    assert [length(*given) for given in lengths] == ["7.20 mm", "25.6 cm", "11.4 m", "0.500 scene units", "1,234 m"]
 
 
 def test_a_page_without_a_summary_is_refused(tmp_path):

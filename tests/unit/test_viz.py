@@ -1,7 +1,5 @@
 """The renderer, the sheets and the figures of planted clouds."""
 
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pycolmap
@@ -13,11 +11,11 @@ from scenefuse.core.stage import StageError, quantity, write_json
 from scenefuse.core.transforms import Sim3
 from scenefuse.photos.pictures import write_depth
 from scenefuse.photos.sheets import save_png
-from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object, draw_scene
+from scenefuse.report.figures import FigureInputs, draw_lone_object, draw_object
 from scenefuse.report.page import view_section
 from scenefuse.report.render import Camera, orbit_camera, point_radii, render
+from scenefuse.report.scene_figures import draw_scene, view_scene
 from scenefuse.report.view import Shown, read_view
-from scenefuse.report.view_scene import view_scene
 
 GREEN, RED, BLUE = (0, 200, 0), (220, 0, 0), (0, 0, 220)
 
@@ -187,7 +185,6 @@ def capture(tmp_path_factory):
     write_json(folder / "missing.json", {"missing": quantity(0.1, "")})
     (folder / "next_photos.csv").write_text("station,photo,x,y,z\n1,1,3,0,3\n1,2,3,1,3\n1,3,3,2,3\n")
     write_json(folder / "crop.json", {"up_in_scene": quantity([0.0, 0.0, 1.0], ""), "diagonal": quantity(2.4, "m")})
-    write_json(folder / "metrics.json", {"registration": {"f_score": quantity(0.93, "1")}})
     model = pycolmap.Reconstruction()
     pinhole = pycolmap.Camera(model="PINHOLE", width=64, height=48, params=[60, 60, 32, 24], camera_id=1)
     model.add_camera_with_trivial_rig(pinhole)
@@ -212,7 +209,11 @@ def capture(tmp_path_factory):
 
 
 POSE = Sim3(2.0, np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.array([1.0, 2, 3]))
-REGISTERED = {"status": quantity("registered", ""), "scene_from_object": quantity(POSE.matrix, "")}
+REGISTERED = {
+    "status": quantity("registered", ""),
+    "reason": quantity("both agree", ""),
+    "scene_from_object": quantity(POSE.matrix, ""),
+}
 
 
 def draw(capture, fine, figures):
@@ -226,7 +227,6 @@ def draw(capture, fine, figures):
         crop_json=capture / "crop.json",
         object_cloud=capture / "object.ply",
         fine_json=capture / "fine.json",
-        metrics_json=capture / "metrics.json",
         missing=capture / "missing.ply",
         missing_json=capture / "missing.json",
         next_photos=capture / "next_photos.csv",
@@ -263,7 +263,6 @@ def test_figures_show_what_was_added(figures):
     names = {
         "missing.png",
         "before_after.png",
-        "provenance.png",
         "registration.png",
         "object.png",
         "before.png",
@@ -273,8 +272,6 @@ def test_figures_show_what_was_added(figures):
     assert all(p.stat().st_size < 1_000_000 for p in figures.iterdir())
     before, after = (cv2.imread(str(figures / f"{n}.png")).astype(float) for n in ("before", "after"))
     assert (np.abs(before - after).max(2) > 40).mean() > 0.02
-    colors = cv2.cvtColor(cv2.imread(str(figures / "provenance.png")), cv2.COLOR_BGR2RGB).astype(int)
-    assert (colors[..., 0] - colors[..., 2] > 60).mean() > 0.01
     colors = cv2.cvtColor(cv2.imread(str(figures / "missing.png")), cv2.COLOR_BGR2RGB).astype(int)
     for first, last in ((0, 2), (2, 0)):
         assert (colors[..., first] - colors[..., last] > 70).sum() > 50
@@ -302,20 +299,6 @@ def test_the_3d_view_holds_the_scene_before_and_what_was_added(figures):
     np.testing.assert_allclose([view.low, view.high], [[-1, -0.5, 0], [1, 0.5, 1]], atol=0.05)
 
 
-def test_a_place_in_the_shade_is_shown_brighter_and_says_so(capture, tmp_path):
-    kept = {name: (capture / name).read_bytes() for name in ("dense.ply", "fused.ply")}
-    for name in kept:
-        cloud = read_cloud(capture / name)
-        write_cloud(capture / name, replace(cloud, colors=(cloud.colors // 8).astype(np.uint8)))
-    dark = read_cloud(capture / "dense.ply").colors.max()
-    draw(capture, REGISTERED, tmp_path / "figures")
-    for name, content in kept.items():
-        (capture / name).write_bytes(content)
-    view = read_view(tmp_path / "figures")
-    assert view.brighter == 4 and view.cloud.colors.max() == 4 * dark
-    assert "The points' own colours, 4.0 x as bright" in view_section("object-box", "box", view)
-
-
 def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(capture, tmp_path):
     scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
     far = Cloud(np.array([[900.0, 0, 0]]), None, np.uint8([RED]))
@@ -332,7 +315,7 @@ def test_the_3d_view_of_a_scene_names_its_objects_and_leaves_stray_points_out(ca
 
 
 def test_the_3d_view_of_a_large_scene_shows_one_in_so_many_points_and_all_of_an_object(capture, tmp_path, monkeypatch):
-    monkeypatch.setattr("scenefuse.report.view_scene.MAX_DRAWN", 2000)
+    monkeypatch.setattr("scenefuse.report.scene_figures.MAX_DRAWN", 2000)
     scene, fused = read_cloud(capture / "dense.ply"), read_cloud(capture / "completed.ply")
     about = {"sources": quantity({"0": "scene", "1": "box"}, ""), "scene_points": quantity(len(scene), "points")}
     write_json(tmp_path / "completed.json", about)

@@ -75,6 +75,13 @@ def summary_command(log):
     return f"{command} --summary results/summary &> {log}"
 
 
+def closing_lines():
+    """What a finished run ends with: the result, the report page, the next step."""
+    from scenefuse.report import facts
+
+    return facts.closing_lines(Path("results/summary"))
+
+
 def result_folders(wildcards=None):
     """The result folders of all scenes and objects, as options; also a params function."""
     names = {"scenes": SCENES, "objects": OBJECTS}

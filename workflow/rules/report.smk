@@ -2,7 +2,7 @@
 #
 # INPUTS    everything before
 # OUTPUTS   results/scenes/{scene}/scene.png, view.ply, view.json, results/objects/{object}/figures/
-#           results/summary/*.tsv, summary.txt, report.html
+#           results/summary/*.tsv, summary.txt, details.txt, report.html
 
 
 include: "../functions/report.smk"
@@ -61,7 +61,6 @@ rule draw_object:
         crop_json="results/objects/{object}/registration/full/crop.json",
         cloud="results/objects/{object}/object.ply",
         fine="results/objects/{object}/registration/full/fine.json",
-        metrics="results/objects/{object}/metrics.json",
         missing="results/objects/{object}/missing.ply",
         missing_json="results/objects/{object}/missing.json",
         next_photos="results/objects/{object}/next_photos.csv",
@@ -102,7 +101,7 @@ rule draw_object:
     shell:
         "exec python {params.script} --name {wildcards.object} --scene {input.scene} --fused {input.fused} --checked {input.checked}"
         " --crop {input.crop} --crop-json {input.crop_json} --object-cloud {input.cloud} --fine-json {input.fine}"
-        " --metrics-json {input.metrics} --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
+        " --missing {input.missing} --missing-json {input.missing_json} --next-photos {input.next_photos}"
         " {params.photos} --figures {output} &> {log}"
 
 
@@ -187,6 +186,7 @@ rule write_summary:
             caption="../report/table.rst",
         ),
         text="results/summary/summary.txt",
+        details="results/summary/details.txt",
     log:
         "results/logs/write_summary/all.log",
     benchmark:
@@ -194,13 +194,13 @@ rule write_summary:
     conda:
         "../../envs/report.yaml"
     resources:
-        mem_mb=1000,
+        mem_mb=2000,
         runtime=10,
     params:
         command=summary_command("results/logs/write_summary/all.log"),
         code=code("report/write_summary.py"),
     message:
-        "Summary: tables"
+        "Summary: tables, texts"
     shell:
         "exec {params.command}"
 
@@ -233,13 +233,18 @@ rule write_report:
         "Summary: report page"
     shell:
         "exec python {params.script} --summary results/summary {params.folders} {params.paper}"
-        " --title scenefuse --report {output} &> {log}"
+        " --report {output} &> {log}"
 
 
 onstart:
     for line in forecast_run():
         print(line, file=sys.stderr)
     mark_as_unfinished()
+
+
+onsuccess:
+    if any(job.rule.name == "write_report" for job in workflow.dag.jobs):
+        print(closing_lines(), file=sys.stderr)
 
 
 onerror:
@@ -270,6 +275,4 @@ onerror:
         run_anyway(job)
     for job in held_up("write_report") if keep_going else []:
         run_anyway(job)
-    print(
-        "Some jobs failed; results/summary/summary.txt names them.", file=sys.stderr
-    )
+    print("Some jobs failed.\n" + closing_lines(), file=sys.stderr)

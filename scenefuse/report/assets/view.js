@@ -236,7 +236,14 @@ class View {
       } else if (off < nearest) { nearest = off; beside = i; }
     }
     const found = hit >= 0 ? hit : beside;
-    return found < 0 ? null : Array.from(positions.subarray(3 * found, 3 * found + 3));
+    if (found < 0) return null;
+    return Object.assign(Array.from(positions.subarray(3 * found, 3 * found + 3)), { deviation: this.deviation(found) });
+  }
+
+  // Standard deviation of a point; 0 where it is not known.
+  deviation(point) {
+    const level = this.data.planes.deviation?.[point], [low, high] = this.about.deviation ?? [];
+    return level ? low * (high / low) ** ((level - 1) / (this.about.levels - 1)) : 0;
   }
 
   measure(x, y) {
@@ -249,7 +256,9 @@ class View {
 
   distance() {
     const length = norm(minus(...this.picked));
-    return `${Number(length.toPrecision(4))} ${this.about.unit}`;
+    const spread = Math.hypot(...this.picked.map((point) => point.deviation));
+    const around = spread > 0 ? ` ± ${Number(spread.toPrecision(2))}` : "";
+    return `${Number(length.toPrecision(4))}${around} ${this.about.unit}`;
   }
 
   drawMarks() {
@@ -328,6 +337,11 @@ class View {
     full.addEventListener("click", () => document.fullscreenElement ? document.exitFullscreen()
       : section.requestFullscreen());
     stage.addEventListener("keydown", (event) => this.key(event));
+    // Under a finger the page scrolls until the view is tapped, and again once something else is touched.
+    stage.querySelector(".wake").addEventListener("click", () => { stage.classList.add("awake"); stage.focus({ preventScroll: true }); });
+    document.addEventListener("pointerdown", (event) => {
+      if (!section.contains(event.target)) stage.classList.remove("awake");
+    });
     // The wheel scrolls the page until the view is in use.
     stage.addEventListener("wheel", (event) => {
       if (!stage.contains(document.activeElement)) event.stopPropagation();
@@ -354,6 +368,8 @@ class View {
 
 const views = new Map([...document.querySelectorAll(".view")].map((section) => [section, new View(section)]));
 const near = new IntersectionObserver((entries) => {
-  for (const entry of entries) if (entry.isIntersecting) views.get(entry.target).start();
+  for (const { isIntersecting, target } of entries)
+    if (isIntersecting) views.get(target).start();
+    else target.querySelector(".view-stage").classList.remove("awake");
 }, { rootMargin: "300px" });
 views.forEach((_view, section) => near.observe(section));

@@ -1,0 +1,242 @@
+"""What a client asks of a scene or an object, in words: how large, how exact, what is missing, what to do next.
+
+The words are made of a row of scenes.tsv or objects.tsv, for the report page and for summary.txt alike.
+"""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+from PIL.ExifTags import IFD, Base
+
+from scenefuse.core.stage import StageError, read_json
+from scenefuse.photos.workspace import posed_images, read_model
+from scenefuse.report.run_summary import ALONE
+from scenefuse.report.values import length, percent, read_table
+
+Row = Mapping[str, Any]
+# Photos of a scene whose ground pixels and dates are looked at, spread evenly.
+LOOKED_AT = 20
+# Errors that 90 % of the points do not exceed, over the root mean square of normal errors in a plane, and upwards.
+CE90_OVER_RMS, LE90_OVER_RMS = float(np.sqrt(np.log(10))), 1.6449
+RESULTS = {
+    "registered": "Found in the scene and completed",
+    "ungated": "Added to the scene, but nothing checked its place",
+    "unregistered": "Not added to the scene",
+    ALONE: "Reconstructed by itself; it lies in no scene",
+    "failed": "Not finished",
+    "missing": "Not run yet",
+}
+DONE = ("registered", "ungated", ALONE)
+DECIDED_BY = {
+    "geometry": "its place follows from the clouds alone, for no photos link object and scene",
+    "near": "its place follows from the clouds, near where the photos put it",
+    "both": "the photos and the clouds put it at the same place",
+    "photos": "its place follows from the photos, against the clouds",
+}
+
+
+MISSING = {
+    "never_seen": "seen by no photo",
+    "untextured": "too plain to measure",
+    "contradicted": "where photos disagree",
+}
+
+
+def object_facts(row: Row) -> dict[str, str]:
+    """Label -> sentence, from a row of objects.tsv; what is not known has no label."""
+    has, facts = _known(row), dict[str, str]()
+    unit, status = has.get("unit", "scene units"), has["status"]
+    why = has.get("reason") if status == "unregistered" else has.get("error")
+    if status in DONE:
+        why = DECIDED_BY.get(has.get("decided_by", ""))
+    facts["Result"] = RESULTS[status] + (f": {why}" if why else "")
+    if status == ALONE:
+        facts["File"] = f"objects/{has['object']}/object.ply"
+    if status == "unregistered":
+        facts["Result"] += ". Perhaps it is not in this scene, or too little of it"
+    if "height" in has:
+        sides = " × ".join(length(has[side], unit) for side in ("length", "width"))
+        facts["Size"] = f"{sides}, {length(has['height'], unit)} high"
+    if "surface_missing" in has:
+        share = has["surface_missing"]
+        kinds = [f"{percent(has[f'surface_{n}'])} {what}" for n, what in MISSING.items() if has.get(f"surface_{n}")]
+        facts["Surface"] = f"{percent(1 - share)} is there" + (
+            f", {percent(share)} is missing: {', '.join(kinds)}" if kinds else ""
+        )
+    if "added_points" in has:
+        facts["Points"] = f"{has['added_points']:,.0f} added" + (
+            f", {has['removed_points']:,.0f} of the scene replaced" if has.get("removed_points") else ""
+        )
+        if "measured_share" in has:
+            facts["Points"] += f"; {percent(has['measured_share'])} of the object's are confirmed by photos"
+    facts |= _accuracy(has, unit)
+    if "registered" in has:
+        facts["Photos"] = f"{has['registered']:.0f} of {has['frames']:.0f} used"
+    if "added_points" in has:
+        facts["File"] = f"objects/{has['object']}/fused.ply; in the scene: completed.ply"
+    return _capital(facts | _next(has))
+
+
+def _accuracy(has: dict[str, Any], unit: str) -> dict[str, str]:
+    parts = [
+        f"{length(has[name], unit)} {where}"
+        for name, where in {"deviation": "on the object", "world_deviation": "in the scene"}.items()
+        if name in has
+    ]
+    found = [f"standard deviation of a point {' and '.join(parts)}"] if parts else []
+    if has.get("scale_sd_log"):
+        found.append(f"its scale is known to {percent(has['scale_sd_log'])}")
+    return {"Accuracy": "; ".join(found)} if found else {}
+
+
+def _next(has: dict[str, Any]) -> dict[str, str]:
+    """What to photograph, click or repair."""
+    parts = []
+    if has.get("stations"):
+        shows = (
+            f": this would show {percent(has['stations_show'])} of what photos can still show"
+            if "stations_show" in has
+            else ""
+        )
+        places = "place" if has["stations"] == 1 else "places"
+        parts.append(f"photograph it from {has['stations']:.0f} {places} ({has['object']}/next_photos.csv){shows}")
+    if "advice" in has:
+        parts.append(has["advice"])
+    return {"Next": "; ".join(parts)} if parts else {}
+
+
+def scene_facts(row: Row) -> dict[str, str]:
+    """Label -> sentence, from a row of scenes.tsv; what is not known has no label."""
+    has, facts = _known(row), dict[str, str]()
+    unit = has.get("length_unit", "scene units")
+    if "error" in has:
+        facts["Result"] = f"no dense cloud: {has['error']}"
+    elif "completed_points" in has:
+        facts["Result"] = f"completed with {has['completed_by']}; {has['completed_points']:,.0f} points"
+    elif "points" in has:
+        facts["Result"] = f"{has['points']:,.0f} points, not completed with all objects yet"
+    if "latitude_deg" in has:
+        north, east = has["latitude_deg"], has["longitude_deg"]
+        facts["Place"] = f"{abs(north):.5f}° {'NS'[north < 0]}, {abs(east):.5f}° {'EW'[east < 0]}"
+    photos = (
+        f"{has['registered']:.0f} of {has['photos']:.0f} photos used" if "registered" in has else "given as a cloud"
+    )
+    facts["Photographed"] = ", ".join(filter(None, [has.get("photographed"), photos]))
+    if unit == "m":
+        facts["Coordinates"] = f"metres, {_crs_name(has['crs'])}" if "crs" in has else "metres, in a local frame"
+    else:
+        facts["Coordinates"] = "scene units: neither GPS, control points nor known lengths give metres"
+    if "ground_pixel" in has:
+        facts["Ground pixel"] = length(has["ground_pixel"], unit)
+    errors = [
+        f"{what} {_errors(has[f'{kind}_rms_horizontal_m'], has[f'{kind}_rms_vertical_m'])}"
+        for kind, what in {"gps": "GPS", "control": "control points", "check": "check points"}.items()
+        if f"{kind}_rms_horizontal_m" in has and f"{kind}_rms_vertical_m" in has
+    ]
+    if errors:
+        facts["Residuals"] = "; ".join(errors)
+    if "completed_points" in has:
+        facts["File"] = f"scenes/{has['scene']}/completed.ply, completed.copc.laz"
+    return _capital(facts)
+
+
+def _capital(facts: dict[str, str]) -> dict[str, str]:
+    """Each sentence with a capital; a file's name stays as it is."""
+    return {label: text if label == "File" else text[:1].upper() + text[1:] for label, text in facts.items()}
+
+
+def _errors(horizontal_m: float, vertical_m: float) -> str:
+    """Root mean square errors, and what 90 % of the points do not exceed."""
+    rms, most = (
+        [length(factor * error, "m") for factor, error in zip(factors, (horizontal_m, vertical_m))]
+        for factors in ((1.0, 1.0), (CE90_OVER_RMS, LE90_OVER_RMS))
+    )
+    return f"{rms[0]} horizontally, {rms[1]} vertically (RMS; CE90 {most[0]}, LE90 {most[1]})"
+
+
+def closing_lines(summary: Path) -> str:
+    """What a run ends with: the result, the report page, the next step.
+
+    Args:
+        summary: folder with scenes.tsv, objects.tsv and report.html.
+    """
+    scenes, objects = (read_table(summary / f"{name}.tsv").to_dict("records") for name in ("scenes", "objects"))
+    done = [row for row in objects if row["status"] in DONE]
+    files = [
+        *(
+            summary.parent / f"scenes/{row['scene']}/completed.ply"
+            for row in map(_known, scenes)
+            if "completed_points" in row
+        ),
+        *(summary.parent / f"objects/{row['object']}/object.ply" for row in objects if row["status"] == ALONE),
+    ]
+    # First what is not done, then what could be better.
+    steps = [f"{row['object']}: {object_facts(row)['Result']}" for row in objects if row not in done]
+    steps += [f"{row['object']}: {facts['Next']}" for row in done if "Next" in (facts := object_facts(row))]
+    page = summary / "report.html"
+    return "\n".join(
+        [
+            f"Result: {len(done)} of {len(objects)} objects completed"
+            + (f"; {', '.join(map(str, files))}" if files else ""),
+            f"Report: {page if page.is_file() else summary / 'summary.txt'}",
+            f"Next:   {steps[0] if steps else 'nothing is missing; open the result in CloudCompare or QGIS'}",
+        ]
+    )
+
+
+def photographed(scene: Path) -> str | None:
+    """The day of a scene's photos by their EXIF, or the first and the last day; None where it is not known.
+
+    Args:
+        scene: the scene's results, with photos.json and photos/.
+    """
+    try:
+        names = [photo["name"] for photo in read_json(scene / "photos.json").get("photos", [])]
+    except StageError:
+        return None
+    days = set()
+    for name in names[:: max(1, len(names) // LOOKED_AT)]:
+        try:
+            with Image.open(scene / "photos" / name) as image:
+                exif = image.getexif()
+            taken = exif.get_ifd(IFD.Exif).get(Base.DateTimeOriginal) or exif.get(Base.DateTime)
+        except (OSError, ValueError, Image.DecompressionBombError):
+            continue
+        if taken:
+            days.add(str(taken)[:10].replace(":", "-"))
+    return " to ".join(dict.fromkeys([min(days), max(days)])) if days else None
+
+
+def ground_pixel(folder: Path) -> float | None:
+    """What a pixel covers at the depth of what the photos show (median), in the model's unit; None without a model."""
+    try:
+        model = read_model(folder)
+    except StageError:
+        return None
+    images, found = posed_images(model), []
+    for image in images[:: max(1, len(images) // LOOKED_AT)]:
+        seen = np.array([model.points3D[p.point3D_id].xyz for p in image.get_observation_points2D()])
+        if len(seen):
+            pose = image.cam_from_world().matrix()
+            depth = float(np.median(seen @ pose[2, :3] + pose[2, 3]))
+            found.append(depth / model.cameras[image.camera_id].mean_focal_length())
+    return float(np.median(found)) if found else None
+
+
+def _known(row: Row) -> dict[str, Any]:
+    """The cells that hold something."""
+    return {name: cell for name, cell in row.items() if cell == cell and cell not in (None, "", "-")}
+
+
+def _crs_name(crs: str) -> str:
+    """The name of a coordinate system, with its code."""
+    import pyproj
+
+    try:
+        name = pyproj.CRS.from_user_input(crs).name
+    except pyproj.exceptions.CRSError:
+        return crs
+    return f"{name} ({crs})" if len(crs) < len(name) else name
