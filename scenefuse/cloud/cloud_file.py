@@ -18,7 +18,16 @@ from scenefuse.cloud.clouds import (
     spacing,
 )
 from scenefuse.cloud.formats import ColumnParts, check_not_degrees, columns_in_parts
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, positions
+from scenefuse.cloud.readers.columns import (
+    AT_ONCE,
+    COLOR,
+    POSITION,
+    Columns,
+    color_counts,
+    colors_of,
+    positions,
+    white_of,
+)
 from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, NOISE, WITHHELD
 from scenefuse.cloud.readers.text import text_notes
 from scenefuse.cloud.strays import is_nothing_at_zero
@@ -29,7 +38,7 @@ from scenefuse.core.transforms import Array
 # Points of a file, at most twice as many, that say where it lies.
 SAMPLE = AT_ONCE
 # Why rows are left out.
-NOT_FINITE, AT_ZERO = "rows without a finite position", "points at 0 0 0, far from all others,"
+NOT_FINITE, AT_ZERO = "rows without a finite position", "points at exactly 0 0 0"
 # Column of the number of a row in its file; no file can have one of that name.
 ROW = "\n"
 EVERYWHERE = np.full(3, -np.inf), np.full(3, np.inf)
@@ -52,7 +61,7 @@ class FileSummary:
         count: of its points of a surface: with a finite position, and neither noise, withheld nor at 0 0 0 far away.
         left_out: why rows are none of these -> how many.
         sample: (S, 3) positions of every so manyth of the points of a surface.
-        most_color: the greatest colour; None where there are none.
+        white: the number of white among the colours; None where there are none.
         without_zero: whether points at 0 0 0 are none; they are not among the sample in any case.
     """
 
@@ -63,7 +72,7 @@ class FileSummary:
     count: int
     left_out: dict[str, int]
     sample: Array
-    most_color: float | None
+    white: float | None
     without_zero: bool
 
     def surface(self, columns: Columns) -> Columns:
@@ -83,7 +92,8 @@ def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
         StageError: it is damaged, or holds no point of a surface.
     """
     is_las, rows, count, zeros = path.suffix.lower() in ENDINGS, 0, 0, 0
-    held, sample, left_out, most_color = list[Columns](), Thinned(SAMPLE), dict[str, int](), None
+    held, sample, left_out, white = list[Columns](), Thinned(SAMPLE), dict[str, int](), None
+    bright = np.zeros(3, np.int64)
     for columns in parts():
         held = [*held, columns] if rows < AT_ONCE else []
         rows += len(columns["x"])
@@ -92,21 +102,21 @@ def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
         at_zero = (positions(surface) == 0).all(1)
         count, zeros = count + len(at_zero), zeros + int(at_zero.sum())
         sample.add(chosen_rows({axis: surface[axis] for axis in POSITION}, ~at_zero)[0])
-        if set(COLOR) <= set(columns):
-            here = max(float(np.nan_to_num(columns[name].astype(np.float64)).max(initial=0)) for name in COLOR)
-            most_color = max(here, most_color or 0.0)
+        if (colors := colors_of(columns)) is not None:
+            bright += color_counts(colors)
+            white = white_of(colors.dtype, bright)
         look(columns, surface)
     if not rows:
         raise StageError(f"{path} holds no points; look at what wrote it")
     chosen = positions(sample.columns)
-    without_zero = zeros > 0 and is_nothing_at_zero(chosen)
+    without_zero = is_nothing_at_zero(chosen, zeros)
     if without_zero:
         left_out[AT_ZERO], count = zeros, count - zeros
     if count == 0:
-        said = ", ".join(f"{number} {why.rstrip(',')}" for why, number in left_out.items() if number)
+        said = ", ".join(f"{number} {why}" for why, number in left_out.items() if number)
         raise StageError(f"{path} holds no point of a surface ({said}); look at what wrote it, and give the surface")
-    if most_color == 0 and is_las:
-        most_color = None  # Formats with colours are used for points without, which are black then.
+    if not bright.any() and is_las:
+        white = None  # Formats with colours are used for points without, which are black then.
     return FileSummary(
         path,
         held.__iter__ if rows <= AT_ONCE else parts,
@@ -115,7 +125,7 @@ def summarise(path: Path, parts: ColumnParts, look: Look) -> FileSummary:
         count,
         left_out,
         chosen if len(chosen) else np.zeros((1, 3)),
-        most_color,
+        white,
         without_zero,
     )
 
@@ -239,8 +249,8 @@ class CloudFile:
 def _cloud(columns: Columns, whole: FileSummary) -> Cloud:
     """Without what LAS says beside colours, and without colours where all are black."""
     left_out = {*LAS_DIMENSIONS, WITHHELD} if whole.is_las else set()
-    left_out |= set(COLOR) if whole.most_color is None else set()
-    return cloud_of({name: values for name, values in columns.items() if name not in left_out}, whole.most_color)
+    left_out |= set(COLOR) if whole.white is None else set()
+    return cloud_of({name: values for name, values in columns.items() if name not in left_out}, whole.white)
 
 
 def _inside(points: Array, box: Box) -> NDArray[np.bool_]:

@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from scenefuse.cloud.formats import read_columns
-from scenefuse.cloud.readers.columns import COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, bytes_of, positions
+from scenefuse.cloud.readers.columns import (
+    COLOR,
+    NORMAL,
+    POSITION,
+    UNIT_TOLERANCE,
+    Columns,
+    bytes_of,
+    colors_of,
+    positions,
+)
 from scenefuse.cloud.readers.ply import Element, header_of
 from scenefuse.core.stage import StageError, atomic_file
 from scenefuse.core.transforms import Sim3
@@ -228,14 +237,14 @@ def coincidence_note(path: Path, points: NDArray[np.float64]) -> list[str]:
     ]
 
 
-def cloud_of(columns: Columns, most_color: float | None = None) -> Cloud:
-    """The cloud of a file's columns; `most_color` is the greatest colour of the whole file where this is a part."""
+def cloud_of(columns: Columns, white: float | None = None) -> Cloud:
+    """The cloud of a file's columns; `white` is the number of white in the whole file where this is a part."""
     normals = np.stack([columns[k] for k in NORMAL], axis=1) if set(NORMAL) <= set(columns) else None
-    colors = np.stack([columns[k] for k in COLOR], axis=1) if set(COLOR) <= set(columns) else None
+    colors = colors_of(columns)
     return Cloud(
         positions(columns),
         None if normals is None else np.nan_to_num(normals.astype(np.float32)),
-        None if colors is None else bytes_of(colors, most_color),
+        None if colors is None else bytes_of(colors, white),
         {name: values for name, values in columns.items() if name not in {*POSITION, *NORMAL, *COLOR}},
     )
 

@@ -35,7 +35,6 @@ ENTRY, EXTENDED = struct.Struct("<4iQ2i"), struct.Struct("<H16sHQ32s")
 
 # Level and place along x, y, z of a cube.
 Key = tuple[int, int, int, int]
-ROOT: Key = (0, 0, 0, 0)
 # Points as the file has them.
 Records = NDArray[Any]
 # Places counted in the file's steps, or numbers of tiles.
@@ -63,7 +62,8 @@ def write_copc(path: Path, cloud: TiledCloud, in_crs: Callable[[Array], Array], 
     with atomic_file(path) as temporary, open(temporary, "wb") as file:
         nodes = _Nodes(file, layout.header, low, bits)
         octree = _Octree(source, nodes, low, bits)
-        nodes.add(ROOT, octree.of_tiles(ROOT, np.arange(len(cloud.low))))
+        root = (0, 0, 0, 0)
+        nodes.add(root, octree.of_tiles(root, np.arange(len(cloud.low))))
         nodes.finish()
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, common_name, joined
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, POSITION, Columns, common_names, joined
 from scenefuse.cloud.readers.e57 import read_e57
 from scenefuse.cloud.readers.las import ENDINGS, LAS_DIMENSIONS, WITHHELD, check_projected, las_crs, read_las
 from scenefuse.cloud.readers.meshes import read_glb, read_obj
@@ -108,15 +108,15 @@ def readable(path: Path) -> Iterator[None]:
         raise
     except Exception as error:  # each library has its own errors for a damaged file
         kind = path.suffix.removeprefix(".").upper()
-        why = (str(error) or type(error).__name__).splitlines()[0]
-        raise StageError(
-            f"{path} is not a readable {kind} cloud ({why}); copy it again, for it may be cut short, or export it again"
-        ) from None
+        why = ((str(error) or type(error).__name__).splitlines() or ["?"])[0][:200]
+        # What this package itself says of a strange file is a ValueError.
+        cut = "" if isinstance(error, ValueError) else "copy it again, for it may be cut short, or "
+        raise StageError(f"{path} is not a readable {kind} cloud ({why}); {cut}export it again") from None
 
 
 def _checked(path: Path, columns: Columns) -> Columns:
     """Columns by their common names; StageError where there are no positions."""
-    columns = {common_name(name): values for name, values in columns.items()}
+    columns = dict(zip(common_names(list(columns)), columns.values()))
     if not set(POSITION) <= set(columns):
         raise StageError(f"{path} has no columns x, y and z but {', '.join(columns) or 'none'}; export it again")
     return columns

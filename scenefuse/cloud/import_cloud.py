@@ -61,7 +61,7 @@ def import_scene_cloud(
 
         from scenefuse.cloud.crs import check_place, usable
 
-        usable(pyproj.CRS.from_user_input(crs), str(source))
+        usable(pyproj.CRS.from_user_input(crs), str(source), local=True)
         unit, name = unit_and_name(crs)
         check_place(crs, sample, source)
     origin = near_origin(sample)
@@ -179,11 +179,11 @@ class ImportedFile:
     def clouds(self) -> Iterator[Cloud]:
         """The points in parts, with unit normals or none, colours as bytes or none, and only the fields kept."""
         for columns in self.summary.columns():
-            cloud = cloud_of(self.summary.surface(columns), self.summary.most_color)
+            cloud = cloud_of(self.summary.surface(columns), self.summary.white)
             normals = None
             if self.unit_normals and cloud.normals is not None:
                 normals = (cloud.normals / np.linalg.norm(cloud.normals, axis=1, keepdims=True)).astype(np.float32)
-            colors = None if self.summary.most_color is None else cloud.colors
+            colors = None if self.summary.white is None else cloud.colors
             yield Cloud(cloud.points, normals, colors, {name: cloud.fields[name] for name in self.kept})
 
     def write(self, cloud: Path, move: Callable[[Cloud], Cloud], unit: str) -> dict[str, Any]:
@@ -227,7 +227,7 @@ class ImportedFile:
             "diagonal": quantity(diagonal, unit),
             "source": quantity(source.name, ""),
             "columns_not_used": quantity(self.unused, ""),
-            "has_colors": quantity(self.summary.most_color is not None, ""),
+            "has_colors": quantity(self.summary.white is not None, ""),
             "has_normals": quantity(bool(self.unit_normals), ""),
             "notes": quantity(notes, ""),
         }
@@ -238,5 +238,5 @@ def unit_and_name(crs: str) -> tuple[str, str]:
     import pyproj
 
     known = pyproj.CRS.from_user_input(crs)
-    unit = known.axis_info[0].unit_name if known.axis_info else "metre"
-    return "m" if unit in ("metre", "meter") else unit, known.to_string()
+    unit = known.axis_info[0] if known.axis_info else None
+    return "m" if unit is None or unit.unit_conversion_factor == 1 else unit.unit_name, known.to_string()

@@ -10,11 +10,10 @@ from scenefuse.core.stage import threads
 
 # Points below this percentile along an axis, and above the same on the other side, do not say how far a cloud reaches.
 STRAY_PERCENT = 1.0
-# Sizes of a cloud; what lies so far from it is none of it.
-MIN_AWAY_SIZES = 10.0
 # Neighbours of a point that has company.
 NEIGHBOURS = 8
-# A stray's neighbours are farther than this share of the cloud's diagonal, and than so many times the usual distance.
+# A stray's neighbours are farther than this share of the cloud's diagonal, and than so many times the usual distance;
+# so many sizes of a cloud away from it, nothing is a part of it.
 MIN_STRAY_SHARE, MIN_STRAY_TIMES = 0.02, 10.0
 # Larger shares of all points are no strays.
 MAX_STRAYS = 0.1
@@ -23,14 +22,16 @@ MAX_STRAYS = 0.1
 EVEN_CUBE, COARSE_CUBE = 0.02, 0.25
 
 
-def is_nothing_at_zero(others: NDArray[np.float64]) -> bool:
-    """Whether points at 0 0 0 are none of a cloud, as all its other points (N, 3) but strays lie far from there:
-    scanners write so what returned nothing."""
-    if not len(others):
+def is_nothing_at_zero(others: NDArray[np.float64], zeros: int) -> bool:
+    """Whether so many points at 0 0 0 are none of a cloud: more than a place has neighbours, or its other points (N, 3)
+    but strays lie far from there. Scanners write so what returned nothing."""
+    if not zeros or not len(others):
         return False
+    if zeros > NEIGHBOURS:
+        return True
     low, high = np.percentile(others, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
     away = np.linalg.norm(np.maximum(np.maximum(low, -high), 0))
-    return bool(away > MIN_AWAY_SIZES * np.linalg.norm(high - low))
+    return bool(away > MIN_STRAY_TIMES * np.linalg.norm(high - low))
 
 
 def strays(points: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -5,7 +5,6 @@ Open3D misreads positions that are binary doubles, without a word.
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from scenefuse.cloud.readers.columns import COLOR, Columns
+from scenefuse.cloud.readers.rows import next_rows, typed
 from scenefuse.core.stage import StageError
 
 
@@ -27,6 +27,7 @@ class _Header:
         count: of rows.
         data: ascii, binary or binary_compressed.
         begin: the byte where the rows begin.
+        lines: of the header.
     """
 
     names: list[str]
@@ -35,6 +36,7 @@ class _Header:
     count: int
     data: str
     begin: int
+    lines: int
 
 
 def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
@@ -58,10 +60,12 @@ def read_pcd(path: Path, at_once: int) -> Iterator[Columns]:
 
 def _header(path: Path) -> _Header:
     words: dict[str, list[str]] = {}
+    lines = 0
     with open(path, "rb") as file:
         while "DATA" not in words:
             line = file.readline()
-            cells = line.decode("ascii").split()
+            lines += 1
+            cells = line.decode("latin-1").split()
             words |= {cells[0]: cells[1:]} if cells else {}
             if not line:
                 raise ValueError("it has no PCD header")
@@ -70,19 +74,26 @@ def _header(path: Path) -> _Header:
     repeats = [int(n) for n in words.get("COUNT", ["1"] * len(names))]
     types = [np.dtype(f"<{kind.lower()}{size}") for kind, size in zip(words["TYPE"], words["SIZE"])]
     count = int(words["WIDTH"][0]) * int(words["HEIGHT"][0])
-    return _Header(names, types, repeats, count, words["DATA"][0], begin)
+    size = sum(kind.itemsize * n for kind, n in zip(types, repeats))
+    if len({len(names), len(repeats), len(types)}) > 1 or count < 0 or size <= 0 or min(repeats) < 0:
+        raise ValueError("its header does not say what its rows hold")
+    missing = count - (path.stat().st_size - begin) // size
+    if words["DATA"][0] == "binary" and missing > 0:
+        raise StageError(f"{path} is cut short: its last {missing} points are missing; copy it again")
+    return _Header(names, types, repeats, count, words["DATA"][0], begin, lines)
 
 
 def _lines(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
     """The fields (N, n) each of rows of text."""
-    cuts = np.cumsum(header.repeats)[:-1]
-    with open(path, encoding="ascii") as file:
+    left, line, ends = header.count, header.lines + 1, np.cumsum([0, *header.repeats])
+    with open(path, "rb") as file:
         file.seek(header.begin)
-        left = header.count
-        while lines := list(islice(file, min(at_once, left))):
-            left -= len(lines)
-            rows = np.loadtxt(lines, ndmin=2)
-            yield [part.astype(kind) for part, kind in zip(np.split(rows, cuts, axis=1), header.types)]
+        while left:
+            rows, line = next_rows(file, min(at_once, left), ends[-1], (str(path), line))
+            if not len(rows):
+                return
+            left -= len(rows)
+            yield [typed(rows[:, at : at + n], kind) for at, n, kind in zip(ends, header.repeats, header.types)]
 
 
 def _rows(path: Path, header: _Header, at_once: int) -> Iterator[list[NDArray[Any]]]:
@@ -103,8 +114,14 @@ def _compressed(path: Path, header: _Header, at_once: int) -> Iterator[list[NDAr
     """The same of compressed columns, one after the other."""
     with open(path, "rb") as file:
         file.seek(header.begin)
-        packed, size = np.fromfile(file, "<u4", 2)
-        raw = _lzf(np.fromfile(file, np.uint8, packed), size).tobytes()
+        packed, size = (int(number) for number in np.fromfile(file, "<u4", 2))
+        content = file.read()[:packed]
+    if len(content) < packed:
+        raise StageError(f"{path} is cut short: {packed - len(content)} bytes are missing; copy it again")
+    # A copy of 264 bytes takes three.
+    if size > 88 * packed or size != header.count * sum(k.itemsize * n for k, n in zip(header.types, header.repeats)):
+        raise ValueError("its compressed part is not as long as its header says")
+    raw = _lzf(content, size)
     sizes = [kind.itemsize * n * header.count for kind, n in zip(header.types, header.repeats)]
     arrays = [
         np.frombuffer(raw, kind, header.count * n, at).reshape(header.count, n)
@@ -121,41 +138,34 @@ def _columns(header: _Header, arrays: list[NDArray[Any]]) -> Columns:
     }
     for name in {"rgb", "rgba"} & set(columns):
         kind = header.types[header.names.index(name)]
-        bits = np.ascontiguousarray(columns.pop(name).astype(kind)).view(np.uint32)
+        packed = columns.pop(name)
+        if header.data == "ascii" and kind.kind == "f":
+            packed = np.nan_to_num(packed)
+        bits = np.ascontiguousarray(packed.astype(kind)).view(np.uint32)
         columns |= {color: (bits >> shift & 255).astype(np.uint8) for color, shift in zip(COLOR, (16, 8, 0))}
     return columns
 
 
-def _lzf(packed: NDArray[np.uint8], size: int) -> NDArray[np.uint8]:
+def _lzf(packed: bytes, size: int) -> bytearray:
     """Undo LZF, the compression of PCD: runs of literal bytes, and copies of bytes that came before."""
-    from numba import njit
-
-    @njit
-    def unpack(source: NDArray[np.uint8], target: NDArray[np.uint8]) -> int:
-        at, end = 0, 0
-        while at < len(source):
-            control = int(source[at])
+    found, at = bytearray(), 0
+    while at < len(packed) and len(found) <= size:
+        control = packed[at]
+        at += 1
+        if control < 32:
+            found += packed[at : at + control + 1]
+            at += control + 1
+            continue
+        length = (control >> 5) + 2
+        if length == 9:
+            length += packed[at]
             at += 1
-            if control < 32:
-                length, start = control + 1, -1
-            else:
-                length = (control >> 5) + 2
-                if length == 9:
-                    length += int(source[at])
-                    at += 1
-                start = end - ((control & 31) << 8) - int(source[at]) - 1
-                at += 1
-                if start < 0:
-                    return -1
-            if end + length > len(target) or (start < 0 and at + length > len(source)):
-                return -1
-            for k in range(length):
-                target[end + k] = source[at + k] if start < 0 else target[start + k]
-            end += length
-            at += length if start < 0 else 0
-        return end
-
-    target = np.zeros(size, np.uint8)
-    if unpack(packed, target) != size:
+        start = len(found) - ((control & 31) << 8) - packed[at] - 1
+        at += 1
+        before = found[max(start, 0) : start + length]
+        found += (before * (length // max(len(before), 1) + 1))[:length]  # a copy may reach into itself
+        if start < 0:
+            break
+    if len(found) != size:
         raise ValueError("its compressed part is damaged")
-    return target
+    return found

@@ -1,16 +1,16 @@
 """PLY: the header, which says where the columns lie, so that parts of them can be read; meshes and lists by plyfile."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import COLOR, POSITION, Columns, bytes_of, common_name, positions
+from scenefuse.cloud.readers.columns import POSITION, Columns, bytes_of, colors_of, common_names, positions
 from scenefuse.cloud.readers.meshes import Mesh, sampled_columns, triangles
+from scenefuse.cloud.readers.rows import next_rows, typed
 from scenefuse.core.stage import StageError
 
 KINDS = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
@@ -21,6 +21,10 @@ TYPES = {name: kind for kind, name in NAMES.items()} | dict(
 )
 
 
+# What the list of a face's corners is called.
+CORNERS = ("vertex_indices", "vertex_index")
+
+
 @dataclass(frozen=True)
 class Element:
     """Rows of one kind in a PLY file.
@@ -29,11 +33,13 @@ class Element:
         name: vertex, face, ...
         count: of rows.
         row: their NumPy type; None where they hold lists, so that rows differ in length.
+        lists: whether a property is a list, by its name.
     """
 
     name: str
     count: int
     row: np.dtype[Any] | None
+    lists: dict[str, bool] = field(default_factory=dict)
 
 
 def read_header(path: Path) -> tuple[list[Element], int] | None:
@@ -42,84 +48,140 @@ def read_header(path: Path) -> tuple[list[Element], int] | None:
     Raises:
         StageError: the file does not exist.
     """
-    return _header(path, {"binary_little_endian": "<", "binary_big_endian": ">"})
+    elements, offset, is_text = _header(path)
+    return None if is_text or not elements else (elements, offset)
 
 
-def read_text_header(path: Path) -> tuple[list[Element], int] | None:
-    """The same of a PLY of text; None where it is binary or no PLY."""
-    return _header(path, {"ascii": "="})
-
-
-def _header(path: Path, orders: dict[str, str]) -> tuple[list[Element], int] | None:
-    """The same of the formats that are keys of `orders`, whose values are NumPy's byte orders."""
+def _header(path: Path) -> tuple[list[Element], int, bool]:
+    """Elements, the byte where their rows begin, and whether these are text; no elements where it is no PLY."""
     if not path.is_file():
         raise StageError(f"{path} does not exist; run the stage that writes it first")
+    orders = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": "="}
     with open(path, "rb") as file:
         lines = _lines(file)
-        if lines[:1] != ["ply"] or lines[-1] != "end_header":
-            return None
-        order = orders.get((lines[1].split() + ["", ""])[1])
-        return None if order is None else (_elements(lines[2:], order), file.tell())
+        form = next((line.split()[1] for line in lines if line.startswith("format ")), "")
+        if lines[0] != "ply" or lines[-1] != "end_header" or form not in orders:
+            return [], 0, False
+        return _elements(lines, orders[form]), file.tell(), form == "ascii"
 
 
 def in_rows(path: Path) -> bool:
     """Whether the points of a PLY come first, without lists, and are no corners of faces."""
-    elements = (read_header(path) or read_text_header(path) or ([], 0))[0]
+    elements = _header(path)[0]
     mesh = any(element.name == "face" and element.count for element in elements)
     return bool(elements) and elements[0].name == "vertex" and elements[0].row is not None and not mesh
 
 
 def read_ply(path: Path, at_once: int) -> Iterator[Columns]:
-    """Points, so many rows at a time; where there are faces, points drawn from them, all at once."""
+    """Points, so many rows at a time; where there are faces, points drawn from them, all at once.
+
+    Raises:
+        StageError: the file is cut short, or a row of text is of another length.
+        ValueError: it is no PLY, or has no vertices.
+    """
+    elements, offset, is_text = _header(path)
+    if not elements:
+        raise ValueError("it does not begin as PLY does")
+    if not is_text:
+        _check_size(path, elements, offset)
     if in_rows(path):
-        yield from _rows(path, at_once)
+        yield from _rows(path, elements[0], offset, is_text, at_once)
         return
+    vertex, faces = _mesh_of_text(path, elements, offset) if is_text else _mesh_of_bytes(path)
+    if not len(faces) or not set(POSITION) <= set(vertex):
+        yield vertex
+        return
+    colors = colors_of(dict(zip(common_names(list(vertex)), vertex.values())))
+    colors = None if colors is None else bytes_of(colors).astype(np.float64)
+    corners = triangles(faces)[0]
+    yield sampled_columns(Mesh(positions(vertex), corners, colors, None, np.full(len(corners), -1)))
+
+
+def _check_size(path: Path, elements: list[Element], offset: int) -> None:
+    """StageError where a binary file is too small for what its header counts; a list takes a byte at least."""
+    there = path.stat().st_size - offset
+    for element in elements:
+        size = len(element.lists) if element.row is None else element.row.itemsize
+        there -= size * element.count
+        if there < 0:
+            raise _cut_short(path, element.name, min(-(there // size), element.count))
+
+
+def _cut_short(path: Path, element: str, missing: int) -> StageError:
+    what = "points" if element == "vertex" else f"rows of {element}"
+    return StageError(f"{path} is cut short: its last {missing} {what} are missing; copy it again")
+
+
+def _mesh_of_bytes(path: Path) -> tuple[Columns, list[Any]]:
+    """The columns of the vertices, and the corners of each face."""
     from plyfile import PlyData
 
     content = PlyData.read(path)
     vertex = content["vertex"].data
     columns = {name: np.array(vertex[name]) for name in vertex.dtype.names if vertex.dtype[name].kind in "iuf"}
-    if "face" not in content or not len(content["face"].data):
-        yield columns
-        return
-    face = content["face"].data
-    corners = next((name for name in ("vertex_indices", "vertex_index") if name in face.dtype.names), None)
-    if corners is None or not set(POSITION) <= set(columns):
-        yield columns
-        return
-    named = {common_name(name): values for name, values in columns.items()}
-    vertices = positions(columns)
-    colors = None
-    if set(COLOR) <= set(named):
-        colors = bytes_of(np.stack([named[name] for name in COLOR], axis=1)).astype(np.float64)
-    faces = triangles(list(face[corners]))[0]
-    yield sampled_columns(Mesh(vertices, faces, colors, None, np.full(len(faces), -1)))
+    face = content["face"].data if "face" in content else np.empty(0, [("", "u1")])
+    name = next((name for name in CORNERS if name in face.dtype.names), None)
+    return columns, [] if name is None else list(face[name])
 
 
-def _rows(path: Path, at_once: int) -> Iterator[Columns]:
-    """The columns of a PLY whose points come first, without lists, so many rows at a time."""
-    binary = read_header(path)
-    elements, offset = binary or read_text_header(path) or ([], 0)
-    row, left = elements[0].row, elements[0].count
-    assert row is not None and row.names is not None
-    kinds = {name: row[name] for name in row.names if row[name].kind in "iuf"}
+def _mesh_of_text(path: Path, elements: list[Element], offset: int) -> tuple[Columns, list[Any]]:
+    """The same of a file of text."""
+    vertex: Columns = {}
+    faces: list[list[int]] = []
     with open(path, "rb") as file:
         file.seek(offset)
+        for element in elements:
+            if element.row is not None:
+                columns = _columns_of_text(path, file, element, element.count)[0]
+                vertex = columns if element.name == "vertex" else vertex
+                continue
+            rows = list(islice((line for line in file if line.strip()), element.count))
+            if len(rows) < element.count:
+                raise _cut_short(path, element.name, element.count - len(rows))
+            faces += [_corners(element, row) for row in rows] if element.name == "face" else []
+    return vertex, faces
+
+
+def _corners(element: Element, row: bytes) -> list[int]:
+    """The corners of a face in a row of text; none where it has other lists alone."""
+    cells, at = row.split(), 0
+    for name, is_list in element.lists.items():
+        count = int(float(cells[at])) if is_list else 1
+        if name in CORNERS:
+            return [int(float(cell)) for cell in cells[at + 1 : at + 1 + count]]
+        at += count + is_list
+    return []
+
+
+def _rows(path: Path, element: Element, offset: int, is_text: bool, at_once: int) -> Iterator[Columns]:
+    """The columns of a PLY whose points come first, without lists, so many rows at a time."""
+    left, row = element.count, element.row
+    assert row is not None and row.names is not None
+    with open(path, "rb") as file:
+        line = 1 + file.read(offset).count(b"\n")
         while left:
             most = min(left, at_once)
-            rows: Any = np.fromfile(file, row, most) if binary else _rows_of_text(file, row, most)
-            if not len(rows):
-                raise StageError(f"{path} is cut short: its last {left} points are missing; copy it again")
-            left -= len(rows)
-            yield {name: np.ascontiguousarray(rows[name]) for name in kinds}
+            if is_text:
+                columns, line = _columns_of_text(path, file, element, most, line)
+            else:
+                rows = np.fromfile(file, row, most)
+                columns = {name: np.ascontiguousarray(rows[name]) for name in row.names}
+            count = len(next(iter(columns.values()), ()))
+            if not count:
+                raise _cut_short(path, element.name, left)
+            left -= count
+            yield columns
 
 
-def _rows_of_text(file: BinaryIO, row: np.dtype[Any], most: int) -> NDArray[Any]:
-    """The next rows of a PLY of text, so many at most; single precision has the digits of the text."""
-    assert row.names is not None
-    lines = list(islice(file, most))
-    wide = np.dtype([(name, "f8" if row[name].kind == "f" else row[name]) for name in row.names])
-    return np.loadtxt((line.decode("ascii") for line in lines), wide, ndmin=1) if lines else np.empty(0, wide)
+def _columns_of_text(path: Path, file: BinaryIO, element: Element, most: int, line: int = 1) -> tuple[Columns, int]:
+    """The next rows of text, so many at most, and the number of the line behind them.
+
+    Single precision has the digits of the text; missing integers are 0, and large ones the largest.
+    """
+    row = element.row
+    assert row is not None and row.names is not None
+    rows, line = next_rows(file, most, len(row.names), (str(path), line))
+    return {name: typed(rows[:, k], row[name]) for k, name in enumerate(row.names)}, line
 
 
 def header_of(elements: list[Element]) -> bytes:
@@ -137,21 +199,29 @@ def _lines(file: BinaryIO) -> list[str]:
     lines: list[str] = []
     while len(lines) < 1000 and (not lines or lines[-1] != "end_header"):
         line = file.readline(1000)
-        lines.append(line.decode("ascii", "replace").strip())
+        lines.append(line.decode("utf-8", "replace").strip(" \r\n\ufeff"))
         if not line or lines[0] != "ply":
             break
-    return lines
+    return lines or [""]
 
 
 def _elements(lines: list[str], order: str) -> list[Element]:
-    found: list[tuple[str, int, list[tuple[str, str]] | None]] = []
+    found: list[tuple[str, int, dict[str, str]]] = []
     for words in (line.split() for line in lines):
         if words[:1] == ["element"]:
-            found.append((words[1], int(words[2]), []))
+            found.append((words[1], int(words[2]), {}))
         elif words[:1] == ["property"]:
-            name, count, columns = found[-1]
-            if columns is None or words[1] not in TYPES:
-                found[-1] = name, count, None
-            else:
-                columns.append((words[2], order + TYPES[words[1]]))
-    return [Element(name, count, None if columns is None else np.dtype(columns)) for name, count, columns in found]
+            found[-1][2][words[-1]] = words[1]
+    if any(count < 0 for _, count, _ in found):
+        raise ValueError("its header counts less than no rows")
+    return [
+        Element(
+            name,
+            count,
+            np.dtype([(own, order + TYPES[kind]) for own, kind in kinds.items()])
+            if {*kinds.values()} <= {*TYPES}
+            else None,
+            {own: kind not in TYPES for own, kind in kinds.items()},
+        )
+        for name, count, kinds in found
+    ]

@@ -2,16 +2,16 @@
 
 import codecs
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, common_name
+from scenefuse.cloud.readers.columns import AT_ONCE, COLOR, NORMAL, POSITION, UNIT_TOLERANCE, Columns, common_names
+from scenefuse.cloud.readers.rows import COMMENT, cells_of, number, number_rows, separator
 from scenefuse.core.stage import StageError
 
 TEXTS = (".xyz", ".pts", ".txt", ".asc", ".csv")
@@ -21,6 +21,8 @@ NORTHING = ("y", "northing", "north", "n", "hochwert", "hw", "nordwert")
 ELEVATION = ("z", "elevation", "elev", "height", "h", "altitude", "alt", "hoehe", "höhe")
 # By how much the better of two places for the colours among the columns has to be.
 MIN_CORRELATION_GAIN = 0.1
+# Red, green and blue of a picture reach alike far; an intensity, a return and a class do not.
+MIN_RANGE_RATIO = 0.25
 # Rows or columns that no scanner's grid has more of; most coordinates in metres do.
 MAX_GRID_ROWS = 100_000
 # Lines in which the first row is looked for, and rows by which it is told what their columns are.
@@ -34,66 +36,67 @@ class TextLayout:
     Attributes:
         above: lines before the first row.
         separator: of numbers; None for blanks.
+        width: cells of a row.
         named: whether a name stands before the numbers of every row.
-        counted: whether a line of its own may count the points of each scan, as in PTS.
         columns: the names of those that are read -> where they stand in a row.
         notes: what was guessed and what is left out, a sentence each.
     """
 
     above: int = 0
     separator: str | None = None
+    width: int = 3
     named: bool = False
-    counted: bool = False
-    columns: dict[str, int] = field(default_factory=dict)
+    columns: dict[str, int] = field(default_factory=lambda: dict(zip(POSITION, range(3))))
     notes: list[str] = field(default_factory=list)
 
-    def rows(self, lines: list[str]) -> NDArray[np.float64]:
-        """(N, C) numbers of lines that are rows."""
-        # A name counts as a number, so that rows of another length are still an error.
-        first_cell: Any = {0: lambda name: 0.0} if self.named else None
-        if self.counted:
-            lines = [line for line in lines if not line.strip().isdecimal()]
-        # Some programs end each row with a separator.
-        if self.separator and any(line.rstrip().endswith(self.separator) for line in lines[:1]):
-            lines = [line.rstrip().removesuffix(self.separator) for line in lines]
-        return np.loadtxt(
-            lines, delimiter=self.separator, ndmin=2, converters=first_cell, comments=None if self.named else "#"
-        )
+    def rows(self, path: Path, lines: list[bytes], first: int, wanted: Sequence[int]) -> NDArray[np.float64]:
+        """(N, C) numbers of some columns of lines, the first of which has that number in the file (`number_rows`)."""
+        if path.suffix.lower() == ".pts":  # a line of its own counts the points of each scan
+            lines = [line for line in lines if not line.strip().isdigit()]
+        needed = 1 + max((self.columns[axis] for axis in POSITION if axis in self.columns), default=0)
+        return number_rows(lines, self.separator, self.width, wanted, needed, (str(path), first), not self.named)
 
 
 def text_layout(path: Path) -> TextLayout:
     """What the first lines and rows of a file say of its columns.
 
-    Rows are numbers separated by blanks, commas or semicolons, below any number of other lines. A line above them that
-    names the columns (`//X Y Z R G B`, `Point,Northing,Easting,Elevation`) is believed. Without one, the first three
-    columns are x, y, z and each three that follow are normals if they have unit length, else colours, if they can be;
-    an intensity may stand before or behind these. A first column that names or numbers the points, or two
-    with the row and column of a scanner, are left out, and so is what follows.
+    Rows are numbers separated by blanks, tabs, commas or semicolons, below any number of other lines. A line above them
+    that names the columns (`//X Y Z R G B`, `Point,Northing,Easting,Elevation`) is believed. Without one, the first
+    three columns are x, y, z and each three that follow are normals if they have unit length, else colours, if they can
+    be nothing else; an intensity may stand before or behind these. A first column that names or numbers the points, or
+    two with the row and column of a scanner, are left out, and so is what follows.
 
     Raises:
-        StageError: longitude and latitude; commas as decimal points.
+        StageError: longitude and latitude; commas as decimal points; a row of another length.
         ValueError: no rows of numbers.
     """
-    with open(path, encoding=_encoding(path)) as file:
-        head = list(islice(file, MAX_HEAD_LINES))
-        if not "".join(head).strip():
-            return TextLayout(columns=dict(zip(POSITION, range(3))))
-        above, named = _first_row(path, head)
-        begin = TextLayout(above, _separator(head[above]), named, path.suffix.lower() == ".pts")
-        rows = begin.rows(head[above:] + list(islice(file, MAX_LAYOUT_ROWS)))
-    names = _names(head[:above], begin.separator, rows.shape[1])
-    if len(names) == rows.shape[1]:
-        if set(POSITION) <= {common_name(name) for name in names}:
-            return replace(begin, columns={name: k for k, name in enumerate(names)})
-        axes = [[name for name in names if _plain(name) in known] for known in (EASTING, NORTHING, ELEVATION)]
-        if all(len(found) == 1 for found in axes):
-            own = {found[0]: axis for axis, found in zip(POSITION, axes)}
-            columns = {own.get(name, name): k for k, name in enumerate(names) if k or not named}
-            said = f"{path.name}: {', '.join(f'{axis} is {name}' for name, axis in own.items())}"
-            return replace(begin, columns=columns, notes=[said])
+    head = [_decoded(line) for line in islice(_lines(path), MAX_HEAD_LINES)]
+    if not "".join(head).strip():
+        return TextLayout()
+    above, mark, width, named = _first_row(path, head)
+    begin = TextLayout(above, mark, width, named)
+    rows = begin.rows(path, list(islice(_lines(path), above, MAX_LAYOUT_ROWS)), above + 1, range(width))
+    rows = rows[np.isfinite(rows).any(1)]
+    known = np.isfinite(rows).any(0)
+    names = _names(head[:above], mark, width)
+    if len(names) == width:
+        usual, said = common_names(names), list[str]()
+        plain = [re.sub(r"[\s_]*(\[\w+\]|\(\w+\)|_m)$", "", name).lower() for name in names]  # N [m], E_m
+        axes = [[k for k, name in enumerate(plain) if name in own] for own in (EASTING, NORTHING, ELEVATION)]
+        if not set(POSITION) <= set(usual) and all(len(found) == 1 for found in axes):
+            for axis, (k,) in zip(POSITION, axes):
+                usual[k] = axis
+            said = [f"{path.name}: {', '.join(f'{axis} is {names[k]}' for axis, (k,) in zip(POSITION, axes))}"]
+        if set(POSITION) <= set(usual):
+            words = [name for name, numbers in zip(names, known) if name and not numbers]
+            said += [f"{path.name}: its columns without numbers are left out: {', '.join(words)}"] if words else []
+            columns = {name: k for k, name in enumerate(usual) if name in POSITION or (name and known[k])}
+            return replace(begin, columns=columns, notes=said)
     degrees = next((name for name in names if name.lower().startswith(("lon", "lat"))), None)
     if degrees is not None:
         raise StageError(f"{path} is in degrees (column {degrees}); project it to metres first, to UTM for instance")
+    while rows.shape[1] > 3 and not known[rows.shape[1] - 1]:  # words behind the numbers, or a separator
+        rows = rows[:, :-1]
     notes, first = list[str](), 1 if named else _indices(rows)
     if first == 1:
         notes.append(f"{path.name}: its first column names or numbers the points and is left out")
@@ -106,17 +109,26 @@ def text_layout(path: Path) -> TextLayout:
     return replace(begin, columns={name: first + k for name, k in columns.items()}, notes=[*notes, *guessed])
 
 
-def _encoding(path: Path) -> str:
-    """That of a text whose first lines are UTF-8 or UTF-16, as spreadsheets write it; else of western Europe."""
+def _lines(path: Path) -> Iterator[bytes]:
+    """The lines of a text in UTF-8, or in one byte a letter; without a byte order mark."""
     with open(path, "rb") as file:
         begin = file.read(1 << 16)
-    if begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        return "utf-16"
+        wide = begin.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        if not wide and (b"\n" in begin or b"\r" not in begin):
+            file.seek(len(codecs.BOM_UTF8) if begin.startswith(codecs.BOM_UTF8) else 0)
+            yield from file
+            return
+    # Spreadsheets write UTF-16, and old Macs end lines by a carriage return alone.
+    with open(path, encoding="utf-16" if wide else "latin-1", errors="replace") as text:
+        yield from (line.encode(errors="replace") for line in text)
+
+
+def _decoded(line: bytes) -> str:
+    """A line of UTF-8, else of western Europe."""
     try:
-        codecs.getincrementaldecoder("utf-8")().decode(begin)
+        return line.decode()
     except UnicodeDecodeError:
-        return "cp1252"
-    return "utf-8-sig"
+        return line.decode("cp1252", "replace")
 
 
 def text_notes(path: Path) -> list[str]:
@@ -128,54 +140,51 @@ def read_text(path: Path, at_once: int = AT_ONCE) -> Iterator[Columns]:
     """The columns of a file of text (`text_layout`), so many rows at a time.
 
     Raises:
-        ValueError: a row that is none, or is of another length.
+        StageError: a row is of another length, or the file ends within one.
     """
     layout = text_layout(path)
-    with open(path, encoding=_encoding(path)) as file:
-        lines = islice(file, layout.above, None)
-        first = layout.above + 1
-        while some := list(islice(lines, at_once)):
-            if "".join(some).strip():
-                try:
-                    rows = layout.rows(some)
-                except ValueError as error:
-                    raise ValueError(f"{error}, rows counted from line {first}") from None
-                yield {name: rows[:, k] for name, k in layout.columns.items()}
-            first += len(some)
+    lines, first = islice(_lines(path), layout.above, None), layout.above + 1
+    while some := list(islice(lines, at_once)):
+        rows = layout.rows(path, some, first, list(layout.columns.values()))
+        yield dict(zip(layout.columns, rows.T))
+        first += len(some)
 
 
-def _names(above: list[str], separator: str | None, columns: int) -> list[str]:
+def _names(above: list[str], mark: str | None, columns: int) -> list[str]:
     """The names in the nearest line above the rows that has one for each column; else those in the last line."""
-    lines = [_titles(line, separator) for line in reversed(above)]
+    lines = [cells_of(line.strip(" \r\n/#"), mark) for line in reversed(above)]
     return next((names for names in lines if len(names) == columns), lines[0] if lines else [])
-
-
-def _plain(name: str) -> str:
-    """A column's name in lower case and without its unit: `N [m]`, `E_m`."""
-    return re.sub(r"[\s_]*(\[\w+\]|\(\w+\)|_m)$", "", name.strip()).lower()
-
-
-def _titles(line: str, separator: str | None) -> list[str]:
-    """The names in a line above the rows."""
-    return [title.strip().strip("\"'") for title in line.strip(" \t\r\n/#").split(separator)]
 
 
 def _unnamed(path: Path, rows: NDArray[np.float64]) -> tuple[dict[str, int], list[str]]:
     """The names of (N, C) columns that no line names -> where they stand, and what a user should know of that."""
     columns, start, notes = {name: k for k, name in enumerate(POSITION[: rows.shape[1]])}, 3, list[str]()
-    if rows.shape[1] % 3 == 1 and rows.shape[1] >= (4 if path.suffix.lower() == ".pts" else 7):
+    further_one = rows.shape[1] % 3 == 1 and rows.shape[1] >= (4 if path.suffix.lower() == ".pts" else 7)
+    colored = _may_be_colors if further_one else _must_be_colors
+    if further_one:
         start, notes = _colors_at(path, rows)
         columns |= {"intensity": 3} if start == 4 else {}
     for first in range(start, rows.shape[1] - 2, 3):
         three = rows[:, first : first + 3]
-        unit = np.abs(np.linalg.norm(three, axis=1) - 1) < UNIT_TOLERANCE
-        kind = NORMAL if unit[np.isfinite(three).all(1)].all() else COLOR
-        if kind[0] in columns or (kind == COLOR and not _may_be_colors(three)):
+        lengths = np.linalg.norm(three[np.isfinite(three).all(1)], axis=1)
+        kind = NORMAL if len(lengths) and (np.abs(lengths - 1) < UNIT_TOLERANCE).all() else COLOR
+        if kind[0] in columns or (kind == COLOR and not colored(three)):
             break
         columns |= {name: first + k for k, name in enumerate(kind)}
+        if kind == COLOR and not notes and path.suffix.lower() != ".pts":
+            notes = [_guess(path, first)]
     if further := rows.shape[1] - len(columns):
         notes.append(f"{path.name}: {further} of its columns have no names and are left out")
     return columns, notes
+
+
+def _must_be_colors(three: NDArray[np.float64]) -> bool:
+    """Whether (N, 3) can be nothing but colours: whole numbers that reach alike far."""
+    three = three[np.isfinite(three).all(1)]
+    tops = three.max(0, initial=0)
+    return _may_be_colors(three) and bool(
+        (three == np.rint(three)).all() and tops.min() >= MIN_RANGE_RATIO * tops.max()
+    )
 
 
 def _may_be_colors(three: NDArray[np.float64]) -> bool:
@@ -205,14 +214,26 @@ def _colors_at(path: Path, rows: NDArray[np.float64]) -> tuple[int, list[str]]:
     behind, before = min(alike[0, 1], alike[1, 2]), min(alike[1, 2], alike[2, 3])
     if abs(before - behind) > MIN_CORRELATION_GAIN:
         first = 4 if before > behind else 3
-        said = f"columns {first + 1} to {first + 3} are taken for red, green and blue"
-    else:
-        first, said = rows.shape[1], "which columns are colours cannot be told, and none are read"
-    return first, [f"{path.name}: {said}; name the columns in a first line (x y z intensity r g b) if this is wrong"]
+        return first, [_guess(path, first)]
+    return rows.shape[1], [
+        f"{path.name}: which columns are colours cannot be told, and none are read; name the columns in a first line"
+        " (x y z intensity r g b) if this is wrong"
+    ]
 
 
-def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
-    """Where the rows begin among the first lines, and whether a name stands before the numbers of all of them.
+def _guess(path: Path, first: int) -> str:
+    """What a user should know of columns without names that are taken for colours."""
+    return (
+        f"{path.name}: columns {first + 1} to {first + 3} are taken for red, green and blue; name the columns in a"
+        " first line (x y z intensity r g b) if this is wrong"
+    )
+
+
+def _first_row(path: Path, head: list[str]) -> tuple[int, str | None, int, bool]:
+    """Where the rows begin among the first lines, what separates their cells, how many these are, and whether a name
+    stands before the numbers of all of them.
+
+    Rows begin with the first line of numbers alone, else with the first one of the kind that is the most frequent.
 
     Raises:
         ValueError: there are none.
@@ -222,17 +243,21 @@ def _first_row(path: Path, head: list[str]) -> tuple[int, bool]:
     commas = len(re.findall(r"(?<![\d.,])-?\d+,\d+(?![\d.,])", last))
     if commas >= 3 or (commas and (";" in last or "\t" in last)):
         raise StageError(f"{path} has commas as decimal points: '{last[:60]}'; export it with points")
-    numbers = next((k for k, line in enumerate(head) if len(_numbers(line)) >= 3), None)
-    if numbers is not None:
-        return numbers, False
-    counts = [len(_numbers(line, True)) for line in head]
-    usual = max((count for count in counts if count >= 3), key=counts.count, default=None)
-    if usual is None:
+    kinds: list[tuple[str | None, int, tuple[int, ...]] | None] = []
+    for line in head:
+        row = COMMENT.split(line)[0]
+        mark = separator(row)
+        cells = cells_of(row, mark)
+        words = tuple(k for k, cell in enumerate(cells) if number(cell) is None)
+        some = sum(map(bool, cells)) - len(words) >= 3
+        kinds.append((mark, len(cells), words) if some else None)
+    found = [kind for kind in kinds if kind is not None]
+    if not found:
         raise ValueError("none of its first lines holds three numbers")
-    first = counts.index(usual)
-    if any(count != usual for count, line in zip(counts[first:], head[first:]) if line.strip()):
-        raise ValueError("its rows have different numbers of columns")
-    return first, True
+    usual = next((kind for kind in found if not kind[2]), max(found, key=found.count))
+    # Words in some rows alone may stand in the first ones.
+    rows = {usual, *(kind for kind in found if kind[:2] == usual[:2] and found.count(kind) > 1)}
+    return next(k for k, kind in enumerate(kinds) if kind in rows), usual[0], usual[1], 0 in usual[2]
 
 
 def _indices(rows: NDArray[np.float64]) -> int:
@@ -249,17 +274,3 @@ def _indices(rows: NDArray[np.float64]) -> int:
         return 1
     once = len(np.unique(first)) == len(first)
     return int(columns % 3 == 1 and whole[0] and not whole[1:4].any() and once)
-
-
-def _separator(line: str) -> str | None:
-    return next((mark for mark in ";," if mark in line), None)
-
-
-def _numbers(line: str, named: bool = False) -> list[float]:
-    """The numbers of a line of numbers, with a name before them or not; none of any other."""
-    mark = _separator(line)
-    cells = (line.rstrip().removesuffix(mark) if mark else line).split(mark)
-    try:
-        return [float(cell) for cell in cells[int(named) :]]
-    except ValueError:
-        return []
