@@ -3,29 +3,43 @@
 Read here and not by Open3D, whose readers take positions as float32: at UTM coordinates that loses decimetres.
 """
 
+import io
 import json
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from scenefuse.cloud.readers.columns import Columns
+from scenefuse.cloud.readers.columns import COLOR, Columns, bytes_of
+from scenefuse.core.stage import StageError
 
 Array = NDArray[np.float64]
 
 # Points drawn from a mesh; one with more vertices gives as many as it has.
 MESH_POINTS = 500_000
+# Extensions of glTF that are read, or change neither shapes nor the colours of surfaces.
+READ_EXTENSIONS = re.compile(
+    "EXT_texture_webp|EXT_mesh_gpu_instancing|KHR_(texture_transform|mesh_quantization|materials_(?!pbrSpec|variants)"
+    "|lights|xmp|node_visibility)|(MSFT|ADOBE|FB|AGI)_"
+)
+# What may stand before the file of a texture in a line of a material.
+OPTIONS = re.compile(r"(?:-[A-Za-z]+(?:\s+(?:[-+]?[\d.]+(?:[eE][-+]?\d+)?|on|off)(?=\s))*\s+)*")
+INSTANCE_PARTS = ("TRANSLATION", "ROTATION", "SCALE")
 
 
 @dataclass(frozen=True)
 class Material:
-    """The colour of faces: a picture (H, W, 3) RGB where there is one, else one colour, 0..255."""
+    """The colour of faces: a picture (H, W, 3) RGB where there is one, else one colour, 0..255.
+
+    A matrix (2, 3) leads from places (u, v, 1) of a mesh to those in the picture.
+    """
 
     picture: NDArray[np.uint8] | None = None
     color: tuple[float, ...] = (255.0, 255.0, 255.0)
+    place: Array = field(default_factory=lambda: np.eye(2, 3))
 
 
 @dataclass(frozen=True)
@@ -100,7 +114,7 @@ def _colors(mesh: Mesh, face: NDArray[np.int64], weights: Array) -> Array | None
             continue
         uv = np.einsum("nk,nkc->nc", weights[rows], mesh.uvs[face[rows]])
         known = np.isfinite(uv).all(1)
-        uv = uv[known]
+        uv = uv[known] @ material.place[:, :2].T + material.place[:, 2]
         uv = np.where((uv < 0) | (uv > 1), uv % 1, uv)
         height, width = material.picture.shape[:2]
         column = np.minimum((uv[:, 0] * width).astype(int), width - 1)
@@ -139,12 +153,13 @@ class _Obj:
 
     def take(self, line: str) -> None:
         word, rest = (*line.split(None, 1), "", "")[:2]
+        numbers = rest.split("#")[0].split()
         if word == "v":
-            self.vertices.append([float(cell) for cell in rest.split()])
+            self.vertices.append([float(cell) for cell in numbers])
         elif word == "vt":
-            self.uvs.append([float(cell) for cell in rest.split()[:2]])
+            self.uvs.append([float(cell) for cell in [*numbers, "0"][:2]])
         elif word == "f":
-            cells = [cell.split("/") for cell in rest.split()]
+            cells = [cell.split("/") for cell in numbers]
             self.polygons.append([_row(cell[0], len(self.vertices)) for cell in cells])
             self.places.append([_row(c[1], len(self.uvs)) if len(c) > 1 and c[1] else -1 for c in cells])
             self.used.append(self.material)
@@ -162,21 +177,25 @@ def read_obj(path: Path) -> Columns:
     content = _Obj()
     with open(path, encoding="utf-8-sig", errors="replace") as file:
         for line in file:
+            while line.rstrip().endswith("\\") and (more := file.readline()):
+                line = line.rstrip()[:-1] + " " + more
             content.take(line)
     if not content.vertices:
         return {axis: np.empty(0) for axis in "xyz"}
     width = 6 if min(map(len, content.vertices)) >= 6 else 3
     table = np.array([vertex[:width] for vertex in content.vertices], np.float64)
-    colors = table[:, 3:] * (255.0 if table[:, 3:].max() <= 1 else 1.0) if width == 6 else None
+    colors = bytes_of(table[:, 3:]) if width == 6 else None
     if not content.polygons:
         columns: Columns = dict(zip("xyz", table[:, :3].T))
-        return columns if colors is None else columns | dict(zip(("red", "green", "blue"), np.rint(colors).T))
+        return columns if colors is None else columns | dict(zip(COLOR, colors.T))
     faces, of = triangles(content.polygons)
     uvs = np.array([*content.uvs, [np.nan, np.nan]], np.float64)[triangles(content.places)[0]]
-    known = dict(pair for name in content.libraries for pair in _materials(path.parent / name).items())
+    files = [file for name in content.libraries for file in _libraries(path.parent, name)]
+    known = dict(pair for file in files for pair in _materials(file).items())
     names = sorted(set(content.used))
     material = np.array([names.index(name) for name in content.used])[of]
     materials = tuple(known.get(name, Material()) for name in names) if known else ()
+    colors = None if colors is None else colors.astype(np.float64)
     return sampled_columns(Mesh(table[:, :3], faces, colors, uvs, material, materials))
 
 
@@ -184,6 +203,22 @@ def _row(cell: str, count: int) -> int:
     """A reference of OBJ, from 1, or from the end if negative, as a row from 0."""
     number = int(cell)
     return number - 1 if number > 0 else count + number
+
+
+def _libraries(folder: Path, names: str) -> list[Path]:
+    """The files of materials that a line names: one, perhaps with blanks, or several."""
+    whole = _beside(folder, names)
+    return [whole] if whole.is_file() else [_beside(folder, name) for name in names.split() or [names]]
+
+
+def _beside(folder: Path, name: str) -> Path:
+    """A file that another one names, there or, where the name is of another machine, by that beside it in any case."""
+    parts = name.strip().strip('"').replace("\\", "/")
+    path = folder / parts
+    if path.is_file() or not folder.is_dir():
+        return path
+    last = Path(parts).name.lower()
+    return next((other for other in sorted(folder.iterdir()) if other.name.lower() == last), path)
 
 
 def _materials(path: Path) -> dict[str, Material]:
@@ -194,33 +229,44 @@ def _materials(path: Path) -> dict[str, Material]:
         print(f"note: {path} is not there: the mesh has no colours of its materials", flush=True)
         return found
     for line in path.read_text(encoding="utf-8-sig", errors="replace").splitlines():
-        word, _, rest = line.strip().partition(" ")
+        word, rest = (*line.split(None, 1), "", "")[:2]
         if word == "newmtl":
             name = rest.strip()
             found[name] = Material()
-        elif word == "Kd" and name:
-            found[name] = Material(found[name].picture, tuple(255 * float(cell) for cell in rest.split()[:3]))
-        elif word == "map_Kd" and name:
-            file = path.parent / _named_file(rest).replace("\\", "/")
-            found[name] = Material(_picture(file.read_bytes() if file.is_file() else b"", str(file)), found[name].color)
+        elif word.lower() == "kd" and name:
+            color = tuple(255 * float(cell) for cell in rest.split("#")[0].split()[:3])
+            found[name] = replace(found[name], color=color if len(color) == 3 else Material.color)
+        elif word.lower() == "map_kd" and name:
+            options = OPTIONS.match(rest)
+            file = _beside(path.parent, rest[options.end() if options else 0 :])
+            picture = _picture(file.read_bytes() if file.is_file() else b"", str(file))
+            found[name] = replace(found[name], picture=picture, place=_placed(options[0] if options else ""))
     return found
 
 
-def _named_file(rest: str) -> str:
-    """The file that a line of a material names: behind its options, perhaps in quotes."""
-    options = re.match(r"(?:-[A-Za-z]+(?:\s+(?:-?[\d.]+|on|off)(?=\s))*\s+)*", rest)
-    return rest[options.end() if options else 0 :].strip().strip('"')
+def _placed(options: str) -> Array:
+    """Where a texture lies, by its options -s (scale) and -o (offset)."""
+    place = np.eye(2, 3)
+    for letter, numbers in re.findall(r"-([so])((?:\s+[-+]?[\d.]\S*)+)", options):
+        first = np.array([float(cell) for cell in numbers.split()[:2]])
+        place[np.arange(len(first)), np.arange(len(first)) if letter == "s" else 2] = first
+    return place
 
 
 def _picture(content: bytes, name: str) -> NDArray[np.uint8] | None:
     """An encoded picture as (H, W, 3) RGB; None, and a note, where it cannot be read."""
     import cv2
+    from PIL import Image
 
     found = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_COLOR) if content else None
-    if found is None:
+    if found is not None:
+        return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGR2RGB), np.uint8)
+    try:
+        with Image.open(io.BytesIO(content)) as picture:  # TGA, DDS and others
+            return np.asarray(picture.convert("RGB"))
+    except (OSError, ValueError, Image.DecompressionBombError):
         print(f"note: the texture {name} cannot be read: its faces have their material's colour", flush=True)
         return None
-    return np.asarray(cv2.cvtColor(found, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_glb(path: Path) -> Columns:
@@ -232,10 +278,15 @@ def read_glb(path: Path) -> Columns:
     content = path.read_bytes()
     if content[:4] != b"glTF" or len(content) < 20:
         raise ValueError("it does not begin as GLB does")
+    if missing := max(int.from_bytes(content[8:12], "little") - len(content), 0):
+        raise StageError(f"{path} is cut short: its last {missing} bytes are missing; copy it again")
     length = int.from_bytes(content[12:16], "little")
     document, blob = json.loads(content[20 : 20 + length]), content[28 + length :]
-    if unread := {"KHR_draco_mesh_compression", "EXT_meshopt_compression"} & set(document.get("extensionsUsed", [])):
-        raise ValueError(f"its meshes are compressed by {min(unread)}: export them without")
+    unread = sorted(name for name in document.get("extensionsUsed", []) if not READ_EXTENSIONS.match(name))
+    if packed := [name for name in unread if name.endswith("_compression")]:
+        raise ValueError(f"its meshes are compressed by {packed[0]}: export them without")
+    if unread:
+        print(f"note: {path.name} uses {', '.join(unread)}, which is not read", flush=True)
     upright = np.array([[1.0, 0, 0, 0], [0, 0, -1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])
     scenes, nodes = document.get("scenes"), document.get("nodes", [])
     roots = scenes[document.get("scene", 0)].get("nodes", []) if scenes else range(len(nodes))
@@ -251,7 +302,7 @@ def read_glb(path: Path) -> Columns:
             np.concatenate(colored) if len(colored) == len(parts) else None,
             np.concatenate([np.full((len(p.faces), 3, 2), np.nan) if p.uvs is None else p.uvs for p in parts]),
             np.concatenate([part.material for part in parts]),
-            tuple(_gltf_material(document, blob, entry) for entry in document.get("materials", [])),
+            tuple(_gltf_material(document, blob, number) for number in range(len(document.get("materials", [])))),
         )
     )
 
@@ -267,47 +318,111 @@ def _parts(document: dict[str, Any], blob: bytes, node: int, outer: Array) -> li
         own = np.eye(4)
         turn = Rotation.from_quat(about.get("rotation", [0, 0, 0, 1])).as_matrix()
         own[:3, :3], own[:3, 3] = turn * np.array(about.get("scale", [1, 1, 1])), about.get("translation", [0, 0, 0])
-    pose = outer @ own
-    found = []
+    pose, found = outer @ own, list[Mesh]()
     for primitive in document["meshes"][about["mesh"]]["primitives"] if "mesh" in about else []:
-        if primitive.get("mode", 4) != 4:
-            print("note: lines, points and strips of the GLB are left out; triangles are read", flush=True)
+        faces = _faces(document, blob, primitive)
+        if faces is None:
+            print("note: lines and points of the GLB are left out; triangles are read", flush=True)
             continue
-        names = primitive["attributes"]
-        vertices = _values(document, blob, names["POSITION"]) @ pose[:3, :3].T + pose[:3, 3]
-        index = np.arange(len(vertices))
-        if "indices" in primitive:
-            index = _values(document, blob, primitive["indices"]).astype(np.int64).ravel()
-        faces = index[: len(index) // 3 * 3].reshape(-1, 3)
+        names, number = primitive["attributes"], primitive.get("material", -1)
+        vertices = _values(document, blob, names["POSITION"])
         colors = 255 * _values(document, blob, names["COLOR_0"])[:, :3] if "COLOR_0" in names else None
-        uvs = _values(document, blob, names["TEXCOORD_0"]) if "TEXCOORD_0" in names else None
-        uvs = None if uvs is None else (uvs * [1, -1] + [0, 1])[faces]
-        found.append(Mesh(vertices, faces, colors, uvs, np.full(len(faces), primitive.get("material", -1))))
+        uvs = None
+        if number >= 0 and (place := f"TEXCOORD_{_texture(document, number).get('texCoord', 0)}") in names:
+            uvs = _values(document, blob, names[place])[faces]
+        for instance in _instances(document, blob, about):
+            turn = pose @ instance
+            corners = faces if np.linalg.det(turn[:3, :3]) > 0 else faces[:, ::-1]
+            own_uvs = uvs if uvs is None or corners is faces else uvs[:, ::-1]
+            moved = vertices @ turn[:3, :3].T + turn[:3, 3]
+            found.append(Mesh(moved, corners, colors, own_uvs, np.full(len(faces), number)))
     return found + [part for child in about.get("children", []) for part in _parts(document, blob, child, pose)]
+
+
+def _faces(document: dict[str, Any], blob: bytes, primitive: dict[str, Any]) -> NDArray[np.int64] | None:
+    """The triangles (F, 3) of triangles, a strip or a fan (glTF 2.0, 3.7.2.1); None of lines and points."""
+    count = document["accessors"][primitive["attributes"]["POSITION"]]["count"]
+    index = np.arange(count)
+    if "indices" in primitive:
+        index = _values(document, blob, primitive["indices"]).astype(np.int64).ravel()
+        if index.size and index.max() >= count:
+            raise ValueError("its faces name vertices that it does not have")
+    mode, each = primitive.get("mode", 4), np.arange(len(index) - 2)
+    if mode == 4:
+        return index[: len(index) // 3 * 3].reshape(-1, 3)
+    if mode == 5:
+        return index[np.stack([each, each + 1 + each % 2, each + 2 - each % 2], axis=1)]
+    return index[np.stack([each + 1, each + 2, np.zeros_like(each)], axis=1)] if mode == 6 else None
+
+
+def _instances(document: dict[str, Any], blob: bytes, node: dict[str, Any]) -> Array:
+    """(N, 4, 4) where copies of a node's mesh stand in it, by EXT_mesh_gpu_instancing."""
+    from scipy.spatial.transform import Rotation
+
+    names = node.get("extensions", {}).get("EXT_mesh_gpu_instancing", {}).get("attributes", {})
+    values = {name: _values(document, blob, names[name]) for name in INSTANCE_PARTS if name in names}
+    poses = np.tile(np.eye(4), (len(next(iter(values.values()), [0])), 1, 1))
+    if "ROTATION" in values:
+        poses[:, :3, :3] = Rotation.from_quat(values["ROTATION"]).as_matrix()
+    if "SCALE" in values:
+        poses[:, :3, :3] *= values["SCALE"][:, None]
+    if "TRANSLATION" in values:
+        poses[:, :3, 3] = values["TRANSLATION"]
+    return poses
 
 
 def _values(document: dict[str, Any], blob: bytes, accessor: int) -> Array:
     """(N, K) values of an accessor of glTF; normalised integers as fractions."""
     about = document["accessors"][accessor]
-    if "bufferView" not in about or "sparse" in about:
-        raise ValueError("its meshes are stored in a form that is not read (sparse); export it again")
-    view = document["bufferViews"][about["bufferView"]]
-    # glTF 2.0, 3.6.2.2: component types, and components of an accessor's type.
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[about["type"]]
+    kind, count = _kind(about), about["count"]
+    if "bufferView" in about:
+        table = _stored(document, blob, about, kind, count, width).astype(np.float64)
+    elif count * width <= len(blob):
+        table = np.zeros((count, width))
+    if "sparse" in about:
+        sparse = about["sparse"]
+        rows = _stored(document, blob, sparse["indices"], _kind(sparse["indices"]), sparse["count"], 1)[:, 0]
+        table[rows] = _stored(document, blob, sparse["values"], kind, sparse["count"], width)
+    return np.maximum(table / np.iinfo(kind).max, -1) if about.get("normalized") else table
+
+
+def _kind(about: dict[str, Any]) -> np.dtype[Any]:
+    """The type of an accessor's numbers (glTF 2.0, 3.6.2.2)."""
     kinds = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-    widths = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-    kind, width = np.dtype(kinds[about["componentType"]]), widths[about["type"]]
+    return np.dtype(kinds[about["componentType"]])
+
+
+def _stored(
+    document: dict[str, Any], blob: bytes, about: dict[str, Any], kind: np.dtype[Any], count: int, width: int
+) -> NDArray[Any]:
+    """(N, K) numbers that lie in the blob."""
+    view = document["bufferViews"][about["bufferView"]]
     start, step = view.get("byteOffset", 0) + about.get("byteOffset", 0), view.get("byteStride", kind.itemsize * width)
-    table = np.ndarray((about["count"], width), kind, blob, start, (step, kind.itemsize)).astype(np.float64)
-    return table / np.iinfo(kind).max if about.get("normalized") else table
+    return np.ndarray((count, width), kind, blob, start, (step, kind.itemsize))
 
 
-def _gltf_material(document: dict[str, Any], blob: bytes, entry: dict[str, Any]) -> Material:
-    about = entry.get("pbrMetallicRoughness", {})
+def _texture(document: dict[str, Any], material: int) -> dict[str, Any]:
+    """What a material says of its texture: `index`, and `texCoord`, `offset`, `scale`, `rotation` of its places."""
+    about = document["materials"][material].get("pbrMetallicRoughness", {}).get("baseColorTexture", {})
+    return about | about.get("extensions", {}).get("KHR_texture_transform", {})
+
+
+def _gltf_material(document: dict[str, Any], blob: bytes, number: int) -> Material:
+    about = document["materials"][number].get("pbrMetallicRoughness", {})
     color = tuple(255 * part for part in about.get("baseColorFactor", [1, 1, 1])[:3])
-    if "baseColorTexture" not in about:
+    texture = _texture(document, number)
+    if "index" not in texture:
         return Material(None, color)
-    number = document["textures"][about["baseColorTexture"]["index"]].get("source", 0)
-    image = document["images"][number]
+    sources = document["textures"][texture["index"]]
+    source = sources.get("extensions", {}).get("EXT_texture_webp", sources).get("source")
+    image = {} if source is None else document["images"][source]
     view = document["bufferViews"][image["bufferView"]] if "bufferView" in image else {"byteLength": 0}
     start = view.get("byteOffset", 0)
-    return Material(_picture(blob[start : start + view["byteLength"]], image.get("name", f"number {number}")), color)
+    picture = _picture(blob[start : start + view["byteLength"]], image.get("name", f"number {source}"))
+    cos, sin = np.cos(texture.get("rotation", 0.0)), np.sin(texture.get("rotation", 0.0))
+    place = np.eye(3)
+    place[:2, :2] = np.array([[cos, -sin], [sin, cos]]) * texture.get("scale", [1, 1])
+    place[:2, 2] = texture.get("offset", [0, 0])
+    down = np.array([[1.0, 0, 0], [0, -1.0, 1], [0, 0, 1]])  # glTF counts from the upper edge
+    return Material(picture, color, (down @ place)[:2])
